@@ -1,0 +1,118 @@
+"""The world frame: a projected CRS in metres minus a rounded origin, or a local frame.
+
+Heights are never transformed: z is the altitude as given, whatever its vertical datum, so that ground heights of the
+same source fit. Meridian convergence is the grid azimuth's defect: grid azimuth = true azimuth - convergence. It is
+positive east of the central meridian in the northern hemisphere, where true north lies to the left (west) of grid
+north. Worked case: at 28 N, 1 degree east of UTM 17's meridian it is +sin(28) = +0.47 degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+
+LOCAL = "local"
+AUTO = "auto"
+_ORIGIN_STEP_M = 1000.0
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """crs: authority code, or "local". origin_m: (x, y, z) subtracted from coordinates in that CRS."""
+
+    crs: str
+    origin_m: tuple[float, float, float]
+
+
+def checked_crs(code: str) -> str:
+    """The code of a usable world CRS in canonical spelling. Raises ConfigError where it is unknown or unfit.
+
+    Fit is a projected CRS in metres with axes to the east and north; "local" passes.
+    """
+    if code.strip().lower() == LOCAL:
+        return LOCAL
+    crs = _crs(code)
+    if not crs.is_projected:
+        raise ConfigError(
+            f"crs {code!r} ({crs.name}) is not projected: give one in metres, such as EPSG:32633, or auto"
+        )
+    for axis in crs.axis_info[:2]:
+        if axis.direction.lower() not in ("east", "north") or axis.unit_conversion_factor != 1.0:
+            raise ConfigError(
+                f"crs {code!r} ({crs.name}) counts in {axis.unit_name} to the {axis.direction}: give a CRS in metres "
+                "whose axes point east and north, or auto for the UTM zone"
+            )
+    authority = crs.to_authority()
+    return ":".join(authority) if authority else code.strip()
+
+
+def utm_crs(latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> str:
+    """Code of the WGS84 UTM zone of the median position. Raises ConfigError beyond UTM's 80 S to 84 N."""
+    latitude = float(np.median(latitudes_deg))
+    first = float(longitudes_deg[0])
+    # Across the antimeridian the median must not fall on the other side of the globe.
+    turned = (np.asarray(longitudes_deg) - first + 180.0) % 360.0 - 180.0 + first
+    longitude = (float(np.median(turned)) + 180.0) % 360.0 - 180.0
+    if not -80.0 <= latitude <= 84.0:
+        raise ConfigError(f"no UTM zone at latitude {latitude:.2f}: give a projected CRS with --crs")
+    zone = min(int((longitude + 180.0) // 6.0) + 1, 60)
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def grid_from_geographic(crs: str, latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> FloatArray:
+    """Easting and northing (N, 2) in metres of WGS84 positions; NaN outside the area of the CRS."""
+    from pyproj import Transformer
+
+    if crs == LOCAL:
+        raise ConfigError("latitudes and longitudes cannot be placed in a local frame: give a CRS, or auto, with --crs")
+    transformer = Transformer.from_crs("EPSG:4326", _crs(crs), always_xy=True)
+    xy_m = np.stack(transformer.transform(longitudes_deg, latitudes_deg), axis=-1).astype(np.float64).reshape(-1, 2)
+    xy_m[~np.isfinite(xy_m).all(axis=1)] = np.nan
+    return xy_m
+
+
+def convergence_deg(crs: str, latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> FloatArray:
+    """Meridian convergence (N,) in degrees: grid azimuth = true azimuth - convergence; 0 in a local frame."""
+    from pyproj import Proj
+
+    if crs == LOCAL:
+        return np.zeros(len(latitudes_deg))
+    factors = Proj(_crs(crs)).get_factors(np.asarray(longitudes_deg), np.asarray(latitudes_deg))
+    return np.atleast_1d(np.asarray(factors.meridian_convergence, dtype=np.float64))
+
+
+def rounded_origin_m(centers_m: FloatArray) -> tuple[float, float, float]:
+    """Origin of the world frame: the median position (N, 3) rounded down to kilometres, height 0."""
+    x, y = np.floor(np.median(np.asarray(centers_m)[:, :2], axis=0) / _ORIGIN_STEP_M) * _ORIGIN_STEP_M
+    return float(x), float(y), 0.0
+
+
+def choose_crs(given: str, stated: str | None, latitudes_deg: Sequence[float], longitudes_deg: Sequence[float]) -> str:
+    """The world's CRS: the user's, else the one stated by an input file, else the UTM zone, else "local".
+
+    given: a code, "local", "auto" or "". stated: a code from block.json, or None. The positions are empty where the
+    pose list holds grid coordinates.
+    """
+    if given.strip().lower() not in ("", AUTO):
+        return checked_crs(given)
+    if stated is not None and not (len(latitudes_deg) and stated.strip().lower() == LOCAL):
+        return checked_crs(stated)
+    if len(latitudes_deg):
+        return utm_crs(np.asarray(latitudes_deg), np.asarray(longitudes_deg))
+    return LOCAL
+
+
+def _crs(code: str) -> Any:
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        return CRS.from_user_input(code).to_2d()
+    except CRSError as error:
+        raise ConfigError(f"crs {code!r} is unknown: give a code such as EPSG:32633, or auto, or local") from error

@@ -1,0 +1,288 @@
+"""What an image file says of itself in its header: EXIF, GPS and XMP. Pixels are never decoded.
+
+Angles come from the camera's tags, never the aircraft's: DJI's Gimbal*Degree (not Flight*Degree; convention
+`gimbal`), else Camera:Yaw/Pitch/Roll of the Pix4D namespace (Parrot, senseFly, MicaSense; convention `nadir`: the
+image top points north at zero angles). Yaw is against true north in both.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.errors import ItemError
+
+_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
+_DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL = 36867, 37520, 37521
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
+_EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
+_FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# What Pillow raises on headers that are cut or scrambled.
+_BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
+
+
+@dataclass(frozen=True)
+class CameraAngles:
+    """Attitude of the camera, degrees; yaw against true north. convention: "gimbal" or "nadir"."""
+
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    convention: str
+
+
+@dataclass(frozen=True)
+class ExifFacts:
+    """The header of one image; None or "" where a fact is absent or unusable.
+
+    width_px, height_px: the stored raster, whatever `orientation` (1-8) says. focal_35mm_mm: 35-mm equivalent.
+    focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
+    speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
+    latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
+    relative_altitude_m: above the take-off point. notes: what was found and could not be used.
+    """
+
+    width_px: int
+    height_px: int
+    orientation: int = 1
+    make: str = ""
+    model: str = ""
+    focal_mm: float | None = None
+    focal_35mm_mm: float | None = None
+    focal_plane_px_per_mm: float | None = None
+    focal_plane_confirmed: bool = False
+    time: str = ""
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_m: float | None = None
+    relative_altitude_m: float | None = None
+    angles: CameraAngles | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_exif(path: Path) -> ExifFacts:
+    """Header facts of a JPEG, PNG or TIFF (8 or 16 bit). Raises ItemError where the file is no readable image."""
+    from PIL import Image, UnidentifiedImageError
+
+    # A mapping camera's frame is larger than Pillow's guard against hostile files; nothing is decoded here.
+    Image.MAX_IMAGE_PIXELS = None
+    notes: list[str] = []
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's remarks on odd tags, one per image, are of no use to anybody
+            with Image.open(path) as image:
+                tags, exif, gps = _ifds(image, notes)
+                # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
+                stored = (int(tags[_WIDTH]), int(tags[_HEIGHT])) if image.format == "TIFF" else image.size
+                xmp = _xmp(image, tags, notes)
+    except UnidentifiedImageError as error:
+        raise ItemError(f"{path.name}: not a readable image (damaged header or another format)") from error
+    except _BROKEN as error:
+        raise ItemError(f"{path.name}: header cannot be read ({error}): copy the file again") from error
+    width_px, height_px = stored
+    if width_px < 1 or height_px < 1:
+        raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
+    latitude_deg, longitude_deg, altitude_m = _position(gps, xmp, notes)
+    focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
+    orientation = _number(tags.get(_ORIENTATION)) or 1.0
+    return ExifFacts(
+        width_px=width_px,
+        height_px=height_px,
+        orientation=int(orientation) if 1 <= orientation <= 8 else 1,
+        make=_text(tags.get(_MAKE)) or xmp.get("tiff:Make", ""),
+        model=_text(tags.get(_MODEL)) or xmp.get("tiff:Model", ""),
+        focal_mm=_positive(exif.get(_FOCAL_LENGTH)),
+        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)),
+        focal_plane_px_per_mm=focal_plane,
+        focal_plane_confirmed=confirmed,
+        time=_time(tags, exif),
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+        altitude_m=altitude_m,
+        relative_altitude_m=_number(xmp.get("drone-dji:RelativeAltitude")),
+        angles=_angles(xmp),
+        notes=tuple(notes),
+    )
+
+
+def exif_or_reason(path: Path) -> ExifFacts | str:
+    """`read_exif`, or the reason why the file is unusable: what a pool of workers maps over many files."""
+    try:
+        return read_exif(path)
+    except ItemError as error:
+        return str(error).removeprefix(f"{path.name}: ")  # recorded beside the name
+
+
+def _ifds(image: Any, notes: list[str]) -> tuple[Mapping[int, Any], Mapping[int, Any], Mapping[int, Any]]:
+    """Main, EXIF and GPS tags; a broken table is empty and noted, since the picture itself may be sound."""
+    tables: list[Mapping[int, Any]] = []
+    readers: tuple[tuple[str, Callable[[], Mapping[int, Any]]], ...] = (
+        ("EXIF", lambda: dict(image.getexif())),
+        ("EXIF", lambda: dict(image.getexif().get_ifd(_EXIF_IFD))),
+        ("GPS", lambda: dict(image.getexif().get_ifd(_GPS_IFD))),
+    )
+    for label, read in readers:
+        try:
+            tables.append(read())
+        except _BROKEN:
+            tables.append({})
+            notes.append(f"{label} tags are damaged")
+    return tables[0], tables[1], tables[2]
+
+
+def _xmp(image: Any, tags: Mapping[int, Any], notes: list[str]) -> dict[str, str]:
+    """XMP properties as "prefix:Name" -> text, with DJI's and Pix4D's namespaces under their usual prefixes."""
+    from xml.etree.ElementTree import ParseError
+
+    from defusedxml import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+
+    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or tags.get(_XMP_PACKET)
+    if isinstance(packet, str):
+        packet = packet.encode()
+    if not isinstance(packet, bytes) or not packet.strip(b"\0 \r\n\t"):
+        return {}
+    try:
+        root = fromstring(packet.strip(b"\0 \r\n\t"))
+    except (ParseError, DefusedXmlException, ValueError):
+        notes.append("XMP block is malformed")
+        return {}
+    properties: dict[str, str] = {}
+    for element in root.iter():
+        pairs = [*element.attrib.items(), (element.tag, element.text or "")]
+        for name, value in pairs:
+            namespace, _, local = name.rpartition("}")
+            prefix = _prefix(namespace)
+            if prefix and value.strip():
+                properties.setdefault(f"{prefix}:{local}", value.strip())
+    return properties
+
+
+def _prefix(namespace: str) -> str:
+    lowered = namespace.lower()
+    if "drone-dji" in lowered:
+        return "drone-dji"
+    if "/camera/" in lowered and "adobe" not in lowered:
+        return "Camera"
+    return "tiff" if "/tiff/" in lowered else ""
+
+
+def _angles(xmp: Mapping[str, str]) -> CameraAngles | None:
+    for names, convention in (
+        (("drone-dji:GimbalYawDegree", "drone-dji:GimbalPitchDegree", "drone-dji:GimbalRollDegree"), "gimbal"),
+        (("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), "nadir"),
+    ):
+        yaw, pitch, roll = (_number(xmp.get(name)) for name in names)
+        if yaw is not None and pitch is not None and roll is not None:
+            return CameraAngles(yaw, pitch, roll, convention)
+    return None
+
+
+def _position(
+    gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
+) -> tuple[float | None, float | None, float | None]:
+    latitude = _sexagesimal(gps.get(2), _text(gps.get(1)), "NS", 90.0)
+    longitude = _sexagesimal(gps.get(4), _text(gps.get(3)), "EW", 180.0)
+    if latitude is None or longitude is None:
+        if gps.get(2) is not None or gps.get(4) is not None:
+            notes.append("GPS position is incomplete or out of range")
+        latitude = _number(xmp.get("drone-dji:GpsLatitude", xmp.get("drone-dji:Latitude")))
+        # DJI's firmware spelt the tag "GpsLongtitude" for years.
+        named = ("drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude")
+        longitude = next((_number(xmp[name]) for name in named if name in xmp), None)
+    if latitude is None or longitude is None or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        return None, None, None
+    if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
+        notes.append("GPS position is (0, 0): no fix")
+        return None, None, None
+    return latitude, longitude, _altitude(gps, xmp)
+
+
+def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> float | None:
+    altitude = _number(gps.get(6))
+    if altitude is None:
+        return _number(xmp.get("drone-dji:AbsoluteAltitude"))
+    reference = gps.get(5)
+    code = reference[0] if isinstance(reference, bytes) and reference else _number(reference)
+    # 1: below sea level; 3: below the ellipsoid (Exif 3.0). Some writers store the character instead of the number.
+    return -abs(altitude) if code in (1, 3, 49, 51) else altitude
+
+
+def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> float | None:
+    """Signed degrees of (degrees, minutes, seconds); None where a part or the hemisphere is missing or absurd."""
+    parts = value if isinstance(value, tuple | list) else (value,)
+    sign = {letters[0]: 1.0, letters[1]: -1.0}.get(reference[:1].upper())
+    if sign is None or not parts or len(parts) > 3:
+        return None
+    degrees = _number(parts[0])
+    if degrees is None or degrees < 0:
+        return None
+    total = degrees
+    for part, scale in zip(parts[1:], (60.0, 3600.0), strict=False):
+        number = _number(part)
+        if number is None and getattr(part, "numerator", None) == 0:
+            number = 0.0  # 0/0 stands for "no seconds given" with several writers
+        if number is None or not 0 <= number <= 60:
+            return None
+        total += number / scale
+    return sign * total if total <= largest else None
+
+
+def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tuple[float | None, bool]:
+    """Pixels per millimetre of the stored raster, and whether EXIF names the raster that the tag speaks of."""
+    resolution = _positive(exif.get(_FOCAL_PLANE_X))
+    unit_mm = _MM_PER_UNIT.get(int(_number(exif.get(_FOCAL_PLANE_UNIT)) or 2))
+    if resolution is None or unit_mm is None:
+        return None, False
+    exif_width, exif_height = _positive(exif.get(_EXIF_WIDTH)), _positive(exif.get(_EXIF_HEIGHT))
+    if exif_width and exif_height and abs(width_px * exif_height - height_px * exif_width) < 2 * exif_width:
+        return resolution / unit_mm * width_px / exif_width, True
+    return resolution / unit_mm, False
+
+
+def _time(tags: Mapping[int, Any], exif: Mapping[int, Any]) -> str:
+    for stamp, subsec in (
+        (exif.get(_DATE_TIME_ORIGINAL), exif.get(_SUBSEC_ORIGINAL)),
+        (tags.get(_DATE_TIME), exif.get(_SUBSEC)),
+    ):
+        try:
+            time = datetime.strptime(_text(stamp), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            continue
+        digits = _text(subsec)
+        fraction = digits[:6].ljust(6, "0") if digits.isascii() and digits.isdigit() else "0"
+        return time.replace(microsecond=int(fraction)).isoformat()
+    return ""
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+
+
+def _number(value: Any) -> float | None:
+    """A finite float of a tag or an XMP text (also "a/b"), or None. Pillow makes NaN of a zero denominator."""
+    if isinstance(value, tuple | list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, str) and "/" in value:
+        numerator, denominator = (_number(part) for part in value.split("/", 1))
+        return numerator / denominator if numerator is not None and denominator else None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0 else None

@@ -1,0 +1,179 @@
+"""The terrain below a block: a constant height, a digital elevation model, or what adjacent images tell.
+
+All heights of a ground are world heights: those of the block's CRS minus the world origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+# A block's window of a DEM is read with at most this many cells per side; a finer DEM is averaged.
+_MAX_CELLS = 4096
+_MARGIN_M = (100.0, 20_000.0)
+
+
+@dataclass(frozen=True)
+class ConstantGround:
+    """A horizontal plane. z_m: its world height."""
+
+    z_m: float
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """World heights (N,) below world points (N, 2)."""
+        return np.full(len(xy_m), self.z_m)
+
+
+@dataclass(frozen=True, eq=False)
+class DemGround:
+    """A raster of world heights, interpolated bilinearly between the centres of its cells.
+
+    heights_m: (H, W) float64, rows from north to south, no gaps. west_m, north_m: world position of the centre of the
+    first cell. cell_m: (east-west, north-south) spacing. outside_m: height of points beyond the raster.
+    """
+
+    heights_m: FloatArray
+    west_m: float
+    north_m: float
+    cell_m: tuple[float, float]
+    outside_m: float
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """World heights (N,) below world points (N, 2)."""
+        points = np.asarray(xy_m, dtype=np.float64)
+        rows, columns = self.heights_m.shape
+        x = (points[:, 0] - self.west_m) / self.cell_m[0]
+        y = (self.north_m - points[:, 1]) / self.cell_m[1]
+        # The outer half of the border cells has their own height.
+        outside = ~((x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5))
+        x, y = np.clip(np.where(outside, 0.0, x), 0, columns - 1), np.clip(np.where(outside, 0.0, y), 0, rows - 1)
+        x0, y0 = np.minimum(x.astype(int), max(columns - 2, 0)), np.minimum(y.astype(int), max(rows - 2, 0))
+        x1, y1 = np.minimum(x0 + 1, columns - 1), np.minimum(y0 + 1, rows - 1)
+        fx, fy = x - x0, y - y0
+        top = self.heights_m[y0, x0] * (1 - fx) + self.heights_m[y0, x1] * fx
+        bottom = self.heights_m[y1, x0] * (1 - fx) + self.heights_m[y1, x1] * fx
+        return np.where(outside, self.outside_m, top * (1 - fy) + bottom * fy)
+
+
+def open_dem(
+    path: Path, crs: str, origin_m: tuple[float, float, float], positions_m: FloatArray
+) -> tuple[DemGround, tuple[str, ...]]:
+    """The DEM under a block, resampled bilinearly into the block's CRS, and what the user should know about it.
+
+    path: any single-band raster of heights in metres that GDAL reads (the first band counts). crs: authority code of
+    the world frame or "local"; origin_m: the world origin in it; positions_m: (N, 3) projection centres in the world
+    frame. Only the block's extent, 5 flying heights around the cameras, is read. Cells without data get the median.
+    Raises ConfigError where the file cannot be read, its CRS cannot be brought to the block's, or it does not cover
+    the block.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    if len(positions_m) == 0:
+        raise ConfigError(f"the DEM {path} needs image positions to find the block on it; give poses or a constant")
+    try:
+        with rasterio.open(path) as dataset:
+            source_crs, notes = _source_crs(dataset, path, crs)
+            absolute = np.asarray(positions_m, dtype=np.float64) + np.asarray(origin_m)
+            low, high = absolute[:, :2].min(axis=0), absolute[:, :2].max(axis=0)
+            frames = (source_crs, source_crs if crs == "local" else rasterio.CRS.from_user_input(crs))
+            coarse, _ = _read_extent(dataset, frames, low - _MARGIN_M[0], high + _MARGIN_M[0], 512)
+            if not np.isfinite(coarse).any():
+                raise ConfigError(f"the DEM {path} does not cover the block {_extent_text(low, high, crs)}")
+            reach = MAX_DISTANCE_FACTOR * float(absolute[:, 2].max() - np.nanmin(coarse))
+            margin = float(np.clip(reach, *_MARGIN_M))
+            heights, transform = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS)
+    except RasterioError as error:
+        raise ConfigError(f"cannot read the DEM {path}: {error}; give a GeoTIFF of heights or a constant") from error
+    known = np.isfinite(heights)
+    median = float(np.median(heights[known]))
+    if not known.all():
+        missing = 100.0 * float(1.0 - known.mean())
+        notes = (
+            *notes,
+            f"the DEM {path} has no data in {missing:.0f} % of the block's surroundings: {median:.1f} m there",
+        )
+        heights = np.where(known, heights, median)
+    ground = DemGround(
+        heights - origin_m[2],
+        transform.c + 0.5 * transform.a - origin_m[0],
+        transform.f + 0.5 * transform.e - origin_m[1],
+        (transform.a, -transform.e),
+        median - origin_m[2],
+    )
+    return ground, notes
+
+
+def _source_crs(dataset: DatasetReader, path: Path, crs: str) -> tuple[Any, tuple[str, ...]]:
+    """The CRS to read a DEM in, and a note where it had to be assumed."""
+    import rasterio
+
+    if crs == "local":
+        if dataset.crs is not None:
+            raise ConfigError(
+                f"the DEM {path} is in {dataset.crs}, the poses in a local frame; give --crs or a local DEM"
+            )
+        # Both sides in one arbitrary frame: nothing is transformed.
+        return rasterio.CRS.from_epsg(3857), ()
+    if dataset.crs is None:
+        return rasterio.CRS.from_user_input(crs), (f"the DEM {path} names no CRS; the block's, {crs}, is assumed",)
+    return dataset.crs, ()
+
+
+def _read_extent(
+    dataset: DatasetReader, frames: tuple[Any, Any], low: FloatArray, high: FloatArray, max_cells: int
+) -> tuple[FloatArray, Any]:
+    """Heights (H, W) float64, NaN without data, over a box of the second frame's CRS, and their affine transform.
+
+    frames: CRS of the DEM and of the block. Cells are as fine as the DEM's; within one CRS they are its own.
+    """
+    from rasterio.transform import from_origin
+    from rasterio.warp import Resampling, reproject, transform_bounds
+
+    left, bottom, right, top = transform_bounds(frames[1], frames[0], *low, *high)
+    own = dataset.transform
+    cells = np.hypot([own.a, own.b], [own.d, own.e])
+    if frames[0] == frames[1] and own.b == own.d == 0.0 and own.e < 0.0:
+        west = own.c + np.floor((low[0] - own.c) / own.a) * own.a
+        north = own.f + np.ceil((high[1] - own.f) / -own.e) * -own.e
+        size = np.array([own.a, -own.e])
+    else:
+        west, north = low[0], high[1]
+        size = (high - low) / np.maximum(np.array([right - left, top - bottom]) / cells, 1.0)
+    size = size * np.maximum(np.ceil((high - low) / size / max_cells), 1.0)
+    columns, rows = np.ceil((np.array([high[0] - west, north - low[1]])) / size).astype(int) + 1
+    transform = from_origin(west, north, *size)
+    heights = np.full((rows, columns), np.nan)
+    reproject(
+        _band(dataset),
+        heights,
+        src_transform=own,
+        src_crs=frames[0],
+        src_nodata=dataset.nodata,
+        dst_transform=transform,
+        dst_crs=frames[1],
+        dst_nodata=np.nan,
+        resampling=Resampling.bilinear,
+        tolerance=0.0,
+    )
+    return heights, transform
+
+
+def _band(dataset: DatasetReader) -> Any:
+    import rasterio
+
+    return rasterio.band(dataset, 1)
+
+
+def _extent_text(low: FloatArray, high: FloatArray, crs: str) -> str:
+    return f"(x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} in {crs}); check --crs"

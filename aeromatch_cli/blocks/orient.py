@@ -1,0 +1,140 @@
+"""From positions and angles in any convention to poses in the world frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from aeromatch_cli.blocks.crs import (
+    LOCAL,
+    WorldFrame,
+    choose_crs,
+    convergence_deg,
+    grid_from_geographic,
+    rounded_origin_m,
+)
+from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.poses import AttitudeKind, PoseRow, PositionKind
+from aeromatch_cli.data import FloatArray, Pose
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_quaternion, from_yaw_pitch_roll
+
+AngleConvention = Literal["auto", "gimbal", "nadir"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Where and how one image was taken, as stated. Units and kinds as in `poses.PoseRow`.
+
+    forward: for yaw, pitch, roll: True where the optical axis is body x (gimbal), False where it is down (nadir).
+    """
+
+    position: tuple[float, float, float]
+    position_kind: PositionKind
+    attitude: tuple[float, ...] | None
+    attitude_kind: AttitudeKind
+    forward: bool
+    sigma_position_m: float | None = None
+    sigma_angle_deg: float | None = None
+
+
+def observation_of_row(row: PoseRow, angles: AngleConvention) -> Observation | None:
+    """What a line of a pose list states; None without position. "auto" means gimbal here."""
+    if row.position is None:
+        return None
+    return Observation(
+        position=row.position,
+        position_kind=row.position_kind,
+        attitude=row.attitude,
+        attitude_kind=row.attitude_kind,
+        forward=angles != "nadir",
+        sigma_position_m=row.sigma_position_m,
+        sigma_angle_deg=row.sigma_angle_deg,
+    )
+
+
+def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observation | None:
+    """What an image's header states; None without position and altitude. "auto" goes by the tags' origin."""
+    if facts.latitude_deg is None or facts.longitude_deg is None or facts.altitude_m is None:
+        return None
+    position = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
+    found = facts.angles
+    if found is None:
+        return Observation(position, "geographic", None, "none", forward=True)
+    convention = found.convention if angles == "auto" else angles
+    attitude = (found.yaw_deg, found.pitch_deg, found.roll_deg)
+    return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward=convention == "gimbal")
+
+
+def oriented(
+    observations: Mapping[str, Observation],
+    crs: str,
+    stated_crs: str | None,
+    known_frame: WorldFrame | None,
+    sigma_position_m: float,
+    sigma_angle_deg: float,
+) -> tuple[WorldFrame, dict[str, Pose], tuple[str, ...]]:
+    """World frame, poses by image name, and names whose position lies outside the CRS.
+
+    crs: what the user gave ("auto", "local" or a code); stated_crs: what an input file states, or None. known_frame:
+    the frame of an earlier run on a block that has grown since; used again where its CRS is the same, so that old
+    poses keep their numbers. sigmas: where an observation states none. Raises ConfigError.
+    """
+    geographic = {name: o for name, o in observations.items() if o.position_kind == "geographic"}
+    latitudes = np.array([o.position[0] for o in geographic.values()])
+    longitudes = np.array([o.position[1] for o in geographic.values()])
+    automatic = crs.strip().lower() in ("", "auto") and stated_crs is None
+    code = (
+        known_frame.crs
+        if known_frame is not None and automatic and (known_frame.crs == LOCAL) == (not geographic)
+        else choose_crs(crs, stated_crs, latitudes.tolist(), longitudes.tolist())
+    )
+    grid = {name: np.array(o.position) for name, o in observations.items() if o.position_kind == "grid"}
+    turns = dict.fromkeys(grid, 0.0)
+    outside: list[str] = []
+    if geographic:
+        xy_m = grid_from_geographic(code, latitudes, longitudes)
+        convergences = convergence_deg(code, latitudes, longitudes)
+        for row, (name, observation) in enumerate(geographic.items()):
+            if np.isfinite(xy_m[row]).all() and np.isfinite(convergences[row]):
+                grid[name] = np.array([*xy_m[row], observation.position[2]])
+                turns[name] = float(convergences[row])
+            else:
+                outside.append(name)
+        if len(outside) == len(geographic):
+            raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+    frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
+    poses = {
+        name: Pose(
+            center_m=center_m - np.array(frame.origin_m),
+            world_rotation=_rotation(observations[name], turns[name]),
+            sigma_position_m=observations[name].sigma_position_m or sigma_position_m,
+            sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
+        )
+        for name, center_m in grid.items()
+    }
+    return frame, poses, tuple(outside)
+
+
+def _origin_m(crs: str, centers_m: list[FloatArray], known: WorldFrame | None) -> tuple[float, float, float]:
+    if known is not None and known.crs == crs:
+        return known.origin_m
+    if crs == LOCAL and (not centers_m or np.abs(np.array(centers_m)).max() < 1e5):
+        return 0.0, 0.0, 0.0  # small coordinates stay as the user knows them
+    return rounded_origin_m(np.array(centers_m)) if centers_m else (0.0, 0.0, 0.0)
+
+
+def _rotation(observation: Observation, convergence: float) -> FloatArray | None:
+    """cam_from_world rotation; convergence in degrees, 0 where the position was given in the grid."""
+    values = observation.attitude
+    if values is None:
+        return None
+    if observation.attitude_kind == "quaternion":
+        return from_quaternion(*values)
+    if observation.attitude_kind == "omega_phi_kappa":
+        return from_omega_phi_kappa(*values)
+    yaw_deg, pitch_deg, roll_deg = values
+    return from_yaw_pitch_roll(yaw_deg - convergence, pitch_deg, roll_deg, forward=observation.forward)

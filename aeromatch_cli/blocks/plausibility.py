@@ -1,0 +1,171 @@
+"""Checks of what a pose list, EXIF tags and a ground claim together. Each warning is one sentence: what is odd, in
+which images, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import Block, BoolArray, FloatArray
+from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR, sees_horizon
+from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, from_yaw_pitch_roll, rotation_z
+
+# Image names (N,) as an array, so that masks select them.
+Names = NDArray[np.object_]
+
+_NAMES_SHOWN = 3
+_LOWEST_HEIGHT_M, _HIGHEST_HEIGHT_M = 5.0, 10_000.0
+_LARGEST_SPREAD_M = 1_000_000.0
+_NULL_ISLAND_DEG = 0.01
+# Dry land lies hardly below sea level, and the ellipsoid, where altitudes may count from, up to 106 m above the geoid:
+# a ground this low most likely means altitudes above the take-off point.
+_LOW_GROUND_M = -40.0
+# Largest relative altitude that is worth suspecting.
+_RELATIVE_ALTITUDE_M = 1500.0
+
+
+def warnings_of(block: Block, unpaired: Collection[str] = (), guessed_cameras: Collection[str] = ()) -> tuple[str, ...]:
+    """Every warning about a block, the gravest first.
+
+    unpaired: names of the images that no pair holds. guessed_cameras: camera ids whose focal length is a guess.
+    """
+    ids = [i.image_id for i in block.images if i.image_id in block.poses]
+    names_by_id = {image.image_id: image.name for image in block.images}
+    names = np.array([names_by_id[image_id] for image_id in ids], dtype=object)
+    centers = np.array([block.poses[image_id].center_m for image_id in ids]).reshape(-1, 3)
+    found = [
+        *_position_warnings(block, names, centers),
+        *_height_warnings(block, names, centers),
+        *_attitude_warnings(block, ids, names),
+    ]
+    guessed = [image.name for image in block.images if image.camera_id in set(guessed_cameras)]
+    if guessed:
+        found.append(
+            f"the focal length of {_some(guessed)} is a guess: pairs, views and verification depend on it; give "
+            "--cameras"
+        )
+    if unpaired:
+        found.append(f"{_some(list(unpaired))} in no pair: check the poses, or lower pairs.min_overlap")
+    return tuple(found)
+
+
+def _position_warnings(block: Block, names: Names, centers: FloatArray) -> list[str]:
+    found = []
+    null_island = _at_null_island(block, centers)
+    if null_island.any():
+        found.append(
+            f"{_some(names[null_island])} at latitude 0, longitude 0: no GPS fix; remove these positions so that the "
+            "images are paired by name"
+        )
+    rest = centers[~null_island, :2]
+    if len(rest) >= 2:
+        spread = float(np.hypot(*np.ptp(rest, axis=0)))
+        if spread < 1e-3:
+            found.append(
+                f"all {len(rest)} positions are identical: the position of the project or take-off point instead of "
+                "each image's? Give the projection centres, or --poses none"
+            )
+        elif spread > _LARGEST_SPREAD_M:
+            far = np.linalg.norm(centers[:, :2] - np.median(rest, axis=0), axis=1) > 0.5 * _LARGEST_SPREAD_M
+            found.append(
+                f"the positions spread over {spread / 1000.0:,.0f} km, {_some(names[far & ~null_island])} far from the "
+                "rest: check exchanged coordinates (x and y, lat and lon) and --crs"
+            )
+    return found
+
+
+def _at_null_island(block: Block, centers: FloatArray) -> BoolArray:
+    """(N,) True where a position is latitude 0, longitude 0, or x = y = 0 of a projected CRS."""
+    if block.crs == "local" or len(centers) == 0:
+        return np.zeros(len(centers), dtype=bool)
+    from pyproj import Transformer
+
+    easting, northing = (centers[:, :2] + np.asarray(block.origin_m[:2])).T
+    to_geographic = Transformer.from_crs(block.crs, "EPSG:4326", always_xy=True)
+    longitude, latitude = to_geographic.transform(easting, northing)
+    at_zero = (np.abs(latitude) < _NULL_ISLAND_DEG) & (np.abs(longitude) < _NULL_ISLAND_DEG)
+    return np.asarray(at_zero | ((np.abs(easting) < 1.0) & (np.abs(northing) < 1.0)))
+
+
+def _height_warnings(block: Block, names: Names, centers: FloatArray) -> list[str]:
+    if block.ground is None or len(centers) == 0:
+        return []
+    found = []
+    ground = block.ground.height_m(centers[:, :2])
+    heights = centers[:, 2] - ground
+    altitudes, ground_altitude = centers[:, 2] + block.origin_m[2], float(np.median(ground)) + block.origin_m[2]
+    below = heights <= 0.0
+    if 2 * below.sum() > len(below) and (np.abs(altitudes) < _RELATIVE_ALTITUDE_M).all() and (altitudes > 0.0).all():
+        found.append(
+            f"the altitudes ({altitudes.min():.0f} to {altitudes.max():.0f} m) look relative to the take-off point: "
+            f"{_some(names[below])} below the ground at {ground_altitude:.0f} m; give --ground in the altitudes' own "
+            "frame, or --ground auto, or absolute altitudes"
+        )
+    elif below.any():
+        found.append(
+            f"{_some(names[below])} below the ground ({ground_altitude:.0f} m): these images see nothing; check their "
+            "altitude and --ground"
+        )
+    elif block.crs != "local" and ground_altitude < _LOW_GROUND_M:
+        found.append(
+            f"the ground lies at {ground_altitude:.0f} m, so the altitudes look relative to the take-off point: fine "
+            "within this block, but a DEM or another flight will not fit; give absolute altitudes if that matters"
+        )
+    odd = ~below & ((heights < _LOWEST_HEIGHT_M) | (heights > _HIGHEST_HEIGHT_M))
+    if odd.any():
+        found.append(
+            f"{_some(names[odd])} flown {heights[odd].min():,.1f} to {heights[odd].max():,.1f} m above ground: check "
+            "units (feet?), --crs and --ground"
+        )
+    return found
+
+
+def _attitude_warnings(block: Block, ids: Sequence[str], names: Names) -> list[str]:
+    cameras = {image.image_id: block.camera(image) for image in block.images}
+    oriented = [(row, i, r) for row, i in enumerate(ids) if (r := block.poses[i].world_rotation) is not None]
+    if not oriented:
+        return []
+    rotations = [rotation for _, _, rotation in oriented]
+    if len(rotations) >= 2 and _all_zero(rotations):
+        return [
+            f"all angles of {_some(names[[row for row, _, _ in oriented]])} are zero: most likely they were never "
+            "measured; leave them out, and the images are paired by position"
+        ]
+    horizon = [row for row, image_id, rotation in oriented if sees_horizon(cameras[image_id], rotation)]
+    if horizon:
+        return [
+            f"{_some(names[horizon])} with the horizon in view: ground beyond {MAX_DISTANCE_FACTOR:g} flying heights "
+            "is left out; if the flight was not oblique, check the angle convention"
+        ]
+    return []
+
+
+def _all_zero(rotations: Sequence[FloatArray]) -> bool:
+    """Whether all attitudes are one, and that one is what zero angles of some convention give.
+
+    Yaw that was given against true north is turned by the meridian convergence, at most a few degrees.
+    """
+    first = rotations[0]
+    if any(angle_between_deg(first, rotation) > 0.1 for rotation in rotations[1:]):
+        return False
+    zeros = [
+        from_omega_phi_kappa(0.0, 0.0, 0.0),
+        from_yaw_pitch_roll(0.0, 0.0, 0.0, forward=True),
+        from_yaw_pitch_roll(0.0, 0.0, 0.0, forward=False),
+        np.eye(3),
+    ]
+    for zero in zeros:
+        world_turn = zero.T @ first
+        heading = float(np.rad2deg(np.arctan2(world_turn[1, 0], world_turn[0, 0])))
+        if abs(heading) < 5.0 and angle_between_deg(world_turn, rotation_z(heading)) < 1e-3:
+            return True
+    return False
+
+
+def _some(names: Sequence[str] | Names) -> str:
+    """How many images, and the first of them by name."""
+    shown = ", ".join(names[:_NAMES_SHOWN])
+    more = ", ..." if len(names) > _NAMES_SHOWN else ""
+    return f"{len(names)} image{'s' if len(names) != 1 else ''} ({shown}{more})"

@@ -1,0 +1,286 @@
+"""The pose list: a CSV or TXT file with a header, one line per image.
+
+Columns, in any order and case (aliases in brackets):
+
+  image [filename, file, name, label, photo, image_name]   path relative to the images folder
+  x y z [easting northing]      projection centre in the block's CRS, or
+  lat lon alt [latitude, longitude lng long, altitude]     projection centre in WGS84 degrees and metres
+  omega_deg phi_deg kappa_deg [omega phi kappa]   relative to the grid, or
+  yaw_deg pitch_deg roll_deg [yaw pitch roll]     yaw against grid north with x y z, true north with lat lon alt, or
+  qw qx qy qz                   cam_from_world, relative to the grid, or no attitude at all
+  camera                        name of the camera (optional)
+  sigma_position_m sigma_angle_deg                standard deviations (optional)
+
+The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
+header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose coordinates are
+empty or NaN leaves its image without pose and is reported; every other defect is a ConfigError.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from aeromatch_cli.errors import ConfigError
+
+PositionKind = Literal["grid", "geographic"]
+AttitudeKind = Literal["omega_phi_kappa", "yaw_pitch_roll", "quaternion", "none"]
+
+_POSITIONS: dict[PositionKind, tuple[str, ...]] = {"grid": ("x", "y", "z"), "geographic": ("lat", "lon", "alt")}
+_ATTITUDES: dict[AttitudeKind, tuple[str, ...]] = {
+    "omega_phi_kappa": ("omega_deg", "phi_deg", "kappa_deg"),
+    "yaw_pitch_roll": ("yaw_deg", "pitch_deg", "roll_deg"),
+    "quaternion": ("qw", "qx", "qy", "qz"),
+}
+_SIGMAS = ("sigma_position_m", "sigma_angle_deg")
+_KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", *_SIGMAS)
+_ALIASES = {
+    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name"), "image"),
+    **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
+    **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
+    **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
+}
+# Columns that might be meant as z or alt, and might as well be heights above ground.
+_UNCLEAR_HEIGHTS = ("z", "alt", "height", "h", "elevation", "relative_altitude", "agl")
+_BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
+_RANGES = {"lat": 90.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
+_LARGEST_ANGLE_DEG = 360.0
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One line of a pose list.
+
+    image: as written, with forward slashes. line: 1-based, for messages. position: x, y, z in metres or lat, lon in
+    degrees and alt in metres, as `position_kind` says; None where the line gives none. attitude: three angles in
+    degrees or a quaternion (w, x, y, z), as `attitude_kind` says; None with "none". camera: "" where not given.
+    """
+
+    image: str
+    line: int
+    position: tuple[float, float, float] | None
+    position_kind: PositionKind
+    attitude: tuple[float, ...] | None
+    attitude_kind: AttitudeKind
+    camera: str = ""
+    sigma_position_m: float | None = None
+    sigma_angle_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class PoseList:
+    """A pose list as read. warnings: columns that were ignored and lines without usable coordinates."""
+
+    rows: tuple[PoseRow, ...]
+    position_kind: PositionKind
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    separator: str | None  # None: blanks
+    columns: tuple[str, ...]
+    position_kind: PositionKind
+    attitude_kind: AttitudeKind
+    ignored: tuple[str, ...]
+
+
+def read_poses(path: Path) -> PoseList:
+    """Reads a pose list. Raises ConfigError with file, line and column where the list is malformed."""
+    lines = [line for line in enumerate(_text(path).splitlines(), start=1) if line[1].strip()]
+    header, layout, records = _header(path, lines)
+    warnings: list[str] = []
+    if layout.ignored:
+        warnings.append(f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}")
+    rows: list[PoseRow] = []
+    lines_of: dict[str, int] = {}
+    for number, line in records:
+        row = _row(path, number, _split(path, number, line, layout.separator), layout, warnings)
+        if row.image in lines_of:
+            raise ConfigError(
+                f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
+                "keep one of the two lines"
+            )
+        lines_of[row.image] = number
+        rows.append(row)
+    if not rows:
+        raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
+    return PoseList(tuple(rows), layout.position_kind, tuple(warnings))
+
+
+def _text(path: Path) -> str:
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"pose list {path} cannot be read ({error.strerror}): give a CSV file, or exif, with --poses"
+        ) from error
+    encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        text = raw.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"pose list {path} is not {encoding[:6].upper()} text: save it as UTF-8 CSV") from error
+    if "\0" in text:
+        raise ConfigError(f"pose list {path} is a binary file: give a CSV or TXT file")
+    return text
+
+
+def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, list[tuple[int, str]]]:
+    """Line number of the header, what it says, and the lines behind it without comments."""
+    if not lines:
+        raise ConfigError(f"pose list {path} is empty: its first line names the columns, such as image,x,y,z")
+    first = next((place for place, (_, line) in enumerate(lines) if not line.lstrip().startswith("#")), len(lines))
+    places = [first] if first < len(lines) else []
+    # A header behind a comment mark counts only where the first plain line is none.
+    for place in [*places, *range(first - 1, -1, -1)]:
+        number, line = lines[place]
+        separator, columns = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
+        if "image" in columns and len(columns) > 1:
+            records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
+            return number, _layout(path, number, separator, columns), records
+    number, line = lines[min(first, len(lines) - 1)]
+    found = ", ".join(_columns(line.strip())[1])[:120]
+    raise ConfigError(
+        f"{path}, line {number}: no header with a column 'image' (found {found}): the first line must name the "
+        "columns, such as image,x,y,z,omega_deg,phi_deg,kappa_deg"
+    )
+
+
+def _columns(line: str) -> tuple[str | None, tuple[str, ...]]:
+    """The separator under which most column names are known, and the canonical names."""
+    best: tuple[int, str | None, tuple[str, ...]] = (-1, None, ())
+    for separator in (",", ";", "\t", None):
+        cells = line.split(separator) if separator else line.split()
+        names = tuple(_canonical(cell) for cell in cells)
+        known = sum(name in _KNOWN for name in names)
+        if known > best[0]:
+            best = (known, separator, names)
+    return best[1], best[2]
+
+
+def _canonical(cell: str) -> str:
+    name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", cell.strip().strip("\"'").strip().lower())
+    name = re.sub(r"[\s-]+", "_", name)
+    return _ALIASES.get(name, name)
+
+
+def _layout(path: Path, number: int, separator: str | None, columns: tuple[str, ...]) -> _Layout:
+    where = f"{path}, line {number}"
+    twice = sorted({name for name in columns if name and columns.count(name) > 1})
+    if twice:
+        raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
+    unknown = tuple(name for name in columns if name and name not in _KNOWN)
+    for name in unknown:
+        near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
+        if near and len(name) > 2:
+            raise ConfigError(f"{where}: unknown column {name!r}: did you mean {near[0]!r}?")
+    position = _form(where, "position", _POSITIONS, columns, unknown)
+    if position is None:
+        raise ConfigError(f"{where}: no position: add the columns x,y,z or lat,lon,alt")
+    attitude = _form(where, "attitude", _ATTITUDES, columns, unknown)
+    return _Layout(separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown)
+
+
+def _form(
+    where: str, what: str, forms: Mapping[Any, tuple[str, ...]], columns: tuple[str, ...], unknown: tuple[str, ...]
+) -> str | None:
+    """The one form of position or attitude that the columns give, None without any."""
+    # The first two columns of a form tell it best: people write lat, lon, z and x, y, alt.
+    present = [kind for kind, names in forms.items() if any(name in columns for name in names[:2])]
+    present = present or [kind for kind, names in forms.items() if any(name in columns for name in names)]
+    if len(present) > 1:
+        both = " and ".join(",".join(forms[kind]) for kind in present)
+        raise ConfigError(f"{where}: two forms of {what} ({both}): delete the columns of one")
+    if not present:
+        return None
+    missing = [name for name in forms[present[0]] if name not in columns]
+    if missing:
+        heights = [name for name in columns if name in _UNCLEAR_HEIGHTS and missing[0] in ("z", "alt")]
+        hint = f" (if {heights[0]!r} is not a height above ground, name it {missing[0]!r})" if heights else ""
+        raise ConfigError(
+            f"{where}: column {missing[0]!r} is missing: {what} needs {','.join(forms[present[0]])}{hint}"
+        )
+    return str(present[0])
+
+
+def _split(path: Path, number: int, line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    try:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    except (csv.Error, StopIteration) as error:
+        raise ConfigError(f"{path}, line {number}: not a line of separated values ({error})") from error
+
+
+def _row(path: Path, number: int, cells: list[str], layout: _Layout, warnings: list[str]) -> PoseRow:
+    while len(cells) > len(layout.columns) and not cells[-1].strip():
+        cells = cells[:-1]
+    if len(cells) != len(layout.columns):
+        raise ConfigError(
+            f"{path}, line {number}: {len(cells)} values, but the header names {len(layout.columns)} columns: "
+            "check separators and quotes"
+        )
+    record = dict(zip(layout.columns, (cell.strip() for cell in cells), strict=True))
+    image = re.sub(r"^(\./)+", "", record["image"].replace("\\", "/"))
+    if not image:
+        raise ConfigError(f"{path}, line {number}, column image: empty: name the image")
+    decimal_comma = layout.separator != ","
+
+    def numbers(names: tuple[str, ...]) -> tuple[float | None, ...]:
+        return tuple(_number(path, number, name, record[name], decimal_comma) for name in names)
+
+    sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
+    position = numbers(_POSITIONS[layout.position_kind])
+    attitude = numbers(_ATTITUDES[layout.attitude_kind]) if layout.attitude_kind != "none" else ()
+    x, y, z = position
+    lacking = next((n for n, v in zip(_POSITIONS[layout.position_kind], position, strict=True) if v is None), None)
+    if lacking:
+        warnings.append(f"{path.name}, line {number}, column {lacking}: no number; {image} is treated as unposed")
+    elif layout.position_kind == "geographic" and x == 0.0 and y == 0.0:
+        warnings.append(f"{path.name}, line {number}: position (0, 0); {image} is treated as unposed")
+        x = None
+    whole = tuple(value for value in attitude if value is not None)
+    if len(whole) < len(attitude):
+        warnings.append(f"{path.name}, line {number}: attitude is incomplete; {image} has a position only")
+        whole = ()
+    if len(whole) == 4 and abs(math.hypot(*whole) - 1.0) > 0.05:
+        raise ConfigError(f"{path}, line {number}: qw,qx,qy,qz has length {math.hypot(*whole):.3g}, not 1")
+    return PoseRow(
+        image=image,
+        line=number,
+        position=(x, y, z) if x is not None and y is not None and z is not None else None,
+        position_kind=layout.position_kind,
+        attitude=whole or None,
+        attitude_kind=layout.attitude_kind if whole else "none",
+        camera=record.get("camera", ""),
+        sigma_position_m=sigmas[0],
+        sigma_angle_deg=sigmas[1],
+    )
+
+
+def _number(path: Path, line: int, column: str, cell: str, decimal_comma: bool) -> float | None:
+    """The value of a cell, None where it is empty or NaN. Raises ConfigError where it is no number or out of range."""
+    where = f"{path}, line {line}, column {column}"
+    if cell.lower() in _BLANKS:
+        return None
+    if decimal_comma and cell.count(",") == 1 and "." not in cell:
+        cell = cell.replace(",", ".")
+    try:
+        value = float(cell)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {cell!r} is not a number") from error
+    if math.isnan(value):
+        return None
+    largest = _RANGES.get(column, _LARGEST_ANGLE_DEG if column.endswith("_deg") else math.inf)
+    if math.isinf(value) or abs(value) > largest:
+        limits = f" between {-largest:g} and {largest:g}" if largest < math.inf else ""
+        raise ConfigError(f"{where}: {cell} is out of range: expected a number{limits}")
+    if column in _SIGMAS and value <= 0:
+        raise ConfigError(f"{where}: {cell} is out of range: a standard deviation is positive")
+    return value

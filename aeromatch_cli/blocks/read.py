@@ -1,0 +1,287 @@
+"""From what the user has (a folder, a pose list, a camera file) to images, cameras and poses in one world frame.
+
+One bad image never stops the rest: it is left out and recorded. A bad list or setting is a ConfigError.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, get_args
+
+import numpy as np
+
+from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
+from aeromatch_cli.blocks.cameras import CameraAssignment, cameras_from_exif, cameras_from_file, listed
+from aeromatch_cli.blocks.crs import WorldFrame, checked_crs
+from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
+from aeromatch_cli.blocks.orient import (
+    AngleConvention,
+    Observation,
+    observation_of_exif,
+    observation_of_row,
+    oriented,
+)
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, read_poses
+from aeromatch_cli.blocks.scan import ScanFailure, image_ids, scan_images
+from aeromatch_cli.data import Camera, Image, Pose
+from aeromatch_cli.errors import ConfigError, InputError
+
+STAGE = "read"
+EXIF = "exif"
+FOLDER = "folder"
+
+FactsReader = Callable[[Sequence[Path]], Sequence[ExifFacts | str]]
+
+
+class ReadFailure(NamedTuple):
+    """An image that is left out: its relative path, the stage ("read") and why."""
+
+    name: str
+    stage: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class BlockInputs:
+    """A block before its ground is known.
+
+    images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose in the world (crs - origin_m);
+    images without position are absent. ground_hint_z_m: world height of the ground as the input states it, or None;
+    ground_hint_source: where it came from, in words, "" for None; ground_is_stated: the user's camera file says so,
+    rather than a barometer. guessed_cameras: camera ids whose focal length is a guess. warnings: for a person, in order of reading.
+    """
+
+    images: tuple[Image, ...]
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, Pose]
+    crs: str
+    origin_m: tuple[float, float, float]
+    ground_hint_z_m: float | None
+    ground_hint_source: str
+    ground_is_stated: bool
+    guessed_cameras: frozenset[str]
+    warnings: tuple[str, ...]
+    failures: tuple[ReadFailure, ...]
+
+
+def read_facts_serially(paths: Sequence[Path]) -> list[ExifFacts | str]:
+    """Header facts of each file, or the reason why it is unusable; about a millisecond per file."""
+    return [exif_or_reason(path) for path in paths]
+
+
+def read_block_inputs(
+    images_dir: Path,
+    poses: str | None,
+    cameras: str = EXIF,
+    crs: str = "auto",
+    angles: AngleConvention = "auto",
+    *,
+    sigma_position_m: float,
+    sigma_angle_deg: float,
+    known_frame: WorldFrame | None = None,
+    read_facts: FactsReader = read_facts_serially,
+) -> BlockInputs:
+    """Reads everything that is known of a block, except its ground.
+
+    poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder" (a
+    camera of its own for every folder). crs: a code, "local" or "auto". angles: what yaw, pitch, roll mean; "auto":
+    by the tags' origin in EXIF (DJI gimbal, Camera:* nadir), gimbal in a pose list. sigmas: of a pose that states
+    none. known_frame: of an earlier run in the same workspace, kept so that a growing block does not move.
+    read_facts: maps `exif.exif_or_reason` over paths, in order; give a parallel one for large blocks.
+
+    Raises ConfigError for a bad argument, pose list or camera file, InputError where no image is left.
+    """
+    if angles not in get_args(AngleConvention):
+        raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
+    # Lists first: they are quick, and a mistake in them should not cost a walk over 10,000 files.
+    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
+    camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
+    names, scan_failures = scan_images(images_dir)
+    warnings, failures = _report_scan(scan_failures)
+    outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
+    failures += [ReadFailure(name, STAGE, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
+    facts = {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}
+    rows: dict[str, PoseRow] = {}
+    if pose_list is not None:
+        rows, remarks = _matched(pose_list, names, f"pose list {poses}")
+        warnings += [*pose_list.warnings, *remarks]
+    assignment = _assign_cameras(cameras, camera_file, facts, {name: row.camera for name, row in rows.items()})
+    warnings += assignment.warnings
+    failures += [ReadFailure(name, STAGE, reason) for name, reason in assignment.reasons.items()]
+    facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
+    if not facts:
+        raise InputError(_nothing_left(images_dir, failures))
+
+    observations, remarks = _observations(poses or "", rows, facts, angles)
+    warnings += remarks
+    frame, named_poses, outside = oriented(
+        observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
+    )
+    if outside:
+        warnings.append(f"{_count(outside, facts)} lie outside the area of {frame.crs} and are treated as unposed")
+    stated_z_m = _stated_ground(camera_file, frame)
+    hint_z_m, hint_source = _relative_ground(named_poses, facts)
+    if stated_z_m is not None:
+        hint_z_m, hint_source = stated_z_m, f"ground height of {Path(cameras).name}"
+    ids = image_ids(facts)
+    images = [_image(name, ids[name], fact, assignment.camera_ids[name]) for name, fact in facts.items()]
+    return BlockInputs(
+        images=tuple(sorted(images, key=lambda image: image.image_id)),
+        cameras=assignment.cameras,
+        poses={ids[name]: pose for name, pose in named_poses.items()},
+        crs=frame.crs,
+        origin_m=frame.origin_m,
+        ground_hint_z_m=hint_z_m,
+        ground_hint_source=hint_source,
+        ground_is_stated=stated_z_m is not None,
+        guessed_cameras=assignment.guessed,
+        warnings=tuple(warnings),
+        failures=tuple(sorted(failures)),
+    )
+
+
+def _image(name: str, image_id: str, fact: ExifFacts, camera_id: str) -> Image:
+    return Image(
+        image_id=image_id,
+        name=name,
+        width_px=fact.width_px,
+        height_px=fact.height_px,
+        camera_id=camera_id,
+        exif_orientation=fact.orientation,
+        time=fact.time,
+    )
+
+
+def _report_scan(scan_failures: list[ScanFailure]) -> tuple[list[str], list[ReadFailure]]:
+    """Warnings of by-products, one per kind, and failures of pictures that are missing."""
+    failures = [ReadFailure(item.name, STAGE, item.reason) for item in scan_failures if item.image_lost]
+    passed: dict[str, list[str]] = defaultdict(list)
+    for item in scan_failures:
+        if not item.image_lost:
+            passed[item.reason].append(item.name)
+    return [f"passed over {len(items)}: {listed(items)}: {reason}" for reason, items in passed.items()], failures
+
+
+def _nothing_left(images_dir: Path, failures: list[ReadFailure]) -> str:
+    if not failures:
+        return f"no image (jpg, jpeg, png, tif, tiff) in {images_dir}: check --images"
+    return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
+
+
+def _assign_cameras(
+    cameras: str, camera_file: CameraFile | None, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]
+) -> CameraAssignment:
+    if camera_file is not None:
+        sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
+        return cameras_from_file(camera_file.cameras, sizes_px, columns)
+    groups = dict(columns)
+    if cameras == FOLDER:
+        groups = {name: columns.get(name) or str(PurePosixPath(name).parent) for name in facts}
+        groups = {name: "" if group == "." else group for name, group in groups.items()}
+    return cameras_from_exif(facts, groups)
+
+
+def _matched(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
+    """Image name -> its line, and remarks on lines without image and images without line.
+
+    An exact relative path comes first; then, only where exactly one image fits, the same path in another case, the
+    bare file name, and the name without suffix (Metashape's labels).
+    """
+    by_key: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        path = PurePosixPath(name)
+        for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
+            by_key[key].append(name)
+    exact = set(names)
+    rows: dict[str, PoseRow] = {row.image: row for row in pose_list.rows if row.image in exact}
+    absent: list[str] = []
+    ambiguous: list[str] = []
+    for row in pose_list.rows:
+        if row.image in exact:
+            continue
+        found = by_key.get(row.image.lower(), [])
+        if len(found) > 1:
+            ambiguous.append(row.image)
+        elif not found:
+            absent.append(row.image)
+        elif found[0] in rows:
+            raise ConfigError(
+                f"{source}, line {row.line}, column image: {row.image!r} and {rows[found[0]].image!r} (line "
+                f"{rows[found[0]].line}) both mean the image {found[0]}: keep one of the two lines"
+            )
+        else:
+            rows[found[0]] = row
+    if names and not rows:
+        raise ConfigError(
+            f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
+            f"folder holds {names[0]}; write paths relative to the images folder"
+        )
+    remarks = []
+    if absent:
+        remarks.append(f"{source} names {len(absent)} images that are not in the folder: {listed(absent)}")
+    if ambiguous:
+        remarks.append(
+            f"{source} gives {len(ambiguous)} names that several images have ({listed(ambiguous)}): their lines are "
+            "not used; write the path relative to the images folder"
+        )
+    unnamed = [name for name in names if name not in rows]
+    if unnamed:
+        remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
+    return rows, remarks
+
+
+def _observations(
+    poses: str, rows: Mapping[str, PoseRow], facts: Mapping[str, ExifFacts], angles: AngleConvention
+) -> tuple[dict[str, Observation], list[str]]:
+    """Observations by image name, and remarks on what the headers lack where poses come from EXIF."""
+    observations: dict[str, Observation] = {}
+    if poses != EXIF:
+        for name in facts:
+            stated = observation_of_row(rows[name], angles) if name in rows else None
+            if stated is not None:
+                observations[name] = stated
+        return observations, []
+    without: dict[str, list[str]] = defaultdict(list)
+    for name, fact in facts.items():
+        observation = observation_of_exif(fact, angles)
+        if observation is not None:
+            observations[name] = observation
+            if observation.attitude is None:
+                without["no angles in XMP: position only"].append(name)
+        elif fact.latitude_deg is not None:
+            without["a GPS position without altitude: treated as unposed"].append(name)
+        else:
+            without["no GPS position: treated as unposed"].append(name)
+    remarks = [f"{_count(items, facts)} have {what}" for what, items in without.items()]
+    notes = Counter(note for fact in facts.values() for note in fact.notes)
+    for note, count in notes.items():
+        remarks.append(f"{count} of {len(facts)} images: {note}")
+    return observations, remarks
+
+
+def _count(names: Sequence[str], total: Mapping[str, object]) -> str:
+    return f"{len(names)} of {len(total)} images ({listed(list(names))})"
+
+
+def _stated_ground(camera_file: CameraFile | None, frame: WorldFrame) -> float | None:
+    """World height that the camera file states; a height belongs to its frame: with another CRS its datum may differ."""
+    if camera_file is None or camera_file.ground_z_m is None:
+        return None
+    if camera_file.crs is not None and checked_crs(camera_file.crs) != frame.crs:
+        return None
+    return camera_file.ground_z_m - frame.origin_m[2]
+
+
+def _relative_ground(poses: Mapping[str, Pose], facts: Mapping[str, ExifFacts]) -> tuple[float | None, str]:
+    """World height below the take-off relative altitudes, and its source."""
+    heights_m = [
+        float(poses[name].center_m[2]) - relative_m
+        for name, fact in facts.items()
+        if name in poses and (relative_m := fact.relative_altitude_m) is not None
+    ]
+    if heights_m:
+        return float(np.median(heights_m)), f"XMP relative altitude of {len(heights_m)} images"
+    return None, ""

@@ -1,0 +1,126 @@
+"""Which files of a folder are images, and what each is called in the workspace."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from aeromatch_cli.errors import ConfigError
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+
+_FOLDER_MARK = "--"
+_LONGEST_SLUG = 150
+_HASH_DIGITS = 10
+
+
+@dataclass(frozen=True)
+class ScanFailure:
+    """Something that has the name of an image and is none.
+
+    name: path relative to the images folder. reason: in words. image_lost: True where a picture is probably missing
+    from the block (empty file, broken link, unreadable folder), False for by-products such as `._x.jpg`.
+    """
+
+    name: str
+    reason: str
+    image_lost: bool
+
+
+def scan_images(folder: Path) -> tuple[list[str], list[ScanFailure]]:
+    """Relative names (forward slashes, sorted) of the images below a folder, and what was passed over and why.
+
+    Folders are searched at any depth, links included; hidden files and folders are skipped. A suffix in any case
+    counts: jpg, jpeg, png, tif, tiff. Raises ConfigError where the folder is missing or cannot be read.
+    """
+    if not folder.is_dir():
+        what = "is not a folder" if folder.exists() else "does not exist"
+        raise ConfigError(f"images folder {folder} {what}: give the folder that holds the images with --images")
+    try:
+        next(folder.iterdir(), None)
+    except OSError as error:
+        raise ConfigError(f"images folder {folder} cannot be read ({error.strerror}): check its permissions") from error
+    names: list[str] = []
+    failures: list[ScanFailure] = []
+
+    def unreadable(error: OSError) -> None:
+        name = Path(error.filename).relative_to(folder).as_posix() if error.filename else ""
+        failures.append(ScanFailure(name, f"folder cannot be read ({error.strerror}): check its permissions", True))
+
+    visited: set[str] = set()
+    for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
+        real = os.path.realpath(parent)
+        if real in visited:  # a link that leads back up
+            subfolders.clear()
+            continue
+        visited.add(real)
+        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
+        for name in subfolders:
+            if Path(name).suffix.lower() in SUFFIXES:
+                relative = (Path(parent) / name).relative_to(folder).as_posix()
+                failures.append(ScanFailure(relative, "is a folder with the name of an image", False))
+        for name in files:
+            if Path(name).suffix.lower() not in SUFFIXES:
+                continue
+            path = Path(parent) / name
+            relative = path.relative_to(folder).as_posix()
+            failure = _failure_of(path, relative)
+            if failure is not None:
+                failures.append(failure)
+            elif not name.startswith("."):
+                names.append(relative)
+    return sorted(names), sorted(failures, key=lambda failure: failure.name)
+
+
+def _failure_of(path: Path, name: str) -> ScanFailure | None:
+    if path.name.startswith("._"):
+        return ScanFailure(name, "is macOS metadata (AppleDouble), not an image", False)
+    if path.name.startswith("."):
+        return None
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        readable = os.fsencode(name).decode("utf-8", "replace")
+        return ScanFailure(readable, "file name is not valid UTF-8: rename the file", True)
+    try:
+        size_bytes = path.stat().st_size
+    except OSError as error:
+        return ScanFailure(name, f"cannot be read ({error.strerror}): broken link or missing permission", True)
+    if not path.is_file():
+        return ScanFailure(name, "is not a regular file", False)
+    return ScanFailure(name, "file is empty: copy it again", True) if size_bytes == 0 else None
+
+
+def identifier(text: str) -> str:
+    """The text itself where it has only [A-Za-z0-9._-], else those characters of it and a hash: never two alike."""
+    readable = re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-")
+    return text if readable == text else f"{readable}-{_digest(text)}"
+
+
+def image_id(name: str) -> str:
+    """Identifier of an image, of characters [A-Za-z0-9._-], that depends on nothing but its relative path.
+
+    `a/1.jpg` becomes `a--1_jpg`. Where this is not reversible (blanks, accents, "--" in a name, very long paths), a
+    hash of the path is appended, so that different paths never share an identifier and adding images changes none.
+    """
+    stem, dot, suffix = name.rpartition(".")
+    plain = f"{stem}_{suffix}" if dot else name
+    readable = re.sub(r"[^A-Za-z0-9._-]", "_", plain.replace("/", _FOLDER_MARK))[:_LONGEST_SLUG]
+    back = readable.replace(_FOLDER_MARK, "/")
+    back_stem, _, back_suffix = back.rpartition("_")
+    if f"{back_stem}.{back_suffix}" == name:
+        return readable
+    return f"{readable}-{_digest(name)}"
+
+
+def image_ids(names: Iterable[str]) -> dict[str, str]:
+    """Relative name -> identifier, see `image_id`."""
+    return {name: image_id(name) for name in names}
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:_HASH_DIGITS]

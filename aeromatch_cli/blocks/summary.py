@@ -1,0 +1,121 @@
+"""What a block looks like in figures, and what in it can hardly be true."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeromatch_cli.blocks.plausibility import warnings_of
+from aeromatch_cli.data import Block, Pair
+from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.geometry.rotations import tilt_deg
+
+
+@dataclass(frozen=True)
+class BlockSummary:
+    """Figures of a block; NaN where nothing is known. Heights are above the ground below each camera.
+
+    extent_m: east-west and north-south extent of the projection centres. best_overlap: mean over the paired images of
+    the overlap with their best neighbour. warnings: one sentence each: what, which images, what to do.
+    """
+
+    images: int
+    cameras: int
+    positioned: int
+    oriented: int
+    crs: str
+    origin_m: tuple[float, float, float]
+    ground_source: str
+    flying_height_m: tuple[float, float, float]
+    mean_tilt_deg: float
+    max_tilt_deg: float
+    gsd_m: float
+    extent_m: tuple[float, float]
+    pairs: int | None
+    pairs_by_reason: tuple[tuple[str, int], ...]
+    best_overlap: float
+    unpaired: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """The summary for a person, one fact per line, without the warnings."""
+        low, median, high = self.flying_height_m
+        east, north = self.extent_m
+        found = [
+            f"images           {self.images}, {self.positioned} with position, {self.oriented} with attitude, "
+            f"{self.cameras} camera{'s' if self.cameras != 1 else ''}",
+            f"world            {self.crs}, origin {self.origin_m[0]:g} {self.origin_m[1]:g} {self.origin_m[2]:g}",
+            f"ground           {self.ground_source or 'unknown'}",
+        ]
+        if self.positioned:
+            found.append(f"extent           {east:.1f} m east-west, {north:.1f} m north-south")
+        if np.isfinite(median):
+            found.append(f"flying height    {median:.1f} m ({low:.1f} to {high:.1f}) above ground")
+        if np.isfinite(self.mean_tilt_deg):
+            found.append(
+                f"tilt             {self.mean_tilt_deg:.1f} degrees on average, {self.max_tilt_deg:.1f} at most"
+            )
+        if np.isfinite(self.gsd_m):
+            found.append(f"ground sampling  {100.0 * self.gsd_m:.2f} cm per pixel")
+        if self.positioned < self.images:
+            found.append(f"without position {self.images - self.positioned}: paired by name and time")
+        if self.oriented < self.positioned:
+            found.append(f"without attitude {self.positioned - self.oriented}: paired by position")
+        if self.pairs is not None:
+            reasons = ", ".join(f"{count} by {reason}" for reason, count in self.pairs_by_reason)
+            found.append(f"pairs            {self.pairs}" + (f" ({reasons})" if reasons else ""))
+        if np.isfinite(self.best_overlap):
+            found.append(f"overlap          {100.0 * self.best_overlap:.0f} % with the best neighbour, on average")
+        return found
+
+
+def summarise(block: Block, pairs: Sequence[Pair] | None = None, guessed_cameras: Collection[str] = ()) -> BlockSummary:
+    """Figures and plausibility of a block.
+
+    pairs: the chosen pairs, or None before they are chosen. guessed_cameras: camera ids whose focal length is a guess.
+    """
+    names = {image.image_id: image.name for image in block.images}
+    poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
+    centers = np.array([pose.center_m for pose in poses.values()]).reshape(-1, 3)
+    tilts = [tilt_deg(pose.world_rotation) for pose in poses.values() if pose.world_rotation is not None]
+    heights = np.zeros(0)
+    if block.ground is not None and len(centers):
+        heights = centers[:, 2] - block.ground.height_m(centers[:, :2])
+    low, median, high = np.percentile(heights, [0, 50, 100]).tolist() if len(heights) else [float("nan")] * 3
+    gsds = [footprint.gsd_m for footprint in block_footprints(block).values()]
+    east, north = np.ptp(centers[:, :2], axis=0).tolist() if len(centers) else (float("nan"), float("nan"))
+    best = _best_overlaps(pairs or ())
+    paired = {image_id for pair in pairs or () for image_id in (pair.image_id0, pair.image_id1)}
+    reasons = sorted({pair.reason for pair in pairs or ()})
+    unpaired = () if pairs is None else tuple(name for image_id, name in names.items() if image_id not in paired)
+    return BlockSummary(
+        images=len(block.images),
+        cameras=len({image.camera_id for image in block.images}),
+        positioned=len(poses),
+        oriented=len(tilts),
+        crs=block.crs,
+        origin_m=block.origin_m,
+        ground_source=block.ground_source,
+        flying_height_m=(low, median, high),
+        mean_tilt_deg=float(np.mean(tilts)) if tilts else float("nan"),
+        max_tilt_deg=float(np.max(tilts)) if tilts else float("nan"),
+        gsd_m=float(np.median(gsds)) if gsds else float("nan"),
+        extent_m=(east, north),
+        pairs=None if pairs is None else len(pairs),
+        pairs_by_reason=tuple((reason, sum(pair.reason == reason for pair in pairs or ())) for reason in reasons),
+        best_overlap=float(np.mean(list(best.values()))) if best else float("nan"),
+        unpaired=unpaired,
+        warnings=warnings_of(block, unpaired, guessed_cameras),
+    )
+
+
+def _best_overlaps(pairs: Sequence[Pair]) -> Mapping[str, float]:
+    """Largest known overlap of each paired image."""
+    best: dict[str, float] = {}
+    for pair in pairs:
+        if np.isfinite(pair.overlap):
+            for image_id in (pair.image_id0, pair.image_id1):
+                best[image_id] = max(best.get(image_id, 0.0), pair.overlap)
+    return best

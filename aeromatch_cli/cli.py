@@ -1,0 +1,326 @@
+"""Every command: parse, one call, print. Results go to stdout, messages to stderr, errors become exit codes.
+
+0 all done; 1 finished, but some items failed (listed); 2 bad arguments or configuration; 3 nothing usable;
+130 interrupted (run the same command again: it resumes).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from aeromatch_cli import __version__
+from aeromatch_cli.errors import AeromatchError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.run import Result
+
+EXIT_SOME_FAILED = 1
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Verified, evenly spread tie points for aerial image blocks.",
+    epilog="CONFIG|PRESET is a YAML file or the name of a preset; every command names its options with --help.",
+)
+weights_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="List, verify and add network weights.")
+app.add_typer(weights_app, name="weights")
+
+STAGES = {
+    "run": "Everything, over all overlapping pairs: pairs to report.",
+    "pairs": "Read the block and choose the pairs.",
+    "enhance": "Write enhanced pictures.",
+    "simulate": "Write simulated views.",
+    "extract": "Find features in every image.",
+    "match": "Match every pair; features that are missing are made first.",
+    "filter": "Verify the matches of every pair.",
+    "export": "Write the files of other programs.",
+    "report": "Write the HTML report.",
+    "check": "Dry run: images readable, poses plausible, weights present, pairs, memory, disk, time. Writes nothing.",
+}
+
+Config = Annotated[str, typer.Argument(metavar="CONFIG|PRESET", help="YAML file or preset name.")]
+Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Folder of images.")]
+Poses = Annotated[str | None, typer.Option("--poses", metavar="FILE|exif|none", help="Pose list, or EXIF/XMP.")]
+Cameras = Annotated[str | None, typer.Option("--cameras", metavar="FILE|exif|folder", help="Cameras, or grouping.")]
+Crs = Annotated[str | None, typer.Option("--crs", metavar="CODE", help="World frame, EPSG:32633 or local.")]
+Ground = Annotated[str | None, typer.Option("--ground", metavar="METRES|DEM|auto", help="Ground height.")]
+Masks = Annotated[Path | None, typer.Option("--masks", metavar="DIR|FILE", help="Masks in COLMAP naming.")]
+WorkspaceDir = Annotated[Path | None, typer.Option("--workspace", metavar="DIR", help="Folder for every result.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a setting; repeatable.")]
+MaxSize = Annotated[int | None, typer.Option("--max-size", min=1, metavar="PX", help="Reduce larger images to this.")]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=0, help="Worker processes; 0 = one per core.")]
+ExecutorName = Annotated[
+    str | None, typer.Option("--executor", metavar="serial|processes|dask", help="Where tasks run.")
+]
+ShardText = Annotated[str | None, typer.Option("--shard", metavar="I/N", help="Only part I of N of the items.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Do everything again, whatever is up to date.")]
+KeepImages = Annotated[bool, typer.Option("--keep-images", help="Keep enhanced and simulated pictures.")]
+LogFile = Annotated[Path | None, typer.Option("--log-file", metavar="FILE", help="Append every message to this file.")]
+Json = Annotated[bool, typer.Option("--json", help="Last line of stdout is a JSON object.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors on stderr, no summary.")]
+
+
+def _add_stage_command(name: str, help_text: str) -> None:
+    @app.command(name, help=help_text)
+    def command(
+        config: Config,
+        images: Images = None,
+        poses: Poses = None,
+        cameras: Cameras = None,
+        crs: Crs = None,
+        ground: Ground = None,
+        masks: Masks = None,
+        workspace: WorkspaceDir = None,
+        set_: Set = None,
+        max_size: MaxSize = None,
+        jobs: Jobs = None,
+        executor: ExecutorName = None,
+        shard: ShardText = None,
+        overwrite: Overwrite = False,
+        keep_images: KeepImages = False,
+        log_file: LogFile = None,
+        json_: Json = False,
+        quiet: Quiet = False,
+    ) -> None:
+        block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
+        block |= {"masks": masks, "max_size_px": max_size}
+        run = {"jobs": jobs, "executor": executor, "keep_images": keep_images or None}
+
+        def call() -> Result:
+            from aeromatch_cli.config import load
+            from aeromatch_cli.stages.run import execute
+
+            settings = load(config, set_ or (), _texts(block), run=_texts(run), workspace=_absolute(workspace))
+            return execute(name, settings, shard=shard, overwrite=overwrite, progress=_progress(quiet))
+
+        _guard(call, name, quiet=quiet, as_json=json_, log_file=log_file)
+
+
+for _name, _help in STAGES.items():
+    _add_stage_command(_name, _help)
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the rendered block.")],
+    preset: Annotated[str, typer.Option("--preset", metavar="NAME", help="Scene and flight.")] = "town",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another scene.")] = 0,
+    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Image size in pixels.")] = "1000x750",
+    images: Annotated[int, typer.Option("--images", min=1, help="Number of images.")] = 12,
+    log_file: LogFile = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render a block with exact truth."""
+
+    def call() -> Result:
+        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.synthetic import render_block
+
+        width_px, height_px = _parse_size(size)
+        summary = render_block(out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images)
+        return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), _texts(asdict(summary)))
+
+    _guard(call, "synth", quiet=quiet, as_json=json_, log_file=log_file)
+
+
+def _add_weights_command(action: str, help_text: str, *, takes_path: bool) -> None:
+    def call(argument: str | None, json_: bool, quiet: bool) -> None:
+        def work() -> Result:
+            from aeromatch_cli.stages.run import manage_weights
+
+            return manage_weights(action, argument)
+
+        _guard(work, f"weights {action}", quiet=quiet, as_json=json_, log_file=None)
+
+    if takes_path:
+
+        @weights_app.command(action, help=help_text)
+        def with_path(
+            path: Annotated[str, typer.Argument(metavar="PATH", help="Checkpoint file.")],
+            json_: Json = False,
+            quiet: Quiet = False,
+        ) -> None:
+            call(path, json_, quiet)
+
+    else:
+
+        @weights_app.command(action, help=help_text)
+        def plain(json_: Json = False, quiet: Quiet = False) -> None:
+            call(None, json_, quiet)
+
+
+_add_weights_command("list", "Weights that strategies find by name.", takes_path=False)
+_add_weights_command("verify", "Compare every file with its recorded SHA-256.", takes_path=False)
+_add_weights_command("add", "Check a checkpoint strictly and copy it into the weights folder.", takes_path=True)
+
+
+@app.callback(invoke_without_command=True)
+def top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
+    """Verified, evenly spread tie points for aerial image blocks."""
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    from aeromatch_cli.errors import ConfigError
+
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT in pixels, for example 1000x750")
+    return int(width), int(height)
+
+
+def _texts(values: dict[str, Any]) -> dict[str, Any]:
+    """Given options only, paths as text."""
+    return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if v is not None}
+
+
+def _absolute(path: Path | None) -> str | None:
+    return None if path is None else str(path.absolute())
+
+
+def _progress(quiet: bool) -> Any:
+    from aeromatch_cli.executor import SilentProgress
+
+    if quiet:
+        return SilentProgress()
+    return TerminalProgress() if sys.stderr.isatty() else LineProgress()
+
+
+def _guard(call: Callable[[], Result], command: str, *, quiet: bool, as_json: bool, log_file: Path | None) -> None:
+    """Run one command; print its result, or its error, and leave with the right exit code."""
+    facts: dict[str, Any] = {"command": command}
+    try:
+        with _logging(quiet, log_file), _terminated_like_interrupt():
+            result = call()
+    except AeromatchError as error:
+        typer.echo(f"error: {error}", err=True)
+        facts |= {"error": str(error), "exit_code": error.exit_code}
+    except KeyboardInterrupt:
+        typer.echo("interrupted; run the same command again to resume", err=True)
+        facts |= {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
+    else:
+        if not quiet:
+            for line in result.lines:
+                typer.echo(line)
+        facts |= result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+    if as_json:
+        typer.echo(json.dumps(facts, allow_nan=False))
+    if facts["exit_code"]:
+        raise typer.Exit(int(facts["exit_code"]))
+
+
+@contextmanager
+def _logging(quiet: bool, log_file: Path | None) -> Iterator[None]:
+    """Messages to stderr, and all of them, with time, to the log file."""
+    from aeromatch_cli.errors import ConfigError
+
+    logger = logging.getLogger("aeromatch")
+    logger.setLevel(logging.DEBUG)
+    logger.propagate = False
+    screen = logging.StreamHandler(sys.stderr)
+    screen.setLevel(logging.ERROR if quiet else logging.INFO)
+    screen.setFormatter(logging.Formatter("%(message)s"))
+    handlers: list[logging.Handler] = [screen]
+    if log_file is not None:
+        try:
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            file = logging.FileHandler(log_file, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--log-file {log_file} cannot be written: {error.strerror}") from None
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handlers.append(file)
+    for handler in handlers:
+        logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+            handler.close()
+
+
+@contextmanager
+def _terminated_like_interrupt() -> Iterator[None]:
+    """SIGTERM (a scheduler's time limit) stops as cleanly as Ctrl-C."""
+
+    def interrupt(signum: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class LineProgress:
+    """One plain line per ten percent, for logs and cron."""
+
+    def start(self, label: str, total: int) -> None:
+        self._label, self._total, self._count, self._shown = label, total, 0, 0
+        self._started = time.monotonic()
+
+    def advance(self) -> None:
+        self._count += 1
+        percent = 100 * self._count // max(self._total, 1)
+        if percent // 10 > self._shown // 10:
+            self._shown = percent
+            elapsed = time.monotonic() - self._started
+            left = elapsed / self._count * (self._total - self._count)
+            typer.echo(f"{self._label}: {percent} % ({self._count}/{self._total}), {left:.0f} s left", err=True)
+
+    def stop(self) -> None:
+        """Nothing to clean up."""
+
+
+class TerminalProgress:
+    """A bar with counts and time left."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+
+    def start(self, label: str, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description:>9}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._task = self._bar.add_task(label, total=total)
+        self._bar.start()
+
+    def advance(self) -> None:
+        self._bar.advance(self._task)
+
+    def stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def main() -> None:
+    """Entry point of the `aeromatch` script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

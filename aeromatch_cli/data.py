@@ -1,0 +1,224 @@
+"""The nouns that every layer speaks of. All frozen; arrays are never written to after construction.
+
+Frames are stated once in `geometry/frames.py`. Points are rows (x, y) in pixels, (0, 0) being the centre of the
+top-left pixel of the stored raster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.floating[Any]]
+IntArray = NDArray[np.integer[Any]]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A lens and a sensor, shared by a group of images.
+
+    model: COLMAP's name, one of `geometry.cameras.MODELS`.
+    width_px, height_px: size of the stored raster.
+    params: COLMAP's order; focal lengths in px, cx and cy in this project's pixel frame (COLMAP's minus 0.5).
+    """
+
+    model: str
+    width_px: int
+    height_px: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a camera was and, if known, how it looked.
+
+    center_m: (3,) float64, projection centre in the world frame, metres.
+    world_rotation: (3, 3) float64, rotation part of cam_from_world, or None where only the position is known.
+    sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle.
+    """
+
+    center_m: FloatArray
+    world_rotation: FloatArray | None
+    sigma_position_m: float
+    sigma_angle_deg: float
+
+
+@dataclass(frozen=True)
+class Image:
+    """One stored raster of the block.
+
+    image_id: unique slug of the relative path, fixed once; names every file of this image in the workspace.
+    name: path relative to the images folder, with forward slashes.
+    exif_orientation: 1-8; turns previews only, never coordinates.
+    time: capture time as ISO text, or "" where unknown.
+    """
+
+    image_id: str
+    name: str
+    width_px: int
+    height_px: int
+    camera_id: str
+    exif_orientation: int = 1
+    time: str = ""
+
+
+class Ground(Protocol):
+    """The terrain below the block."""
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """World heights (N,) in metres below the world points xy_m (N, 2)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """What was flown.
+
+    images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose; images without any position
+    are absent. crs: authority code of the world frame, or "local". origin_m: (3,) what was subtracted from the
+    coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
+    distance of the ground views, or None where no image has an attitude.
+    """
+
+    images: tuple[Image, ...]
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, Pose]
+    crs: str
+    origin_m: tuple[float, float, float]
+    ground: Ground | None
+    ground_source: str
+    gsd_m: float | None
+
+    def camera(self, image: Image) -> Camera:
+        return self.cameras[image.camera_id]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two images that may show the same ground; image_id0 < image_id1.
+
+    overlap: shared ground area over the smaller footprint, 0-1, NaN where unknown.
+    view_angle_deg: angle between the rays from both cameras to the middle of the overlap, NaN where unknown.
+    reason: the rule that chose the pair, in one word ("overlap", "position", "name", "time", "exhaustive", ...).
+    """
+
+    image_id0: str
+    image_id1: str
+    overlap: float
+    view_angle_deg: float
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A virtual camera made from one image by a plane-induced homography. View 0 may be the source itself.
+
+    undistorted_from_view: (3, 3) float64; source pixel = distort(camera, undistorted_from_view . view pixel).
+    angle_deg: angle between the image's own optical axis and the view's.
+    """
+
+    name: str
+    width_px: int
+    height_px: int
+    undistorted_from_view: FloatArray
+    is_source: bool
+    angle_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Keypoints of one image, merged over its views, and the descriptors that describe them.
+
+    keypoints_px: (K, 2) float32, source frame, undistorted by nothing: the stored raster's pixels.
+    sizes_px: (K,) float32, diameter of the described blob in source pixels.
+    responses: (K,) float32, strength, larger is better.
+    descriptors: (D, C) uint8 (RootSIFT x 512, clipped) or float32.
+    descriptor_keypoint_idx: (D,) int32 into keypoints_px.
+    view_idx: (D,) int32 into the view arrays; view_keypoints_px: (D, 2) float32 in that view's frame;
+    view_size_px: (D,) float32 diameter in that view; view_orientation_deg: (D,) float32 in that view.
+    view_sizes_px: (V, 2) int32 width, height of every view; view_angles_deg: (V,) float32.
+    """
+
+    keypoints_px: FloatArray
+    sizes_px: FloatArray
+    responses: FloatArray
+    descriptors: NDArray[Any]
+    descriptor_keypoint_idx: IntArray
+    view_idx: IntArray
+    view_keypoints_px: FloatArray
+    view_size_px: FloatArray
+    view_orientation_deg: FloatArray
+    view_sizes_px: IntArray
+    view_angles_deg: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Correspondences of one pair.
+
+    indices: (M, 2) int32 into both images' keypoints, -1 for a point measured without a detector.
+    scores: (M,) float32 in 0-1, larger is better. view_pairs: (M, 2) int16, the views that found each.
+    points0_px, points1_px: (M, 2) float64 measured places in source pixels, or None where indices say it all.
+    """
+
+    indices: IntArray
+    scores: FloatArray
+    view_pairs: IntArray
+    points0_px: FloatArray | None = None
+    points1_px: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PairGeometry:
+    """What is known of a pair before it is matched: both cameras and, where known, both poses.
+
+    ground_z_m: world height of the ground in the overlap, None where unknown.
+    """
+
+    pair: Pair
+    camera0: Camera
+    camera1: Camera
+    pose0: Pose | None
+    pose1: Pose | None
+    ground_z_m: float | None
+
+
+State = Literal["verified", "rejected", "not verifiable"]
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a chain of filters says of one pair.
+
+    keep: (M,) bool over the matches given. state: "verified" (a model supports the kept matches), "rejected" (a
+    filter refused the pair; reason says why; nothing is kept) or "not verifiable" (too few matches to judge).
+    model_kind: "E", "F", "H" or "" ; model: (3, 3) float64 on undistorted pixels (F, H) or normalised rays (E),
+    x1^T M x0 = 0 or x1 ~ H x0, zeros without a model.
+    errors_px: (M,) float32 error to the model, NaN where none. rejected: filter name -> matches it dropped.
+    relative_rotation: (3, 3) cam1_from_cam0 of the model where it has one, else None.
+    """
+
+    keep: BoolArray
+    state: State
+    reason: str = ""
+    model_kind: str = ""
+    model: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    errors_px: FloatArray | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    relative_rotation: FloatArray | None = None
+
+
+class Raster(Protocol):
+    """A picture that is read by windows, so that a 100-megapixel file is never loaded whole by accident."""
+
+    width_px: int
+    height_px: int
+
+    def read(self, x_px: int, y_px: int, width_px: int, height_px: int, step: int = 1) -> NDArray[Any]:
+        """Pixels (H, W) or (H, W, C) of a window, every `step`-th pixel averaged, in the stored dtype, RGB order."""
+        ...

@@ -1,0 +1,28 @@
+"""The errors that a user can cause. The library raises them; the command line turns them into exit codes."""
+
+
+class AeromatchError(Exception):
+    """Root of every error raised on purpose. The message says what is wrong, where, and what to do.
+
+    `exit_code` is what a shell sees: 2 for bad arguments or configuration, 3 when nothing usable is left.
+    """
+
+    exit_code = 3
+
+
+class ConfigError(AeromatchError):
+    """A setting, an argument or an input list is wrong: nothing was started."""
+
+    exit_code = 2
+
+
+class InputError(AeromatchError):
+    """The input was read, and nothing in it can be used (no image, no pair, no match)."""
+
+
+class ItemError(AeromatchError):
+    """One image or one pair cannot be processed. Stages record it in failures.csv and go on with the rest."""
+
+
+class WorkspaceError(AeromatchError):
+    """The workspace cannot be read or written (permissions, full disk, written by another version)."""

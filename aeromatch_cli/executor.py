@@ -1,0 +1,229 @@
+"""run_tasks(function, tasks): serial, processes or dask. Nothing else in the package knows how work is spread.
+
+A task is a small picklable object that names its files; results come back in task order whatever finished first. One
+failing task never stops the others, except when the disk or the workspace itself fails: then nothing can be saved.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
+
+T = TypeVar("T")
+R = TypeVar("R")
+log = logging.getLogger("aeromatch")
+
+# One thread inside each worker: the processes are the parallelism, and results do not depend on thread counts.
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+class Progress(Protocol):
+    """Told about the advance of one stage; the command line draws it."""
+
+    def start(self, label: str, total: int) -> None: ...
+
+    def advance(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+class SilentProgress:
+    """Draws nothing."""
+
+    def start(self, label: str, total: int) -> None:
+        """A stage of `total` tasks begins."""
+
+    def advance(self) -> None:
+        """One task is finished."""
+
+    def stop(self) -> None:
+        """The stage is over."""
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[R]):
+    """What became of one task: a value, or the reason why there is none."""
+
+    value: R | None
+    error: str = ""
+
+
+def single_threaded() -> None:
+    """Make this process's libraries use one thread. Runs at the start of every worker."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    for name in _THREAD_VARIABLES:
+        os.environ[name] = "1"
+
+
+def _worker_start() -> None:
+    # Ctrl-C is the parent's to handle: workers would only print tracebacks.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    single_threaded()
+
+
+@contextlib.contextmanager
+def _thread_environment() -> Iterator[None]:
+    """Workers inherit one-thread settings; BLAS reads them when it is loaded, before any initializer runs."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def guarded(function: Callable[[T], R], task: T) -> Outcome[R]:
+    """Run one task; a user's error becomes its message, a defect its traceback's last line. Disk failures pass."""
+    try:
+        return Outcome(function(task))
+    except WorkspaceError:
+        raise
+    except AeromatchError as error:
+        return Outcome(None, str(error))
+    except MemoryError:
+        return Outcome(None, "out of memory; use --max-size or fewer --jobs")
+    except Exception as error:  # noqa: BLE001 - one item must never stop the rest; the report names it
+        log.debug("%s", traceback.format_exc())
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{os.path.basename(frame.filename)}:{frame.lineno}"  # noqa: PTH119
+        return Outcome(None, f"unexpected {type(error).__name__} at {where}: {error}")
+
+
+class Executor:
+    """Runs tasks; keeps its workers between stages. Use as a context manager."""
+
+    def __init__(self, kind: str = "serial", jobs: int = 0, progress: Progress | None = None) -> None:
+        self.kind = kind
+        self.jobs = jobs or available_cores()
+        self.progress = progress or SilentProgress()
+        self._pool: ProcessPoolExecutor | None = None
+        self._client: Any = None
+
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        self.close(cancel=error is not None)
+
+    def close(self, *, cancel: bool = False) -> None:
+        if self._pool is not None:
+            workers = list((getattr(self._pool, "_processes", None) or {}).values())
+            self._pool.shutdown(wait=not cancel, cancel_futures=True)
+            if cancel:
+                for worker in workers:
+                    worker.terminate()
+            self._pool = None
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def run(self, function: Callable[[T], R], tasks: Sequence[T], label: str) -> list[Outcome[R]]:
+        """Outcomes in task order. Raises WorkspaceError when results can no longer be saved."""
+        self.progress.start(label, len(tasks))
+        try:
+            if self.kind == "dask":
+                return self._run_dask(function, tasks)
+            if self.kind == "serial" or self.jobs == 1 or len(tasks) <= 1:
+                return self._run_serial(function, tasks)
+            return self._run_processes(function, tasks)
+        finally:
+            self.progress.stop()
+
+    def _run_serial(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
+        single_threaded()
+        outcomes = []
+        for task in tasks:
+            outcomes.append(guarded(function, task))
+            self.progress.advance()
+        return outcomes
+
+    def _run_processes(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
+        outcomes: dict[int, Outcome[R]] = {}
+        waiting = list(range(len(tasks)))
+        suspects: list[int] = []
+        while waiting:
+            suspects = self._drain(function, tasks, waiting, outcomes)
+            waiting = [index for index in waiting if index not in outcomes and index not in suspects]
+            # A dead worker (killed for memory, a crash in a native library) takes the pool with it and does not say
+            # which task it had: each task that was in flight is tried again alone, and blamed only if it dies alone.
+            for index in suspects:
+                alone = self._drain(function, tasks, [index], outcomes)
+                if alone:
+                    outcomes[index] = Outcome(None, "its worker process died (out of memory, or a crash in a library)")
+                    self.progress.advance()
+        return [outcomes[index] for index in range(len(tasks))]
+
+    def _drain(
+        self, function: Callable[[T], R], tasks: Sequence[T], indices: Sequence[int], outcomes: dict[int, Outcome[R]]
+    ) -> list[int]:
+        """Run the tasks at `indices`; returns those in flight when a worker died, none if all went well."""
+        pool = self._processes()
+        queue = iter(indices)
+        flying: dict[Future[Outcome[R]], int] = {}
+        try:
+            while True:
+                # Two per worker in flight: enough to keep them busy, few to repeat when one dies.
+                for index in queue:
+                    flying[pool.submit(guarded, function, tasks[index])] = index
+                    if len(flying) >= 2 * self.jobs:
+                        break
+                if not flying:
+                    return []
+                finished, _ = wait(flying, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    outcomes[flying[future]] = future.result()
+                    del flying[future]
+                    self.progress.advance()
+        except BrokenProcessPool:
+            self._pool = None
+            return sorted(flying.values())
+
+    def _processes(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            with _thread_environment():
+                self._pool = ProcessPoolExecutor(
+                    self.jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_worker_start
+                )
+                # Spawning is lazy: make every worker now, while the environment says one thread.
+                wait([self._pool.submit(os.getpid) for _ in range(self.jobs)])
+        return self._pool
+
+    def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
+        try:
+            from distributed import Client, as_completed
+        except ImportError:
+            raise ConfigError(
+                "run.executor=dask needs the extra: pip install 'aeromatch[cluster]', or use --executor processes"
+            ) from None
+        if self._client is None:
+            # DASK_SCHEDULER_ADDRESS names a cluster; without it a local one is started.
+            address = os.environ.get("DASK_SCHEDULER_ADDRESS")
+            local = {} if address else {"n_workers": self.jobs, "threads_per_worker": 1, "dashboard_address": None}
+            self._client = Client(address, **local)
+            self._client.run(single_threaded)
+        futures = self._client.map(guarded, [function] * len(tasks), tasks, pure=False)
+        for _ in as_completed(futures):
+            self.progress.advance()
+        return list(self._client.gather(futures))
+
+
+def available_cores() -> int:
+    """Cores that this process may use (cgroups and affinity respected)."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

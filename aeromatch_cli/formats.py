@@ -1,0 +1,380 @@
+"""Reading and writing of the workspace's files. This docstring is the specification (format version 1).
+
+Text is UTF-8; CSV has a header row, comma separator and "" for unknown. Numbers are written with full float64
+precision. Pixels are (x, y) with (0, 0) at the centre of the top-left pixel of the stored raster; metres are in the
+world frame (`block.json`: `crs` minus `origin_m`). `.npz` files are uncompressed numpy archives without objects.
+
+block.json      format_version, crs, origin_m [x, y, z], ground_source, ground_z_m (null with a DEM or none), gsd_m
+                (null without attitudes), basis: fingerprint of every image when ground and GSD were fixed.
+images.csv      image_id, name, width_px, height_px, camera_id, exif_orientation, time, fingerprint
+cameras.csv     camera_id, model, width_px, height_px, params: space-separated, COLMAP's order, cx and cy in this
+                project's pixel frame (COLMAP's minus 0.5).
+poses.csv       image_id, x, y, z (metres, world frame, projection centre), qw, qx, qy, qz (cam_from_world, "" where
+                the attitude is unknown), sigma_position_m, sigma_angle_deg
+pairs.csv       image_id0, image_id1 (id0 < id1), overlap (0-1), view_angle_deg, reason
+failures.csv    stage, item, reason
+
+enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json facts of the strategy.
+simulated/<id>/views.json    fingerprint, scale (stored raster to the raster that the views were made from), views:
+                             name, width_px, height_px, is_source, angle_deg, undistorted_from_view (3 x 3). Source
+                             pixel = distort(camera, undistorted_from_view . view pixel); for is_source the view is
+                             the raster itself. With scale < 1 the camera is the one resized by scale.
+simulated/<id>/<view>.png    gray picture of the view (kept by the single stage and with --keep-images).
+
+features/<id>.npz            fingerprint ()str
+  keypoints_px (K,2) float32 source frame, merged over views; sizes_px (K,) float32 diameter; responses (K,) float32
+  descriptors (D,C) uint8 (RootSIFT x 512) or float32; descriptor_keypoint_idx (D,) int32
+  view_idx (D,) int32; view_keypoints_px (D,2) float32, view_size_px (D,) float32, view_orientation_deg (D,) float32:
+  place, diameter and direction in the view's own frame; view_sizes_px (V,2) int32; view_angles_deg (V,) float32
+
+matches/<id0>.npz            one row: all pairs of id0, concatenated; pair p owns entries offsets[p]:offsets[p+1]
+  image_id1 (P,) str; fingerprint (P,) str; offsets (P+1,) int64
+  indices (M,2) int32 into both keypoint lists, -1 for a point measured without a detector
+  scores (M,) float32 in 0-1; view_pairs (M,2) int16; strategy (P,) str
+  points0_px, points1_px (M,2) float64, present only where some index is -1
+
+verified/<id0>.npz           the same row layout, only kept matches
+  image_id1, fingerprint, offsets, indices, scores, [points0_px, points1_px] as above
+  errors_px (M,) float32 error to the model; state (P,) str verified | rejected | not verifiable; reason (P,) str
+  model_kind (P,) str E | F | H | ""; models (P,3,3) float64 (E on normalised rays, F and H on undistorted px)
+  rotations (P,3,3) float64 cam1_from_cam0 of the model, NaN where it has none; matches_in (P,) int64
+  rejected (P,) str: JSON object, filter name -> matches that it dropped
+
+reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up to date), failed, fingerprint, facts,
+                             failures: [[item, reason], ...]
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import (
+    Camera,
+    Features,
+    FloatArray,
+    Image,
+    IntArray,
+    Matches,
+    Pair,
+    Pose,
+    Verdict,
+)
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.geometry.rotations import from_quaternion, to_quaternion
+
+_FEATURE_ARRAYS = tuple(field.name for field in fields(Features))
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """CSV with every float at full precision; NaN and None become empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows([_cell(value) for value in row] for row in rows)
+    return stream.getvalue()
+
+
+def _cell(value: Any) -> str:
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return ""
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a workspace CSV. Raises WorkspaceError when it is missing or broken."""
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise WorkspaceError(f"cannot read {path}: {error}; run `aeromatch pairs` to have it made again") from None
+
+
+def images_text(images: Iterable[Image], fingerprints: Mapping[str, str]) -> str:
+    header = ("image_id", "name", "width_px", "height_px", "camera_id", "exif_orientation", "time", "fingerprint")
+    return csv_text(
+        header,
+        (
+            (
+                i.image_id,
+                i.name,
+                i.width_px,
+                i.height_px,
+                i.camera_id,
+                i.exif_orientation,
+                i.time,
+                fingerprints[i.image_id],
+            )
+            for i in images
+        ),
+    )
+
+
+def cameras_text(cameras: Mapping[str, Camera]) -> str:
+    rows = (
+        (k, c.model, c.width_px, c.height_px, " ".join(repr(p) for p in c.params)) for k, c in sorted(cameras.items())
+    )
+    return csv_text(("camera_id", "model", "width_px", "height_px", "params"), rows)
+
+
+def poses_text(poses: Mapping[str, Pose]) -> str:
+    header = ("image_id", "x", "y", "z", "qw", "qx", "qy", "qz", "sigma_position_m", "sigma_angle_deg")
+    rows = []
+    for image_id, pose in sorted(poses.items()):
+        q: Sequence[float | None] = (None,) * 4 if pose.world_rotation is None else to_quaternion(pose.world_rotation)
+        rows.append((image_id, *map(float, pose.center_m), *q, pose.sigma_position_m, pose.sigma_angle_deg))
+    return csv_text(header, rows)
+
+
+def pairs_text(pairs: Iterable[Pair]) -> str:
+    header = ("image_id0", "image_id1", "overlap", "view_angle_deg", "reason")
+    return csv_text(header, ((p.image_id0, p.image_id1, p.overlap, p.view_angle_deg, p.reason) for p in pairs))
+
+
+def read_images(path: Path) -> tuple[Image, ...]:
+    return tuple(
+        Image(
+            row["image_id"],
+            row["name"],
+            int(row["width_px"]),
+            int(row["height_px"]),
+            row["camera_id"],
+            int(row["exif_orientation"]),
+            row["time"],
+        )
+        for row in read_csv(path)
+    )
+
+
+def read_cameras(path: Path) -> dict[str, Camera]:
+    return {
+        row["camera_id"]: Camera(
+            row["model"],
+            int(row["width_px"]),
+            int(row["height_px"]),
+            tuple(float(value) for value in row["params"].split()),
+        )
+        for row in read_csv(path)
+    }
+
+
+def read_poses(path: Path) -> dict[str, Pose]:
+    poses = {}
+    for row in read_csv(path):
+        rotation = from_quaternion(*(float(row[k]) for k in ("qw", "qx", "qy", "qz"))) if row["qw"] else None
+        center = np.array([float(row[key]) for key in "xyz"])
+        poses[row["image_id"]] = Pose(center, rotation, float(row["sigma_position_m"]), float(row["sigma_angle_deg"]))
+    return poses
+
+
+def read_pairs(path: Path) -> list[Pair]:
+    return [
+        Pair(
+            row["image_id0"],
+            row["image_id1"],
+            float(row["overlap"] or "nan"),
+            float(row["view_angle_deg"] or "nan"),
+            row["reason"],
+        )
+        for row in read_csv(path)
+    ]
+
+
+# --- archives ---------------------------------------------------------------------------------------------------
+
+
+def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> None:
+    arrays: dict[str, Any] = {name: getattr(features, name) for name in _FEATURE_ARRAYS}
+    np.savez(stream, fingerprint=np.array(fingerprint), **arrays)
+
+
+def read_features(path: Path) -> Features:
+    """All arrays. Raises WorkspaceError when the file is missing or broken."""
+    arrays = _load(path, _FEATURE_ARRAYS)
+    return Features(**arrays)
+
+
+def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray]:
+    """keypoints_px (K, 2) and sizes_px (K,) only."""
+    arrays = _load(path, ("keypoints_px", "sizes_px"))
+    return arrays["keypoints_px"], arrays["sizes_px"]
+
+
+def features_fingerprint(path: Path) -> str | None:
+    """Fingerprint recorded in a feature file, None when the file is absent or broken."""
+    try:
+        return str(_load(path, ("fingerprint",))["fingerprint"])
+    except WorkspaceError:
+        return None
+
+
+def _load(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in names}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
+
+
+@dataclass(frozen=True, eq=False)
+class MatchEntry:
+    """One pair of a matches row."""
+
+    image_id1: str
+    fingerprint: str
+    strategy: str
+    matches: Matches
+
+
+@dataclass(frozen=True, eq=False)
+class VerifiedEntry:
+    """One pair of a verified row: the kept matches and what the filters said (verdict.keep is all True here)."""
+
+    image_id1: str
+    fingerprint: str
+    matches_in: int
+    matches: Matches
+    verdict: Verdict
+
+
+def write_match_row(stream: BinaryIO, entries: Sequence[MatchEntry]) -> None:
+    np.savez(
+        stream,
+        **_row_arrays(entries),
+        strategy=_strings([e.strategy for e in entries]),
+        view_pairs=_joined([e.matches.view_pairs for e in entries], (0, 2), np.int16),
+    )
+
+
+def read_match_row(path: Path) -> dict[str, MatchEntry]:
+    """Entries by image_id1; empty when the file is absent. Raises WorkspaceError when it is broken."""
+    if not path.exists():
+        return {}
+    row = _Row(path)
+    view_pairs, strategy = row["view_pairs"], row["strategy"]
+    return {
+        id1: MatchEntry(id1, fp, str(strategy[p]), row.matches(p, view_pairs)) for p, (id1, fp) in enumerate(row.keys())
+    }
+
+
+def write_verified_row(stream: BinaryIO, entries: Sequence[VerifiedEntry]) -> None:
+    verdicts = [e.verdict for e in entries]
+    rotations = [np.full((3, 3), np.nan) if v.relative_rotation is None else v.relative_rotation for v in verdicts]
+    errors = [
+        np.full(len(e.matches.indices), np.nan) if e.verdict.errors_px is None else e.verdict.errors_px for e in entries
+    ]
+    np.savez(
+        stream,
+        **_row_arrays(entries),
+        errors_px=_joined(errors, (0,), np.float32),
+        state=_strings([v.state for v in verdicts]),
+        reason=_strings([v.reason for v in verdicts]),
+        model_kind=_strings([v.model_kind for v in verdicts]),
+        models=np.array([v.model for v in verdicts], dtype=np.float64).reshape(-1, 3, 3),
+        rotations=np.array(rotations, dtype=np.float64).reshape(-1, 3, 3),
+        matches_in=np.array([e.matches_in for e in entries], dtype=np.int64),
+        rejected=_strings([json.dumps(dict(v.rejected)) for v in verdicts]),
+    )
+
+
+def read_verified_row(path: Path) -> dict[str, VerifiedEntry]:
+    """Entries by image_id1; empty when the file is absent. Raises WorkspaceError when it is broken."""
+    if not path.exists():
+        return {}
+    row = _Row(path)
+    entries = {}
+    for p, (id1, fp) in enumerate(row.keys()):
+        matches = row.matches(p, None)
+        rotation = row["rotations"][p]
+        verdict = Verdict(
+            keep=np.ones(len(matches.indices), dtype=bool),
+            state=str(row["state"][p]),  # type: ignore[arg-type]
+            reason=str(row["reason"][p]),
+            model_kind=str(row["model_kind"][p]),
+            model=row["models"][p],
+            errors_px=row["errors_px"][row.span(p)],
+            rejected=json.loads(str(row["rejected"][p])),
+            relative_rotation=None if np.isnan(rotation).any() else rotation,
+        )
+        entries[id1] = VerifiedEntry(id1, fp, int(row["matches_in"][p]), matches, verdict)
+    return entries
+
+
+def row_fingerprints(path: Path) -> dict[str, str]:
+    """image_id1 -> fingerprint of a matches or verified row; empty when absent or broken."""
+    if not path.exists():
+        return {}
+    try:
+        arrays = _load(path, ("image_id1", "fingerprint"))
+    except WorkspaceError:
+        return {}
+    return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
+
+
+class _Row:
+    """A row archive, read once."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                self._arrays = {name: archive[name] for name in archive.files}
+            self._offsets = self._arrays["offsets"]
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._arrays[name]
+
+    def keys(self) -> list[tuple[str, str]]:
+        return [(str(i), str(f)) for i, f in zip(self["image_id1"], self["fingerprint"], strict=True)]
+
+    def span(self, p: int) -> slice:
+        return slice(int(self._offsets[p]), int(self._offsets[p + 1]))
+
+    def matches(self, p: int, view_pairs: IntArray | None) -> Matches:
+        span = self.span(p)
+        indices = self["indices"][span]
+        measured = "points0_px" in self._arrays
+        return Matches(
+            indices,
+            self["scores"][span],
+            np.zeros((len(indices), 2), np.int16) if view_pairs is None else view_pairs[span],
+            self["points0_px"][span] if measured else None,
+            self["points1_px"][span] if measured else None,
+        )
+
+
+def _row_arrays(entries: Sequence[MatchEntry] | Sequence[VerifiedEntry]) -> dict[str, NDArray[Any]]:
+    matches = [e.matches for e in entries]
+    arrays: dict[str, NDArray[Any]] = {
+        "image_id1": _strings([e.image_id1 for e in entries]),
+        "fingerprint": _strings([e.fingerprint for e in entries]),
+        "offsets": np.cumsum([0, *(len(m.indices) for m in matches)], dtype=np.int64),
+        "indices": _joined([m.indices for m in matches], (0, 2), np.int32),
+        "scores": _joined([m.scores for m in matches], (0,), np.float32),
+    }
+    if any(m.points0_px is not None for m in matches):
+        for name in ("points0_px", "points1_px"):
+            parts = [getattr(m, name) for m in matches]
+            filled = [
+                np.full((len(m.indices), 2), np.nan) if x is None else x for m, x in zip(matches, parts, strict=True)
+            ]
+            arrays[name] = _joined(filled, (0, 2), np.float64)
+    return arrays
+
+
+def _joined(parts: Sequence[NDArray[Any]], empty_shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
+    return np.concatenate(parts).astype(dtype) if parts else np.zeros(empty_shape, dtype)
+
+
+def _strings(values: Sequence[str]) -> NDArray[Any]:
+    return np.array(values, dtype=np.str_) if values else np.zeros(0, dtype="<U1")

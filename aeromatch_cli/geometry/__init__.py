@@ -1,0 +1,1 @@
+"""Mathematics of cameras, poses and planes: pure numpy float64, no configuration, no files."""

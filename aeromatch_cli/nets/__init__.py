@@ -1,0 +1,1 @@
+"""Networks: torch modules and the loading of their weights. Nothing here downloads."""

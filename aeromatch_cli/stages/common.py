@@ -1,0 +1,198 @@
+"""What every stage shares: the context it runs in, sharding, and the report it leaves."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from aeromatch_cli.config import Settings
+from aeromatch_cli.data import Block, Image, Pair, PairGeometry, Pose
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.executor import Executor, Outcome
+from aeromatch_cli.formats import csv_text
+from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_hash, write_json, write_text
+
+T = TypeVar("T")
+R = TypeVar("R")
+log = logging.getLogger("aeromatch")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part i of n of the items, chosen by a stable hash of their id: 1/2 and 2/2 are disjoint and complete."""
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """From "i/n", 1 <= i <= n. Raises ConfigError."""
+        first, _, second = text.partition("/")
+        if not (first.isdigit() and second.isdigit() and 1 <= int(first) <= int(second)):
+            raise ConfigError(f"--shard {text!r}: write i/n with 1 <= i <= n, for example 1/4")
+        return cls(int(first), int(second))
+
+    def owns(self, item_id: str) -> bool:
+        return stable_hash(item_id) % self.count == self.index - 1
+
+    @property
+    def label(self) -> str:
+        return f"{self.index}-of-{self.count}"
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`."""
+
+    settings: Settings
+    workspace: Workspace
+    executor: Executor
+    block: Block
+    pairs: tuple[Pair, ...]
+    image_fingerprints: Mapping[str, str]
+    given_poses: Mapping[str, Pose]
+    guessed_cameras: frozenset[str] = frozenset()
+    shard: Shard | None = None
+    overwrite: bool = False
+
+    def owns(self, item_id: str) -> bool:
+        return self.shard is None or self.shard.owns(item_id)
+
+    def images(self) -> list[Image]:
+        """The images of this shard."""
+        return [image for image in self.block.images if self.owns(image.image_id)]
+
+    def rows(self) -> dict[str, list[Pair]]:
+        """Pairs of this shard by image_id0, in order."""
+        rows: dict[str, list[Pair]] = {}
+        for pair in self.pairs:
+            if self.owns(pair.image_id0):
+                rows.setdefault(pair.image_id0, []).append(pair)
+        return rows
+
+    def image_path(self, image: Image) -> Path:
+        return Path(self.settings.block.images) / image.name
+
+    def pose(self, image_id: str) -> Pose | None:
+        return self.block.poses.get(image_id)
+
+    def ground_z_m(self, image_id: str) -> float | None:
+        """Ground height below an image's projection centre, None without ground or position."""
+        pose = self.pose(image_id)
+        if self.block.ground is None or pose is None:
+            return None
+        return float(self.block.ground.height_m(pose.center_m[None, :2])[0])
+
+    @property
+    def image_by_id(self) -> Mapping[str, Image]:
+        return _image_index(self.block)
+
+    def geometry(self, pair: Pair) -> PairGeometry:
+        images = self.image_by_id
+        heights = [h for h in (self.ground_z_m(pair.image_id0), self.ground_z_m(pair.image_id1)) if h is not None]
+        return PairGeometry(
+            pair=pair,
+            camera0=self.block.camera(images[pair.image_id0]),
+            camera1=self.block.camera(images[pair.image_id1]),
+            pose0=self.pose(pair.image_id0),
+            pose1=self.pose(pair.image_id1),
+            ground_z_m=sum(heights) / len(heights) if heights else None,
+        )
+
+    def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
+        """What strategies with these `needs` read of one image's geometry."""
+        pose = self.pose(image_id)
+        parts: dict[str, Any] = {}
+        if "camera" in needs:
+            parts["camera"] = self.block.camera(self.image_by_id[image_id])
+        if "pose" in needs:
+            parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
+        if "sigma" in needs:
+            parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
+        if "ground" in needs:
+            parts["ground"] = (self.ground_z_m(image_id), self.block.gsd_m)
+        return fingerprint(parts)
+
+
+@lru_cache(maxsize=4)
+def _image_index(block: Block) -> Mapping[str, Image]:
+    return {image.image_id: image for image in block.images}
+
+
+@dataclass
+class StageReport:
+    """What one stage did; becomes reports/<stage>.json."""
+
+    stage: str
+    seconds: float = 0.0
+    items: int = 0
+    done: int = 0
+    skipped: int = 0
+    fingerprint: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+
+    def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
+        """Close the clock, write the report and gather failures.csv from all stages."""
+        self.seconds = round(time.perf_counter() - self.started, 3)
+        value = {
+            "stage": self.stage,
+            "seconds": self.seconds,
+            "items": self.items,
+            "done": self.done,
+            "skipped": self.skipped,
+            "failed": len(self.failures),
+            "fingerprint": self.fingerprint,
+            "facts": self.facts,
+            "failures": [list(failure) for failure in self.failures],
+        }
+        write_json(context_workspace.stage_report(self.stage, shard.label if shard else ""), value)
+        gather_failures(context_workspace)
+        for item, reason in self.failures:
+            log.warning("%s: %s: %s", self.stage, item, reason)
+        return self
+
+
+def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
+    """failures.csv anew from every stage's report; returns its rows."""
+    rows: set[tuple[str, str, str]] = set()
+    for path in sorted(workspace.reports.glob("*.json")):
+        report = read_json(path)
+        rows.update((report["stage"], item, reason) for item, reason in report["failures"])
+    ordered = sorted(rows)
+    write_text(workspace.failures, csv_text(("stage", "item", "reason"), ordered))
+    return ordered
+
+
+def run_stage(
+    context: Context,
+    report: StageReport,
+    function: Callable[[T], R],
+    tasks: Sequence[T],
+    names: Sequence[str],
+) -> list[R]:
+    """Run tasks, put failures into the report under their names, return the values of the rest."""
+    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, report.stage) if tasks else []
+    values = []
+    for name, outcome in zip(names, outcomes, strict=True):
+        if outcome.value is None:
+            report.failures.append((name, outcome.error))
+        else:
+            values.append(outcome.value)
+    report.done += len(values)
+    return values
+
+
+def distrust_fingerprint(context: Context) -> str:
+    """What the list of contradicting images depends on: everything that decides verified rotations, but not itself."""
+    settings = context.settings
+    poses = [(i, p.center_m, p.world_rotation) for i, p in sorted(context.given_poses.items())]
+    images = sorted(context.image_fingerprints.items())
+    parts = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match, settings.filter)
+    return fingerprint(parts, poses, images, settings.block.max_size_px, settings.seed)

@@ -1,0 +1,160 @@
+"""enhance: pictures whose shadows, or whatever the strategy treats, are readable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Image
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.images import (
+    below_horizon,
+    mask_path,
+    read_mask,
+    read_pixels,
+    sees_sky,
+    shrink,
+    shrink_camera,
+    write_png,
+)
+from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.strategies import Enhanced, Enhancer
+from aeromatch_cli.workspace import Workspace, fingerprint, image_fingerprint, read_json, write_atomically, write_json
+
+
+@dataclass(frozen=True, eq=False)
+class EnhanceTask:
+    """One image to enhance.
+
+    mask: file or None. sky_rotation: the attitude where the image sees above the horizon, else None. scale: stored
+    raster to the raster worked on (--max-size).
+    """
+
+    image_id: str
+    path: Path
+    mask: Path | None
+    camera: Camera
+    sky_rotation: FloatArray | None
+    scale: float
+    enhancer: Enhancer
+    workspace: Workspace
+    fingerprint: str
+
+
+def make_task(context: Context, image: Image) -> EnhanceTask:
+    """The task of one image, with the fingerprint of everything that its result depends on."""
+    settings = context.settings
+    camera = context.block.camera(image)
+    longest = max(image.width_px, image.height_px)
+    limit = settings.block.max_size_px
+    scale = min(1.0, limit / longest) if limit else 1.0
+    mask = mask_path(settings.block.masks, image.name)
+    pose = context.pose(image.image_id)
+    sky = sees_sky(camera, pose)
+    parts = [
+        context.image_fingerprints[image.image_id],
+        image_fingerprint(mask) if mask else "",
+        scale,
+        settings.enhance,
+        context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
+    ]
+    return EnhanceTask(
+        image_id=image.image_id,
+        path=context.image_path(image),
+        mask=mask,
+        camera=camera,
+        sky_rotation=pose.world_rotation if sky and pose else None,
+        scale=scale,
+        enhancer=settings.enhance,
+        workspace=context.workspace,
+        fingerprint=fingerprint(*parts),
+    )
+
+
+def load_source(task: EnhanceTask, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
+    """Pixels at the working scale and where they are valid (mask, nodata, sky); None = everywhere."""
+    pixels = read_pixels(task.path, colour=colour)
+    height, width = pixels.shape[:2]
+    if (width, height) != (task.camera.width_px, task.camera.height_px):
+        # The header and the decoded raster disagree: geometry would be wrong everywhere.
+        raise ItemError(
+            f"image {task.path} decodes to {width}x{height}, its camera is "
+            f"{task.camera.width_px}x{task.camera.height_px}; give the right --cameras"
+        )
+    valid = read_mask(task.mask, width, height) if task.mask else None
+    valid = _combine(valid, _without_nodata(pixels))
+    pixels = shrink(pixels, task.scale)
+    if valid is not None:
+        valid = shrink(valid.astype(np.uint8) * 255, task.scale) > 254
+    if task.sky_rotation is not None:
+        valid = _combine(valid, below_horizon(shrink_camera(task.camera, task.scale), task.sky_rotation))
+    return pixels, valid
+
+
+def _combine(first: BoolArray | None, second: BoolArray | None) -> BoolArray | None:
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second
+
+
+def _without_nodata(pixels: NDArray[Any]) -> BoolArray | None:
+    """False in frames of exact zeros that touch the border, as orthorectified or rotated pictures have them.
+
+    Black objects inside the picture stay valid; None when less than half of any border line is zero.
+    """
+    import cv2
+
+    flat = pixels if pixels.ndim == 2 else pixels.max(axis=2)
+    borders = (flat[0], flat[-1], flat[:, 0], flat[:, -1])
+    if all(np.count_nonzero(line == 0) < 0.5 * line.size for line in borders):
+        return None
+    zero = (flat == 0).astype(np.uint8)
+    _, labels = cv2.connectedComponents(zero, connectivity=4)
+    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    return ~np.isin(labels, edge[edge > 0])
+
+
+def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
+    """Pixels after enhancement, their validity, and what the strategy says; always made anew: a PNG costs more."""
+    pixels, valid = load_source(task, colour=task.enhancer.needs_colour)
+    result = task.enhancer(pixels, valid)
+    return result.pixels, valid, result
+
+
+def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
+    """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing."""
+    if picture:
+        write_atomically(task.workspace.enhanced(task.image_id, ".png"), lambda s: write_png(s, result.pixels))
+    mask = result.mask
+    if mask is not None:
+        write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
+    if picture or result.info:
+        facts = task.workspace.enhanced(task.image_id, ".json")
+        write_json(facts, {"fingerprint": task.fingerprint, "picture": picture, **result.info})
+
+
+def _run_task(task: EnhanceTask) -> str:
+    _, _, result = enhanced(task)
+    keep(task, result, picture=True)
+    return task.image_id
+
+
+def run(context: Context) -> StageReport:
+    """Write enhanced/<id>.png for every image of the shard that is not up to date."""
+    report = StageReport("enhance")
+    tasks = [make_task(context, image) for image in context.images()]
+    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    report.items, report.skipped = len(tasks), len(tasks) - len(todo)
+    run_stage(context, report, _run_task, todo, [task.image_id for task in todo])
+    report.fingerprint = fingerprint([task.fingerprint for task in tasks])
+    return report.write(context.workspace, context.shard)
+
+
+def _is_done(task: EnhanceTask) -> bool:
+    facts = task.workspace.enhanced(task.image_id, ".json")
+    picture = task.workspace.enhanced(task.image_id, ".png")
+    return picture.is_file() and facts.is_file() and read_json(facts).get("fingerprint") == task.fingerprint

@@ -1,0 +1,124 @@
+"""match: correspondences of every pair, one task and one file per image row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from aeromatch_cli.data import Features, Pair, PairGeometry
+from aeromatch_cli.errors import ItemError, WorkspaceError
+from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
+from aeromatch_cli.stages import extract
+from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.strategies import Matcher
+from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
+
+
+@dataclass(frozen=True, eq=False)
+class PairTask:
+    """One pair of a row: its geometry and the fingerprint that its result must carry."""
+
+    geometry: PairGeometry
+    fingerprint: str
+
+    @property
+    def image_id1(self) -> str:
+        return self.geometry.pair.image_id1
+
+
+@dataclass(frozen=True, eq=False)
+class MatchTask:
+    """All pairs of one image."""
+
+    image_id0: str
+    pairs: tuple[PairTask, ...]
+    matcher: Matcher
+    workspace: Workspace
+    overwrite: bool
+
+
+def pair_fingerprint(context: Context, pair: Pair, features: dict[str, str]) -> str:
+    """Fingerprint of one pair's matches: matcher, both images' features, and their geometry."""
+    matcher = context.settings.match
+    sides = [(features[i], context.geometry_fingerprint(i, matcher.needs)) for i in (pair.image_id0, pair.image_id1)]
+    return fingerprint(matcher, sides)
+
+
+def make_tasks(context: Context, features: dict[str, str]) -> list[MatchTask]:
+    """One task per row of the shard, pairs without features left out. Larger rows first, so that none runs last."""
+    tasks = []
+    for image_id0, pairs in context.rows().items():
+        usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
+        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p, features)) for p in usable)
+        if row:
+            tasks.append(MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite))
+    return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
+
+
+def run_task(task: MatchTask) -> tuple[int, list[tuple[str, str]]]:
+    """Match what is not up to date in one row; returns the matches found and the failed pairs with reasons."""
+    path = task.workspace.matches(task.image_id0)
+    old = {} if task.overwrite else _usable_row(path)
+    entries, failures, found = [], [], 0
+    features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
+    for pair in task.pairs:
+        entry = old.get(pair.image_id1)
+        if entry is None or entry.fingerprint != pair.fingerprint:
+            try:
+                entry = _match_pair(task, pair, features0)
+            except ItemError as error:
+                failures.append((f"{task.image_id0} {pair.image_id1}", str(error)))
+                continue
+            found += len(entry.matches.indices)
+        entries.append(entry)
+    write_atomically(path, lambda stream: write_match_row(stream, entries))
+    return found, failures
+
+
+def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
+    path1 = task.workspace.features(pair.image_id1)
+    matches = task.matcher(features0, _features(path1, _stamp(path1)), pair.geometry)
+    return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
+
+
+def _usable_row(path: Path) -> dict[str, MatchEntry]:
+    """The row as far as it can be read: a broken file is made again."""
+    try:
+        return read_match_row(path)
+    except WorkspaceError:
+        return {}
+
+
+def _stamp(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
+@lru_cache(maxsize=64)
+def _features(path: Path, stamp: int) -> Features:
+    """Features of the last images that this worker saw; the stamp notices rewritten files."""
+    del stamp
+    return read_features(path)
+
+
+def run(context: Context) -> StageReport:
+    """Write matches/<id0>.npz for every row of the shard; features that are missing are made first."""
+    wanted = {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
+    features = extract.ensure(context, wanted)
+    report = StageReport("match")
+    tasks = make_tasks(context, features)
+    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    report.items = sum(len(task.pairs) for task in tasks)
+    report.skipped = report.items - sum(len(task.pairs) for task in todo)
+    results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
+    for _, failures in results:
+        report.failures.extend(failures)
+    report.done = report.items - report.skipped - len(report.failures)
+    report.facts = {"matches": sum(found for found, _ in results)}
+    report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
+    return report.write(context.workspace, context.shard)
+
+
+def _is_done(task: MatchTask) -> bool:
+    wanted = {pair.image_id1: pair.fingerprint for pair in task.pairs}
+    return row_fingerprints(task.workspace.matches(task.image_id0)) == wanted

@@ -1,0 +1,229 @@
+"""Rows of the report's tables: one per pair, per image and per stage, gathered in one pass over the workspace."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import FloatArray, Image, Pair
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.formats import VerifiedEntry, read_csv, read_keypoints
+from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.filter import match_points, verified_pairs
+from aeromatch_cli.workspace import Workspace, read_json
+
+# Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
+COVERAGE_CELLS = 16
+NOT_JUDGED = "not judged"
+_STAGE_ORDER = ("pairs", "enhance", "simulate", "extract", "match", "filter", "export")
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """One pair of pairs.csv and what became of it. NaN where unknown. chosen_by: the rule that proposed the pair."""
+
+    image_id0: str
+    image_id1: str
+    overlap: float
+    view_angle_deg: float
+    chosen_by: str
+    matches_in: int
+    verified: int
+    median_error_px: float
+    state: str
+    reason: str
+    model_kind: str
+    rejects: Mapping[str, int]
+
+    @property
+    def share(self) -> float:
+        return self.verified / self.matches_in if self.matches_in else float("nan")
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """One image. href: relative link to the picture, or "". keypoints, coverage: None where there are no features.
+
+    pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match.
+    """
+
+    image_id: str
+    name: str
+    href: str
+    pose: str
+    keypoints: int | None
+    pairs: int
+    verified_pairs: int
+    verified_matches: int
+    coverage: float | None
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """reports/<stage>.json, or the sum over the shards of one stage."""
+
+    label: str
+    seconds: float
+    items: int
+    done: int
+    skipped: int
+    failed: int
+    facts: str
+
+
+class _Coverage:
+    """Which cells of every image hold a verified match."""
+
+    def __init__(self, context: Context) -> None:
+        self._images = context.image_by_id
+        self._workspace = context.workspace
+        self._keypoints_px: dict[str, FloatArray | None] = {}
+        self._seen: dict[str, NDArray[np.bool_]] = {}
+
+    def keypoints_px(self, image_id: str) -> FloatArray | None:
+        """(K, 2), or None where the image has no readable features."""
+        if image_id not in self._keypoints_px:
+            try:
+                self._keypoints_px[image_id] = read_keypoints(self._workspace.features(image_id))[0]
+            except WorkspaceError:
+                self._keypoints_px[image_id] = None
+        return self._keypoints_px[image_id]
+
+    def add(self, pair: Pair, entry: VerifiedEntry) -> None:
+        """Mark the cells of both images that this pair's matches touch."""
+        keypoints0, keypoints1 = self.keypoints_px(pair.image_id0), self.keypoints_px(pair.image_id1)
+        if keypoints0 is None or keypoints1 is None:
+            return
+        points = match_points(entry.matches, keypoints0, keypoints1)
+        for image_id, points_px in zip((pair.image_id0, pair.image_id1), points, strict=True):
+            image = self._images[image_id]
+            cells = np.floor((points_px + 0.5) * COVERAGE_CELLS / (image.width_px, image.height_px)).astype(np.int64)
+            cells = np.clip(cells, 0, COVERAGE_CELLS - 1)
+            seen = self._seen.setdefault(image_id, np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), dtype=bool))
+            seen[cells[:, 1], cells[:, 0]] = True
+
+    def share(self, image_id: str) -> float | None:
+        if self.keypoints_px(image_id) is None:
+            return None
+        return float(self._seen[image_id].mean()) if image_id in self._seen else 0.0
+
+
+def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
+    """Pairs in the order of pairs.csv and images in the order of images.csv."""
+    coverage = _Coverage(context)
+    judged: dict[tuple[str, str], PairRow] = {}
+    tied: Counter[str] = Counter()
+    matches: Counter[str] = Counter()
+    for pair, entry in verified_pairs(context):
+        row = judged[pair.image_id0, pair.image_id1] = _pair_row(pair, entry)
+        if row.state == "verified":
+            coverage.add(pair, entry)
+            tied.update((pair.image_id0, pair.image_id1))
+            matches.update({pair.image_id0: row.verified, pair.image_id1: row.verified})
+    pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(p, None) for p in context.pairs]
+    proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
+    images = []
+    for image in context.block.images:
+        keypoints = coverage.keypoints_px(image.image_id)
+        images.append(
+            ImageRow(
+                image_id=image.image_id,
+                name=image.name,
+                href=_href(context, image),
+                pose=_pose_words(context, image),
+                keypoints=None if keypoints is None else len(keypoints),
+                pairs=proposed[image.image_id],
+                verified_pairs=tied[image.image_id],
+                verified_matches=matches[image.image_id],
+                coverage=coverage.share(image.image_id),
+            )
+        )
+    return pairs, images
+
+
+def _pair_row(pair: Pair, entry: VerifiedEntry | None) -> PairRow:
+    known = (pair.image_id0, pair.image_id1, pair.overlap, pair.view_angle_deg, pair.reason)
+    if entry is None:
+        words = "no matches on file: the match stage failed or has not run"
+        return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})
+    verdict = entry.verdict
+    errors = np.zeros(0) if verdict.errors_px is None else verdict.errors_px[np.isfinite(verdict.errors_px)]
+    return PairRow(
+        *known,
+        matches_in=entry.matches_in,
+        verified=len(entry.matches.indices) if verdict.state == "verified" else 0,
+        median_error_px=float(np.median(errors)) if len(errors) else float("nan"),
+        state=verdict.state,
+        reason=verdict.reason,
+        model_kind=verdict.model_kind,
+        rejects=verdict.rejected,
+    )
+
+
+def _pose_words(context: Context, image: Image) -> str:
+    pose = context.pose(image.image_id)
+    if pose is None:
+        return "none"
+    return "position" if pose.world_rotation is None else "full"
+
+
+def _href(context: Context, image: Image) -> str:
+    """Link from the report to the picture; "" where there is none (another drive on Windows)."""
+    try:
+        relative = os.path.relpath(context.image_path(image), context.workspace.report.parent)
+    except ValueError:
+        return ""
+    return quote(Path(relative).as_posix())
+
+
+def stage_rows(workspace: Workspace) -> list[StageRow]:
+    """Last run of every stage in the order of the chain; the shards of one stage are summed."""
+    groups: dict[tuple[str, bool], list[dict[str, object]]] = {}
+    for path in sorted(workspace.reports.glob("*.json")):
+        sharded = re.fullmatch(r".+\.\d+-of-\d+", path.stem) is not None
+        report = read_json(path)
+        groups.setdefault((str(report["stage"]), sharded), []).append(report)
+
+    def place(key: tuple[str, bool]) -> tuple[int, str, bool]:
+        name = key[0]
+        return (_STAGE_ORDER.index(name) if name in _STAGE_ORDER else len(_STAGE_ORDER), *key)
+
+    rows = []
+    for name, sharded in sorted(groups, key=place):
+        # The report stage is running now: what is on file of it is about an earlier page.
+        if name == "report":
+            continue
+        reports = groups[name, sharded]
+        seconds, *counts = (
+            sum(float(r[key]) for r in reports)  # type: ignore[arg-type]
+            for key in ("seconds", "items", "done", "skipped", "failed")
+        )
+        label = f"{name} ({len(reports)} shards)" if sharded else name
+        facts = "" if sharded else _facts_words(reports[0]["facts"])
+        rows.append(StageRow(label, seconds, *(int(count) for count in counts), facts))
+    return rows
+
+
+def _facts_words(facts: object) -> str:
+    """The plain numbers and words among a stage's facts; what is nested has its own place on the page."""
+    if not isinstance(facts, dict):
+        return ""
+    plain = {key: value for key, value in facts.items() if isinstance(value, int | float | str)}
+    return ", ".join(f"{key.replace('_', ' ')} {_number(value)}" for key, value in plain.items())
+
+
+def _number(value: float | str) -> str:
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}" if isinstance(value, float) else value
+
+
+def failure_rows(workspace: Workspace) -> list[dict[str, str]]:
+    """Rows of failures.csv: stage, item, reason."""
+    return read_csv(workspace.failures) if workspace.failures.is_file() else []

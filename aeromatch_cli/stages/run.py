@@ -1,0 +1,169 @@
+"""run: one command from its settings to its result; the whole chain, or one stage of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.config import Settings
+from aeromatch_cli.errors import ConfigError, InputError
+from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
+from aeromatch_cli.stages.common import Context, Shard, StageReport
+
+log = logging.getLogger("aeromatch")
+
+STAGES: Mapping[str, Callable[[Context], StageReport]] = {
+    "enhance": enhance.run,
+    "simulate": simulate.run,
+    "extract": extract.run,
+    "match": match.run,
+    "filter": filter.run,
+    "export": export.run,
+    "report": report.run,
+}
+# Stages whose items are independent: these can be cut into shards, the others need everything.
+SHARDED = ("enhance", "simulate", "extract", "match", "filter")
+# How often attitudes may be distrusted and their images done again; each pass can only add images.
+_MAX_PASSES = 3
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command says: lines for people, facts for machines, failures for the exit code."""
+
+    lines: tuple[str, ...]
+    facts: dict[str, Any] = field(default_factory=dict)
+    failures: tuple[tuple[str, str, str], ...] = ()
+
+
+def execute(
+    command: str,
+    settings: Settings,
+    *,
+    shard: str | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped."""
+    part = Shard.parse(shard) if shard else None
+    if part and command not in (*SHARDED, "run", "pairs"):
+        raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
+    with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
+        context, first = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
+        if command == "check":
+            return _check(context, first)
+        reports = [first]
+        if command == "run":
+            reports += _run_all(context)
+        elif command != "pairs":
+            reports.append(STAGES[command](context))
+    return _result(command, context, reports)
+
+
+def _run_all(context: Context) -> list[StageReport]:
+    """extract, match, filter, and again for images whose attitude turns out wrong; then export and report."""
+    reports: list[StageReport] = []
+    for _ in range(_MAX_PASSES):
+        reports = [extract.run(context), match.run(context), filter.run(context)]
+        trusted = pairs.without_distrusted(replace(context, overwrite=False))
+        if context.shard is not None or _attitudes(trusted) == _attitudes(context):
+            break
+        log.info("attitudes of some images contradict the pictures; these images are done again without")
+        context, _ = pairs.prepare(context.settings, context.executor, shard=context.shard)
+    if context.shard is None:
+        if not reports[-1].facts["verified_matches"]:
+            reports.append(report.run(context))
+            raise InputError(f"no pair could be verified; {context.workspace.report} and failures.csv say why")
+        reports += [export.run(context), report.run(context)]
+    return reports
+
+
+def _attitudes(context: Context) -> set[str]:
+    return {i for i, pose in context.block.poses.items() if pose.world_rotation is not None}
+
+
+def _result(command: str, context: Context, reports: list[StageReport]) -> Result:
+    failures = tuple((r.stage, item, reason) for r in reports for item, reason in r.failures)
+    lines = list(reports[0].facts["summary"])
+    for stage in reports:
+        lines.append(
+            f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
+            f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
+        )
+        if stage.stage == "filter":
+            lines += _filter_lines(stage)
+    lines.append(f"workspace {context.workspace.root}")
+    if command in ("run", "report") and context.shard is None:
+        lines.append(f"report    {context.workspace.report}")
+    if command in ("run", "export") and context.shard is None:
+        lines += [f"export    {context.workspace.export(e.name)}" for e in context.settings.export]
+    if failures:
+        lines.append(f"{len(failures)} failed, listed in {context.workspace.failures}")
+    facts = {
+        "workspace": str(context.workspace.root),
+        "stages": {
+            r.stage: {
+                "items": r.items,
+                "done": r.done,
+                "skipped": r.skipped,
+                "failed": len(r.failures),
+                "seconds": r.seconds,
+                "facts": r.facts,
+            }
+            for r in reports
+        },
+        "failures": len(failures),
+    }
+    return Result(tuple(lines), facts, failures)
+
+
+def _filter_lines(stage: StageReport) -> list[str]:
+    facts = stage.facts
+    states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
+    lines = [f"          pairs: {states}; {facts['verified_matches']} verified matches"]
+    components = facts["components"]
+    if len(components) > 1:
+        shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")
+        lines.append(f"          {len(components)} unconnected groups of images, of sizes {shown}")
+    else:
+        lines.append("          all images are connected")
+    if facts["weakly_tied"]:
+        names = facts["weakly_tied"]
+        lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
+    for image_id, angle in facts.get("rotation_contradicts_pose", {}).items():
+        lines.append(f"          {image_id}: matches say its attitude is wrong by {angle:.0f} degrees; not used")
+    return lines
+
+
+def _listed(names: list[str], shown: int = 10) -> str:
+    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
+
+
+def _check(context: Context, first: StageReport) -> Result:
+    found = check.run(context)
+    lines = (*first.facts["summary"], *found.lines)
+    failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
+    facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
+    return Result((*lines, *(f"failed: {item}: {reason}" for _, item, reason in failures)), facts, failures)
+
+
+def manage_weights(action: str, path: str | None) -> Result:
+    """List, verify or add network weights; a file that does not match its record is a failure."""
+    from aeromatch_cli.nets.weights import add_weights, list_weights, verify_weights, weights_folder
+
+    if action == "add":
+        entry = add_weights(Path(path or ""))
+        return Result((f"added {entry.name} ({entry.architecture}), SHA-256 {entry.sha256}",), {"name": entry.name})
+    if action == "verify":
+        checks = verify_weights()
+        lines = tuple(f"{c.name}: {c.state}" for c in checks) or (f"no weights in {weights_folder()}",)
+        wrong = tuple(("weights", c.name, c.state) for c in checks if c.state != "ok")
+        return Result(lines, {"weights": {c.name: c.state for c in checks}}, wrong)
+    entries = list_weights()
+    lines = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e6:.1f} MB  {e.sha256}" for e in entries)
+    names = [e.name for e in entries]
+    return Result(lines or (f"no weights in {weights_folder()}",), {"weights": names})

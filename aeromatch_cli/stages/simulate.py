@@ -1,0 +1,109 @@
+"""simulate: virtual views of every image, chosen from its pose and ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import Image, Pose, View
+from aeromatch_cli.images import render_view, shrink_camera, to_gray8, write_png
+from aeromatch_cli.stages import enhance
+from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.strategies import Simulator, ViewPixels
+from aeromatch_cli.workspace import fingerprint, read_json, write_atomically, write_json
+
+
+@dataclass(frozen=True, eq=False)
+class SimulateTask:
+    """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown."""
+
+    source: enhance.EnhanceTask
+    pose: Pose | None
+    ground_z_m: float | None
+    gsd_m: float | None
+    simulator: Simulator
+    fingerprint: str
+
+
+def make_task(context: Context, image: Image) -> SimulateTask:
+    """The task of one image, with the fingerprint of everything that its result depends on."""
+    source = enhance.make_task(context, image)
+    simulator = context.settings.simulate
+    ground_z_m = context.ground_z_m(image.image_id)
+    geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
+    own = fingerprint(source.fingerprint, simulator, geometry)
+    return SimulateTask(source, context.pose(image.image_id), ground_z_m, context.block.gsd_m, simulator, own)
+
+
+def views_of(task: SimulateTask) -> tuple[View, ...]:
+    """The views of one image: geometry only."""
+    camera = shrink_camera(task.source.camera, task.source.scale)
+    return task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m)
+
+
+def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
+    """Gray pictures of every view of one image, and the enhancement they were made from."""
+    pixels, valid, result = enhance.enhanced(task.source)
+    gray = to_gray8(pixels)
+    camera = shrink_camera(task.source.camera, task.source.scale)
+    pictures = []
+    for view in views_of(task):
+        picture, seen = render_view(gray, valid, camera, view)
+        pictures.append(ViewPixels(view, picture, seen))
+    return pictures, result
+
+
+def keep(task: SimulateTask, pictures: list[ViewPixels], *, with_pictures: bool) -> None:
+    """Write views.json, and with `with_pictures` a PNG of every view."""
+    workspace, image_id = task.source.workspace, task.source.image_id
+    if with_pictures:
+        for item in pictures:
+            gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
+            write_atomically(workspace.view(image_id, item.view.name), partial(write_png, pixels=gray))
+    write_json(
+        workspace.views(image_id),
+        {
+            "fingerprint": task.fingerprint,
+            "pictures": with_pictures,
+            "scale": task.source.scale,
+            "views": [
+                {
+                    "name": view.name,
+                    "width_px": view.width_px,
+                    "height_px": view.height_px,
+                    "is_source": view.is_source,
+                    "angle_deg": view.angle_deg,
+                    "undistorted_from_view": view.undistorted_from_view.tolist(),
+                }
+                for view in (item.view for item in pictures)
+            ],
+        },
+    )
+
+
+def _run_task(task: SimulateTask) -> str:
+    pictures, _ = render(task)
+    keep(task, pictures, with_pictures=True)
+    return task.source.image_id
+
+
+def run(context: Context) -> StageReport:
+    """Write simulated/<id>/ for every image of the shard that is not up to date."""
+    report = StageReport("simulate")
+    tasks = [make_task(context, image) for image in context.images()]
+    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    report.items, report.skipped = len(tasks), len(tasks) - len(todo)
+    run_stage(context, report, _run_task, todo, [task.source.image_id for task in todo])
+    report.fingerprint = fingerprint([task.fingerprint for task in tasks])
+    return report.write(context.workspace, context.shard)
+
+
+def _is_done(task: SimulateTask) -> bool:
+    path = task.source.workspace.views(task.source.image_id)
+    if not path.is_file():
+        return False
+    found = read_json(path)
+    return found.get("fingerprint") == task.fingerprint and bool(found.get("pictures"))

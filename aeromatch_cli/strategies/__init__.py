@@ -1,0 +1,83 @@
+"""Strategies: what can be switched. Each is one class (schema, defaults, version, callable) and one line in its
+family's table; it touches arrays only.
+
+Calls, by family (table in the family's __init__):
+
+  pairings    strategy(block) -> list[Pair]                          sorted by ids, image_id0 < image_id1
+  enhancers   strategy(pixels, valid) -> Enhanced                    one image, before any view is made
+  simulators  strategy(camera, pose, ground_z_m, gsd_m) -> tuple[View, ...]
+  extractors  strategy(camera, views) -> Features                    views: ViewPixels of one image
+  matchers    strategy(features0, features1, geometry) -> Matches
+  filters     strategy(points0_px, points1_px, geometry, seed) -> Verdict   points in stored pixels
+  exporters   strategy(contents, folder) -> ExportSummary            the only family that writes: a foreign format
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
+
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from aeromatch_cli.data import BoolArray, Camera, Features, Matches, PairGeometry, Pose, View
+
+
+class Strategy(BaseModel):
+    """A frozen, hashable recipe.
+
+    version: raised whenever the results change; part of the fingerprint.
+    needs: what the call reads of an image's geometry, of "camera", "pose" (centre and attitude), "sigma" and "ground";
+    only that enters the fingerprint, so that a change re-does exactly the stages that depend on it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset()
+
+    def fingerprint_files(self) -> tuple[str, ...]:
+        """Paths of files (weights) whose contents are part of the recipe."""
+        return ()
+
+
+@dataclass(frozen=True, eq=False)
+class Enhanced:
+    """pixels: like the input. mask: (H, W) uint8 of what was treated, or None. info: JSON-ready facts."""
+
+    pixels: NDArray[Any]
+    mask: NDArray[Any] | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPixels:
+    """A view with its picture. gray: (H, W) uint8. valid: (H, W) bool, False where nothing was seen, or None = all."""
+
+    view: View
+    gray: NDArray[Any]
+    valid: BoolArray | None
+
+
+class Enhancer(Protocol):
+    """needs_colour: False where the strategy takes gray pixels, which decode faster."""
+
+    needs_colour: ClassVar[bool]
+
+    def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced: ...
+
+
+class Simulator(Protocol):
+    def __call__(
+        self, camera: Camera, pose: Pose | None, ground_z_m: float | None, gsd_m: float | None
+    ) -> tuple[View, ...]: ...
+
+
+class Extractor(Protocol):
+    def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features: ...
+
+
+class Matcher(Protocol):
+    name: str
+
+    def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches: ...

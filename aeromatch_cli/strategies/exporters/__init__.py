@@ -1,0 +1,12 @@
+"""Exporters: from verified matches to the files of another program.
+
+Call: strategy(contents: ExportContents, folder: Path) -> ExportSummary. The folder is replaced as a whole; nothing
+else is touched. Pixel frames and identifiers are translated here and nowhere else.
+"""
+
+from aeromatch_cli.strategies.exporters.colmap import Colmap
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents
+
+EXPORTERS = {"colmap": Colmap}
+
+__all__ = ["EXPORTERS", "Colmap", "ExportContents", "ExportSummary", "PairContents"]

@@ -1,0 +1,88 @@
+"""What an exporter gets and what it returns, and the folder that appears whole or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from aeromatch_cli.data import Block, FloatArray, IntArray, Pair
+from aeromatch_cli.errors import WorkspaceError
+
+
+@dataclass(frozen=True, eq=False)
+class PairContents:
+    """One matched pair.
+
+    matches: (M, 2) int32 keypoint indices before any filter. verified: (V, 2) int32, those that the filters kept,
+    empty where the pair was not verified. model_kind, model: as in `data.Verdict`.
+    """
+
+    pair: Pair
+    matches: IntArray
+    verified: IntArray
+    model_kind: str
+    model: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ExportContents:
+    """Everything that leaves the workspace. Arrays are read when they are needed, never all at once.
+
+    keypoints_px: image_id -> (K, 2) float32 in stored pixels, the array that match indices point into; (0, 2) for an
+    image without features. pairs: each pair at most once, in the order of pairs.csv; only iterated once.
+    guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
+    """
+
+    block: Block
+    keypoints_px: Callable[[str], FloatArray]
+    pairs: Iterable[PairContents]
+    guessed_cameras: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class ExportSummary:
+    """Counts of what was written. files: absolute or relative as the folder was given, sorted."""
+
+    files: tuple[Path, ...]
+    images: int
+    posed_images: int
+    keypoints: int
+    matched_pairs: int
+    matches: int
+    verified_pairs: int
+    verified_matches: int
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A scratch folder beside `folder` that takes its place when the block ends, and vanishes if it raises.
+
+    A reader never sees half an export; leftovers of a killed run are removed first. The scratch names are fixed, so
+    that only one export of a folder may run at a time.
+
+    Raises WorkspaceError where the folder cannot be written.
+    """
+    partial = folder.with_name(f".{folder.name}.partial")
+    previous = folder.with_name(f".{folder.name}.previous")
+    try:
+        if previous.exists() and not folder.exists():
+            previous.rename(folder)
+        for leftover in (partial, previous):
+            if leftover.exists():
+                shutil.rmtree(leftover)
+        partial.mkdir(parents=True)
+        yield partial
+        if folder.exists():
+            folder.rename(previous)
+        partial.rename(folder)
+        if previous.exists():
+            shutil.rmtree(previous)
+    except OSError as error:
+        raise WorkspaceError(
+            f"export folder {folder} cannot be written: {error}; check free space and permissions, then run again"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

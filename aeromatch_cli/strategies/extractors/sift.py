@@ -1,0 +1,189 @@
+"""SIFT on overlapping tiles, with an exact budget spread evenly over the image, described by RootSIFT bytes.
+
+Source: Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012 (RootSIFT). The detector is OpenCV's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import BoolArray, Camera, Features, FloatArray, IntArray
+from aeromatch_cli.geometry.warps import source_from_view
+from aeromatch_cli.strategies import Strategy, ViewPixels
+from aeromatch_cli.strategies.extractors.merging import merge_keypoints
+from aeromatch_cli.strategies.extractors.selection import even_selection
+from aeromatch_cli.strategies.extractors.tiles import Tile, tiles
+
+_TILE_AREA_PX = 4_000_000
+_TILE_MARGIN_PX = 128
+_DESCRIPTOR_LENGTH = 128
+
+
+class Sift(Strategy):
+    """SIFT keypoints and RootSIFT descriptors of all views of one image.
+
+    keypoints: points per image, over all its views: exactly so many, fewer only where fewer exist. A point with two
+    orientations counts once and has two descriptors.
+    contrast_threshold: OpenCV's, divided by octave_layers inside; edge_threshold: largest ratio of curvatures.
+    selection: which points a cell gives first: "balanced" by response x size^2 (found again most often in neighbouring
+    images), "scale" the largest, "response" the most contrasted.
+    per_cell: average features per cell of the even selection; larger is less even.
+    """
+
+    version: ClassVar[int] = 1
+    name: Literal["sift"] = "sift"
+    keypoints: int = Field(4000, ge=1)
+    contrast_threshold: float = Field(0.01, gt=0.0)
+    edge_threshold: float = Field(10.0, gt=1.0)
+    octave_layers: int = Field(3, ge=1)
+    sigma: float = Field(1.6, gt=0.5)
+    selection: Literal["balanced", "scale", "response"] = "balanced"
+    per_cell: int = Field(200, ge=1)
+
+    def __call__(self, camera: Camera, views: tuple[ViewPixels, ...]) -> Features:
+        """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
+        found = [_in_source(camera, view, self._detect(view, index)) for index, view in enumerate(views)]
+        raw = _concatenate(found)
+        keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
+        points = raw.take(standing)
+        strengths = self._strengths(points)
+        chosen = even_selection(
+            points.source_px, strengths, camera.width_px, camera.height_px, self.keypoints, self.per_cell
+        )
+        return _features(raw, keypoint_idx, points.take(chosen), chosen, views)
+
+    def _strengths(self, points: _Raw) -> FloatArray:
+        if self.selection == "scale":
+            return points.source_sizes_px
+        if self.selection == "response":
+            return points.responses
+        return points.responses * points.source_sizes_px**2
+
+    def _detect(self, view: ViewPixels, view_idx: int) -> _Raw:
+        import cv2
+
+        detector = cv2.SIFT_create(
+            nfeatures=0,
+            nOctaveLayers=self.octave_layers,
+            contrastThreshold=self.contrast_threshold,
+            edgeThreshold=self.edge_threshold,
+            sigma=self.sigma,
+            descriptorType=cv2.CV_8U,
+            enable_precise_upscale=True,  # without it every keypoint is off by a quarter pixel
+        )
+        height, width = view.gray.shape
+        parts = [
+            _detect_tile(detector, view, tile, view_idx)
+            for tile in tiles(width, height, _TILE_AREA_PX, _TILE_MARGIN_PX)
+        ]
+        return _away_from_mask(_concatenate(parts), view.valid)
+
+
+@dataclass(frozen=True, eq=False)
+class _Raw:
+    """N described features: source_px (N, 2) float64, the rest as in data.Features."""
+
+    source_px: FloatArray
+    source_sizes_px: FloatArray
+    points_px: FloatArray
+    sizes_px: FloatArray
+    orientations_deg: FloatArray
+    responses: FloatArray
+    descriptors: NDArray[Any]
+    view_idx: IntArray
+
+    def take(self, which: IntArray | BoolArray) -> _Raw:
+        return _Raw(**{key: value[which] for key, value in vars(self).items()})
+
+
+def _concatenate(parts: list[_Raw]) -> _Raw:
+    return _Raw(**{key: np.concatenate([getattr(part, key) for part in parts]) for key in vars(parts[0])})
+
+
+def _detect_tile(detector: Any, view: ViewPixels, tile: Tile, view_idx: int) -> _Raw:
+    window = (slice(tile.y0, tile.y1), slice(tile.x0, tile.x1))
+    seen = view.valid is None or bool(view.valid[window].any())
+    keypoints, descriptors = detector.detectAndCompute(view.gray[window], None) if seen else ((), None)
+    if descriptors is None:
+        descriptors = np.zeros((0, _DESCRIPTOR_LENGTH), np.uint8)
+    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
+    points = (table[:, :2] + [tile.x0, tile.y0]).astype(np.float32)
+    # A fixed order, whatever the detector's: by place, then size; orientations of a point stay side by side.
+    order = np.lexsort((table[:, 3], table[:, 2], points[:, 0], points[:, 1]))
+    order = order[tile.owns(points[order])]
+    table = table[order].astype(np.float32)
+    return _Raw(
+        source_px=points[order].astype(np.float64),
+        source_sizes_px=table[:, 2],
+        points_px=points[order],
+        sizes_px=table[:, 2],
+        orientations_deg=table[:, 3],
+        responses=table[:, 4],
+        descriptors=descriptors[order],
+        view_idx=np.full(len(order), view_idx, np.int32),
+    )
+
+
+def root_sift(descriptors: NDArray[Any]) -> NDArray[np.uint8]:
+    """(N, 128) uint8 of SIFT bytes (N, 128): 512 times the square root of the L1-normalised values, clipped at 255."""
+    values = descriptors.astype(np.float32)
+    sums = np.maximum(values.sum(axis=1, keepdims=True), 1.0)
+    return np.minimum(np.rint(np.sqrt(values / sums) * np.float32(512.0)), 255.0).astype(np.uint8)
+
+
+def _away_from_mask(raw: _Raw, valid: BoolArray | None) -> _Raw:
+    """Without the features whose blob touches an unseen pixel: a mask's edge is no texture."""
+    if valid is None or bool(valid.all()) or len(raw.points_px) == 0:
+        return raw
+    import cv2
+
+    distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    height, width = valid.shape
+    x = np.clip(np.rint(raw.points_px[:, 0]).astype(np.int64), 0, width - 1)
+    y = np.clip(np.rint(raw.points_px[:, 1]).astype(np.int64), 0, height - 1)
+    return raw.take(distance[y, x] > 1.0 + raw.sizes_px)
+
+
+def _in_source(camera: Camera, view: ViewPixels, raw: _Raw) -> _Raw:
+    """The same with source_px and source_sizes_px filled in; features that the source cannot see are left out."""
+    if view.view.is_source or len(raw.points_px) == 0:
+        return raw
+    warp = view.view.undistorted_from_view
+    points = raw.points_px.astype(np.float64)
+    ring = [source_from_view(camera, warp, points + step) for step in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))]
+    along_x, along_y = ring[0] - ring[1], ring[2] - ring[3]
+    scale = np.sqrt(np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]))
+    source = source_from_view(camera, warp, points)
+    limits = np.array([camera.width_px, camera.height_px]) - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = np.isfinite(scale) & (source >= -0.5).all(axis=1) & (source < limits).all(axis=1)
+    moved = _Raw(**(vars(raw) | {"source_px": source, "source_sizes_px": (raw.sizes_px * scale).astype(np.float32)}))
+    return moved.take(inside)
+
+
+def _features(raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, views: tuple[ViewPixels, ...]) -> Features:
+    """The chosen keypoints and all their descriptors, those of one keypoint side by side."""
+    number = np.full(int(keypoint_idx.max(initial=-1)) + 1, -1, np.int64)
+    number[chosen] = np.arange(len(chosen))
+    numbers = number[keypoint_idx]
+    order = np.argsort(numbers, kind="stable")
+    order = order[numbers[order] >= 0]
+    described = raw.take(order)
+    return Features(
+        keypoints_px=points.source_px.astype(np.float32),
+        sizes_px=points.source_sizes_px,
+        responses=points.responses,
+        descriptors=root_sift(described.descriptors),
+        descriptor_keypoint_idx=numbers[order].astype(np.int32),
+        view_idx=described.view_idx,
+        view_keypoints_px=described.points_px,
+        view_size_px=described.sizes_px,
+        view_orientation_deg=described.orientations_deg,
+        view_sizes_px=np.array([(v.view.width_px, v.view.height_px) for v in views], np.int32).reshape(-1, 2),
+        view_angles_deg=np.array([v.view.angle_deg for v in views], np.float32),
+    )

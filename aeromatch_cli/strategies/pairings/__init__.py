@@ -1,0 +1,20 @@
+"""Which pairs of images to match.
+
+Call: `strategy(block) -> list[Pair]`, sorted by (image_id0, image_id1) with image_id0 < image_id1, each pair once.
+Every strategy fills overlap and view angle where both images have a footprint (pose with attitude, and a ground),
+and NaN elsewhere.
+"""
+
+from __future__ import annotations
+
+from aeromatch_cli.strategies.pairings.exhaustive import Exhaustive
+from aeromatch_cli.strategies.pairings.file import PairFile
+from aeromatch_cli.strategies.pairings.overlap import Overlap
+from aeromatch_cli.strategies.pairings.sequential import Sequential
+
+PAIRINGS: dict[str, type[Exhaustive] | type[Overlap] | type[PairFile] | type[Sequential]] = {
+    "overlap": Overlap,
+    "exhaustive": Exhaustive,
+    "sequential": Sequential,
+    "file": PairFile,
+}

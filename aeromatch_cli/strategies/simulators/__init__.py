@@ -1,0 +1,18 @@
+"""Virtual cameras: how else the ground of one image can be looked at before features are found.
+
+Call: `strategy(camera, pose, ground_z_m, gsd_m) -> tuple[View, ...]`, at least one view. pose, ground_z_m (world height
+of the ground under the image's footprint) and gsd_m (the block's common ground sampling distance) are None where
+unknown. A view is geometry only; its pixels are the source's, resampled at `geometry.warps.source_from_view`. A view
+with is_source is the stored raster itself: its pixels ARE the stored pixels, distortion included, and its
+undistorted_from_view (identity) is not used.
+"""
+
+from __future__ import annotations
+
+from aeromatch_cli.strategies.simulators.ground import GroundView
+from aeromatch_cli.strategies.simulators.none import SourceOnly
+
+SIMULATORS: dict[str, type[GroundView] | type[SourceOnly]] = {
+    "none": SourceOnly,
+    "ground": GroundView,
+}

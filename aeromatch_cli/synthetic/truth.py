@@ -1,0 +1,136 @@
+"""Where a pixel of one rendered image really lies in another: asked of the scene itself, rebuilt from truth.json."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
+from aeromatch_cli.errors import ConfigError, InputError
+from aeromatch_cli.geometry.cameras import from_colmap, normalise, project
+from aeromatch_cli.synthetic.flight import Exterior
+from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
+from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path
+
+# A surface point counts as seen when nothing stands more than this in front of it.
+_TOLERANCE_M = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A rendered block's scene, and the exact camera and pose of each image by name."""
+
+    scene: Scene
+    caster: RayCaster
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, Pose]
+
+    def surface_points(self, image: str, points_px: FloatArray) -> FloatArray:
+        """World points (N, 3) that an image shows at stored pixels (N, 2); NaN where it shows sky or has no ray."""
+        camera, rotation, center_m = self._view(image)
+        directions = np.column_stack([normalise(camera, points_px), np.ones(len(points_px))]) @ rotation
+        surface = np.full((len(points_px), 3), np.nan)
+        usable = np.flatnonzero(np.isfinite(directions).all(axis=1))
+        hits = self.caster.first_hits(center_m, directions[usable])
+        hit = np.isfinite(hits.distances)
+        surface[usable[hit]] = center_m + hits.distances[hit, None] * directions[usable[hit]]
+        return surface
+
+    def transfer(self, image0: str, points_px: FloatArray, image1: str) -> tuple[FloatArray, BoolArray]:
+        """Exact places in image 1 of what image 0 shows at stored pixels (N, 2).
+
+        Returns places (N, 2) and hidden (N,). Hidden: sky in image 0, outside image 1, or something stands in front of
+        it there. The place of a hidden point ignores what hides it; it is NaN for sky and for points behind camera 1.
+        Raises ConfigError on an unknown image.
+        """
+        camera, rotation, center_m = self._view(image1)
+        surface = self.surface_points(image0, np.asarray(points_px, dtype=np.float64).reshape(-1, 2))
+        places = project(camera, rotation, center_m, surface)
+        last = np.array([camera.width_px, camera.height_px]) - 0.5
+        with np.errstate(invalid="ignore"):
+            hidden: BoolArray = np.any(~((places >= -0.5) & (places <= last)), axis=1)
+        asked = np.flatnonzero(~hidden)
+        directions = surface[asked] - center_m
+        hits = self.caster.first_hits(center_m, directions)
+        # In units of these directions the point itself lies at 1.
+        hidden[asked] = hits.distances < 1.0 - _TOLERANCE_M / np.linalg.norm(directions, axis=1)
+        return places, hidden
+
+    def _view(self, image: str) -> tuple[Camera, FloatArray, FloatArray]:
+        if image not in self.poses:
+            raise ConfigError(
+                f"{image!r} is no image of this rendered block; it has {', '.join(list(self.poses)[:3])} ..."
+            )
+        pose = self.poses[image]
+        assert pose.world_rotation is not None
+        return self.cameras[image], pose.world_rotation, pose.center_m
+
+
+def load_truth(folder: Path) -> Truth:
+    """Rebuild the scene of a rendered block (about half a second).
+
+    Raises InputError where the folder holds no finished block, or one of another version of the scene generator.
+    """
+    facts = _read_json(folder / "truth.json")
+    if facts.get("format") != TRUTH_FORMAT:
+        raise InputError(
+            f"{folder / 'truth.json'} is not the truth of a rendered block; give the folder that synth wrote"
+        )
+    block = _read_json(folder / "block.json")
+    try:
+        scene = build_scene(facts["preset"], facts["seed"], facts["half_extent_m"])
+        same = facts["scene_version"] == SCENE_VERSION and facts["scene_sha256"] == scene_digest(scene)
+        camera = _camera(block["cameras"]["1"])
+        poses = _read_poses(folder / "poses.csv")
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the truth in {folder} is damaged ({error!r}); render the block again") from error
+    if not same:
+        raise InputError(f"the block in {folder} was rendered by another version; render it again")
+    return Truth(scene, RayCaster(scene), dict.fromkeys(poses, camera), poses)
+
+
+def transfer(truth: Truth | Path, image0: str, points_px: FloatArray, image1: str) -> tuple[FloatArray, BoolArray]:
+    """`Truth.transfer` of a loaded truth, or of a rendered block's folder (which is then loaded anew each time)."""
+    return (truth if isinstance(truth, Truth) else load_truth(truth)).transfer(image0, points_px, image1)
+
+
+def read_depth(folder: Path, image: str) -> NDArray[np.float32]:
+    """Depth (H, W) float32 of a rendered image, metres along the optical axis at pixel centres, NaN for sky."""
+    try:
+        with np.load(depth_path(folder, image), allow_pickle=False) as arrays:
+            depth_m: NDArray[np.float32] = arrays["depth_m"]
+            return depth_m
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            f"the depth of {image} in {folder} cannot be read ({error}); render the block again"
+        ) from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); give the folder of a finished rendered block") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path} must hold one JSON object; give the folder of a finished rendered block")
+    return content
+
+
+def _camera(lens: dict[str, Any]) -> Camera:
+    return from_colmap(lens["model"], int(lens["width"]), int(lens["height"]), tuple(lens["params"]))
+
+
+def _read_poses(path: Path) -> dict[str, Pose]:
+    with path.open(encoding="utf-8", newline="") as stream:
+        return {
+            row[POSE_COLUMNS[0]]: Exterior(*(float(row[column]) for column in POSE_COLUMNS[1:])).pose()
+            for row in csv.DictReader(stream)
+        }

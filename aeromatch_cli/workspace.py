@@ -1,0 +1,230 @@
+"""Where everything lies in a workspace, how it is written, and how it is known to be up to date.
+
+Resume rests on evidence: a result counts as done when it is present and its fingerprint equals the one that the
+current settings and inputs give. Files appear under their final name complete or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import socket
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.strategies import Strategy
+
+FORMAT_VERSION = 1
+_PROBE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Every path and file name below one root folder. Holds no state."""
+
+    root: Path
+
+    @property
+    def config(self) -> Path:
+        return self.root / "config.yaml"
+
+    @property
+    def block(self) -> Path:
+        return self.root / "block.json"
+
+    @property
+    def images(self) -> Path:
+        return self.root / "images.csv"
+
+    @property
+    def cameras(self) -> Path:
+        return self.root / "cameras.csv"
+
+    @property
+    def poses(self) -> Path:
+        return self.root / "poses.csv"
+
+    @property
+    def pairs(self) -> Path:
+        return self.root / "pairs.csv"
+
+    @property
+    def failures(self) -> Path:
+        return self.root / "failures.csv"
+
+    @property
+    def distrusted(self) -> Path:
+        return self.root / "distrusted.json"
+
+    @property
+    def reports(self) -> Path:
+        return self.root / "reports"
+
+    @property
+    def report(self) -> Path:
+        return self.root / "report" / "index.html"
+
+    def enhanced(self, image_id: str, suffix: str) -> Path:
+        return self.root / "enhanced" / f"{image_id}{suffix}"
+
+    def views(self, image_id: str) -> Path:
+        return self.root / "simulated" / image_id / "views.json"
+
+    def view(self, image_id: str, view_name: str) -> Path:
+        return self.root / "simulated" / image_id / f"{view_name}.png"
+
+    def features(self, image_id: str) -> Path:
+        return self.root / "features" / f"{image_id}.npz"
+
+    def matches(self, image_id0: str) -> Path:
+        return self.root / "matches" / f"{image_id0}.npz"
+
+    def verified(self, image_id0: str) -> Path:
+        return self.root / "verified" / f"{image_id0}.npz"
+
+    def export(self, exporter: str) -> Path:
+        return self.root / "export" / exporter
+
+    def stage_report(self, stage: str, shard: str = "") -> Path:
+        return self.reports / (f"{stage}.{shard}.json" if shard else f"{stage}.json")
+
+    def create(self) -> None:
+        """Make the folder and prove that it can be written; refuse one of another format version."""
+        with translated_os_errors(self.root):
+            self.root.mkdir(parents=True, exist_ok=True)
+        if self.block.exists():
+            found = read_json(self.block).get("format_version")
+            if found != FORMAT_VERSION:
+                raise WorkspaceError(
+                    f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
+                    "use the version that wrote it, or choose another --workspace"
+                )
+        write_atomically(self.root / ".writable", lambda stream: stream.write(b"") and None)
+        (self.root / ".writable").unlink(missing_ok=True)
+        remove_stale_temporaries(self.root)
+
+
+def _temporary_name(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
+
+
+@contextlib.contextmanager
+def translated_os_errors(path: Path) -> Iterator[None]:
+    """Turn failures of the disk into WorkspaceError: what, where, what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise WorkspaceError(
+                f"disk full while writing {path}; free space and run the same command again, it resumes"
+            ) from error
+        if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
+            raise WorkspaceError(f"cannot write {path} ({error.strerror}); choose another --workspace") from error
+        raise WorkspaceError(f"cannot write {path}: {error}") from error
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write beside `path` and rename: a reader or a killed run never sees half a file.
+
+    No fsync: after a power cut a file may be empty, which the readers treat as absent.
+    """
+    with translated_os_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = _temporary_name(path)
+        try:
+            with temporary.open("wb") as stream:
+                write(stream)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Atomic, UTF-8; a file that already holds the text is left untouched."""
+    data = text.encode("utf-8")
+    if path.is_file() and path.read_bytes() == data:
+        return
+    write_atomically(path, lambda stream: stream.write(data))
+
+
+def write_json(path: Path, value: Any) -> None:
+    write_text(path, json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises WorkspaceError on anything else."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
+    if not isinstance(value, dict):
+        raise WorkspaceError(f"{path} holds no JSON object; delete it to have it made again")
+    return value
+
+
+def remove_stale_temporaries(root: Path) -> None:
+    """Delete what a killed process of this machine left behind; files of live processes stay."""
+    host = socket.gethostname()
+    for path in root.rglob(".*.tmp"):
+        parts = path.name.rsplit(".", 4)
+        if len(parts) == 5 and parts[1] == host and parts[2].isdigit() and not _alive(int(parts[2])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def fingerprint(*parts: Any) -> str:
+    """SHA-256 (hex) of the canonical JSON of `parts`; strategies bring their name, settings and version."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=True)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Strategy):
+        files = {path: file_digest(Path(path)) for path in value.fingerprint_files()}
+        return {"class": type(value).__name__, "version": value.version, "files": files, **value.model_dump()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if hasattr(value, "__dataclass_fields__"):
+        return {key: getattr(value, key) for key in value.__dataclass_fields__}
+    raise TypeError(f"{type(value).__name__} cannot enter a fingerprint")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 (hex) of a whole file, for weights."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def image_fingerprint(path: Path) -> str:
+    """Size, modification time and SHA-256 of the first and last MiB: enough to notice a changed photograph."""
+    status = path.stat()
+    digest = hashlib.sha256(f"{status.st_size} {status.st_mtime_ns} ".encode())
+    with path.open("rb") as stream:
+        digest.update(stream.read(_PROBE_BYTES))
+        if status.st_size > _PROBE_BYTES:
+            stream.seek(max(_PROBE_BYTES, status.st_size - _PROBE_BYTES))
+            digest.update(stream.read(_PROBE_BYTES))
+    return digest.hexdigest()
+
+
+def stable_hash(text: str) -> int:
+    """The same number on every machine and in every process; shards and seeds come from it."""
+    return int.from_bytes(hashlib.sha256(text.encode("utf-8")).digest()[:8], "big")

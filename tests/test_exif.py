@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_image
+from PIL.TiffImagePlugin import IFDRational
+
+from aeromatch_cli.blocks.exif import exif_or_reason, read_exif
+from aeromatch_cli.errors import ItemError
+
+
+def test_facts_of_a_jpeg(tmp_path: Path) -> None:
+    path = write_image(
+        tmp_path / "a.JPG",
+        (80, 60),
+        main={271: "Canon\0", 272: "Canon S100", 274: 6, 306: "2011:01:01 00:00:00"},
+        exif={36867: "2016:11:22 16:32:34", 37521: "498", 37386: 5.2, 41989: 24, 41486: 100.0, 41488: 3, 40962: 160}
+        | {40963: 120},
+        gps=gps_tags(-41.5, -81.25, -12.5),
+    )
+    facts = read_exif(path)
+    assert (facts.width_px, facts.height_px, facts.orientation) == (80, 60, 6)  # stored size, whatever Orientation says
+    assert (facts.make, facts.model, facts.focal_mm, facts.focal_35mm_mm) == ("Canon", "Canon S100", 5.2, 24.0)
+    # 100 px/cm = 10 px/mm on the 160 px wide original: 5 px/mm on this half-size picture.
+    assert facts.focal_plane_px_per_mm == pytest.approx(5.0)
+    assert facts.focal_plane_confirmed
+    assert facts.time == "2016-11-22T16:32:34.498000"
+    assert (facts.latitude_deg, facts.longitude_deg) == pytest.approx((-41.5, -81.25), abs=1e-7)
+    assert facts.altitude_m == pytest.approx(-12.5)
+    assert facts.notes == ()
+
+
+def test_gimbal_angles_are_read_and_not_the_aircraft_s(tmp_path: Path) -> None:
+    xmp = DJI_XMP.format(yaw="+45.00", pitch="-89.90", roll="+0.10", relative="+39.80")
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp))
+    assert facts.angles is not None
+    assert (facts.angles.yaw_deg, facts.angles.pitch_deg, facts.angles.roll_deg) == (45.0, -89.9, 0.1)
+    assert facts.angles.convention == "gimbal"
+    assert facts.relative_altitude_m == 39.8
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
+def test_camera_namespace_is_nadir_also_in_16_bit_tiff(tmp_path: Path, name: str) -> None:
+    xmp = PARROT_XMP.format(yaw="-13.305", pitch="5.18259", roll="2.73152") + "\n \0\0"
+    facts = read_exif(
+        write_image(
+            tmp_path / name, main={271: "Parrot"}, exif={37386: 3.98}, gps=gps_tags(41.4, -81.6, 349.0), xmp=xmp
+        )
+    )
+    assert facts.angles is not None
+    assert (facts.angles.yaw_deg, facts.angles.pitch_deg, facts.angles.roll_deg) == (-13.305, 5.18259, 2.73152)
+    assert facts.angles.convention == "nadir"
+    assert facts.focal_mm == pytest.approx(3.98)
+    assert facts.longitude_deg == pytest.approx(-81.6)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif", "a.png"])
+def test_orientation_never_turns_the_stored_size(tmp_path: Path, name: str) -> None:
+    facts = read_exif(write_image(tmp_path / name, (40, 30), main={274: 6}))
+    assert (facts.width_px, facts.height_px, facts.orientation) == (40, 30, 6)
+
+
+def test_png_without_tags(tmp_path: Path) -> None:
+    facts = read_exif(write_image(tmp_path / "a.png"))
+    assert (facts.width_px, facts.height_px, facts.time, facts.angles, facts.altitude_m) == (40, 30, "", None, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "note"),
+    [
+        ({2: (IFDRational(46, 0), IFDRational(0, 0), IFDRational(0, 0))}, "incomplete"),
+        ({1: ""}, "incomplete"),
+        ({2: (95.0, 0.0, 0.0)}, "incomplete"),
+        ({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)}, "(0, 0)"),
+    ],
+)
+def test_garbage_positions_are_dropped_and_noted(tmp_path: Path, change: dict[int, object], note: str) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0) | change))
+    assert facts.latitude_deg is None
+    assert facts.altitude_m is None
+    assert note in facts.notes[0]
+
+
+def test_absent_seconds_and_zero_denominators_elsewhere(tmp_path: Path) -> None:
+    gps = gps_tags(46.0, 7.0, None) | {2: (46.0, 30.0, IFDRational(0, 0)), 6: IFDRational(5, 0)}
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps, exif={37386: IFDRational(0, 0)}))
+    assert facts.latitude_deg == pytest.approx(46.5)
+    assert facts.altitude_m is None
+    assert facts.focal_mm is None
+
+
+def test_position_in_xmp_alone_with_dji_s_misspelt_tag(tmp_path: Path) -> None:
+    xmp = DJI_XMP.format(yaw=0, pitch=-90, roll=0, relative=1).replace(
+        "drone-dji:Rel", 'drone-dji:GpsLatitude="46.5" drone-dji:GpsLongtitude="-7.25" drone-dji:Rel'
+    )
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp))
+    assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (46.5, -7.25, 198.31)
+
+
+def test_malformed_xmp_is_noted_and_the_rest_kept(tmp_path: Path) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0), xmp="<x:xmpmeta"))
+    assert facts.notes == ("XMP block is malformed",)
+    assert facts.altitude_m == 500.0
+
+
+def test_entities_in_xmp_are_refused(tmp_path: Path) -> None:
+    bomb = '<!DOCTYPE x [<!ENTITY a "aaaa">]>' + DJI_XMP.format(yaw="&a;", pitch="1", roll="1", relative="1")
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=bomb))
+    assert facts.angles is None
+    assert facts.notes == ("XMP block is malformed",)
+
+
+@pytest.mark.parametrize(
+    "content", [b"not an image at all", b"\xff\xd8\xff\xe0\x00\x10JFIF", b"II*\x00\x08\x00\x00\x00"]
+)
+def test_corrupt_files_are_item_errors(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.jpg"
+    path.write_bytes(content)
+    with pytest.raises(ItemError, match=r"bad\.jpg"):
+        read_exif(path)
+    reason = exif_or_reason(path)
+    assert isinstance(reason, str)
+    assert "bad.jpg" not in reason  # it is recorded beside the name

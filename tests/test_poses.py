@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeromatch_cli.blocks.poses import read_poses
+from aeromatch_cli.errors import ConfigError
+
+
+def write(folder: Path, text: str | bytes) -> Path:
+    path = folder / "poses.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image,x,y,z,omega_deg,phi_deg,kappa_deg\na/1.jpg,1.5,2,3,4,5,6\n",
+        "\ufeffimage,x,y,z,omega_deg,phi_deg,kappa_deg\r\na/1.jpg,1.5,2,3,4,5,6\r\n",
+        "# made by hand\n\nKappa;Phi;Omega;Z;Y;X;FileName\n6;5;4;3;2;1,5;a/1.jpg\n",
+        "name\teasting\tnorthing\tz\tomega\tphi\tkappa\n# first strip\na\\1.jpg\t1.5\t2\t3\t4\t5\t6\t\n",
+        "image   x  y  z  omega_deg phi_deg  kappa_deg\n  ./a/1.jpg  1.5  2 3   4 5 6\n",
+        "# Cameras (1)\n#Label,X/Easting,Y/Northing,Z/Altitude,Omega,Phi,Kappa\na/1.jpg,1.5,2,3,4,5,6\n",
+        'image,"x [m]",y (m),Z [m],Omega [deg],phi,kappa\n"a/1.jpg", 1.5, 2, 3, 4, 5, 6\n',
+        "image,x,y,z,omega_deg,phi_deg,kappa_deg\na/1.jpg,1.5,2,3,4,5,6\n".encode("utf-16"),
+    ],
+)
+def test_separators_cases_comments_and_encodings(tmp_path: Path, text: str | bytes) -> None:
+    poses = read_poses(write(tmp_path, text))
+    (row,) = poses.rows
+    assert (row.image, row.position, row.attitude) == ("a/1.jpg", (1.5, 2.0, 3.0), (4.0, 5.0, 6.0))
+    assert (row.position_kind, row.attitude_kind) == ("grid", "omega_phi_kappa")
+    assert poses.warnings == ()
+
+
+def test_every_form_of_position_and_attitude(tmp_path: Path) -> None:
+    header = "image,latitude,lng,altitude,yaw,pitch,roll,camera,sigma_position_m,sigma_angle_deg"
+    row = read_poses(write(tmp_path, f"{header}\n1.jpg,46,-92,198,45,-90,0,A,2,\n")).rows[0]
+    assert (row.position, row.position_kind) == ((46.0, -92.0, 198.0), "geographic")
+    assert (row.attitude, row.attitude_kind) == ((45.0, -90.0, 0.0), "yaw_pitch_roll")
+    assert (row.camera, row.sigma_position_m, row.sigma_angle_deg, row.line) == ("A", 2.0, None, 2)
+    row = read_poses(write(tmp_path, "image,qw,qx,qy,qz,x,y,z\n1.jpg,0,1,0,0,1,2,3\n")).rows[0]
+    assert (row.attitude, row.attitude_kind) == ((0.0, 1.0, 0.0, 0.0), "quaternion")
+    row = read_poses(write(tmp_path, "image,x,y,z\n1.jpg,1,2,3\n")).rows[0]
+    assert (row.attitude, row.attitude_kind) == (None, "none")
+
+
+def test_rows_without_coordinates_are_unposed_and_the_rest_is_kept(tmp_path: Path) -> None:
+    lines = ["a,NaN,1,2,0,0,0", "b,,,,,,", "c,0,0,5,0,0,0", "d,1,2,3,,,", "e,1,2,3,4,nan,6", "f,1,2,3,4,5,6"]
+    poses = read_poses(write(tmp_path, "\n".join(["image,lat,lon,alt,yaw,pitch,roll", *lines])))
+    assert [row.position is not None for row in poses.rows] == [False, False, False, True, True, True]
+    assert [row.attitude is not None for row in poses.rows] == [True, False, True, False, False, True]
+    assert any("line 2, column lat" in warning for warning in poses.warnings)
+    assert any("(0, 0)" in warning for warning in poses.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("a.jpg,1,2,3\nb.jpg,1,2,3\n", "line 1: no header"),
+        ("# only a remark\n", "no header"),
+        ("image,x,y,z\n", "no line follows"),
+        ("image,omega_deg,phi_deg,kappa_deg\na,1,2,3\n", "no position"),
+        ("image,x,y\na,1,2\n", "'z' is missing"),
+        ("image,lat,lon,height\na,1,2,3\n", "'alt' is missing.*'height' is not a height above ground"),
+        ("image,lat,lon,z\na,1,2,3\n", "name it 'alt'"),
+        ("image,x,y,z,omega_deg,phi_deg\na,1,2,3,4,5\n", "'kappa_deg' is missing"),
+        ("image,x,y,z,omega_deg,phi_deg,kapa_deg\na,1,2,3,4,5,6\n", "did you mean 'kappa_deg'"),
+        ("image,x,y,z,lat,lon,alt\na,1,2,3,4,5,6\n", "two forms of position"),
+        ("image,x,y,z,x\na,1,2,3,4\n", "'x' is named twice"),
+        ("image,x,y,z\na,1,2,3\na,1,2,3\n", "line 3, column image: 'a' stands in line 2 already"),
+        ("image,x,y,z\na,1,2\n", "line 2: 3 values, but the header names 4"),
+        ("image,x,y,z\na,1,2,3,4\n", "line 2: 5 values"),
+        ("image,x,y,z\n,1,2,3\n", "column image: empty"),
+        ("image,x,y,z\na,1,inf,3\n", "line 2, column y: inf is out of range"),
+        ("image,x,y,z\na,1,two,3\n", "line 2, column y: 'two' is not a number"),
+        ("image,lat,lon,alt\na,-92,46,3\n", "column lat: -92 is out of range"),
+        ("image,x,y,z,yaw,pitch,roll\na,1,2,3,400,0,0\n", "column yaw_deg: 400 is out of range"),
+        ("image,x,y,z,qw,qx,qy,qz\na,1,2,3,0,0,0,0\n", "has length 0"),
+        ("image,x,y,z,sigma_position_m\na,1,2,3,-1\n", "standard deviation"),
+        (b"image,x,y,z\n\xff\xfa,1,2,3\n", "save it as UTF-8"),
+        (b"image,x\0,y,z\n", "binary"),
+    ],
+)
+def test_malformed_lists_name_the_place(tmp_path: Path, text: str | bytes, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        read_poses(write(tmp_path, text))
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.csv", tmp_path):
+        with pytest.raises(ConfigError, match="cannot be read"):
+            read_poses(path)
+
+
+def test_unknown_columns_are_ignored_with_a_warning(tmp_path: Path) -> None:
+    poses = read_poses(write(tmp_path, "image,x,y,z,accuracy,note\na,1,2,3,0.5,hello\n"))
+    assert poses.rows[0].position == (1.0, 2.0, 3.0)
+    assert poses.warnings == ("poses.csv: unknown columns ignored: accuracy, note",)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    values=st.lists(st.tuples(*[st.floats(-1e7, 1e7)] * 3, *[st.floats(-360, 360)] * 3), min_size=1, max_size=5),
+    separator=st.sampled_from([",", ";", "\t", " "]),
+)
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, values: list[tuple[float, ...]], separator: str) -> None:
+    header = separator.join(["image", "x", "y", "z", "yaw_deg", "pitch_deg", "roll_deg"])
+    lines = [separator.join([f"{row}.jpg", *map(repr, numbers)]) for row, numbers in enumerate(values)]
+    poses = read_poses(write(tmp_path_factory.mktemp("poses"), "\n".join([header, *lines])))
+    assert [(*row.position, *row.attitude) for row in poses.rows if row.position and row.attitude] == values

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from make_images import PARROT_XMP, gps_tags, write_dji, write_image
+
+from aeromatch_cli.blocks.crs import WorldFrame
+from aeromatch_cli.blocks.exif import exif_or_reason
+from aeromatch_cli.blocks.read import BlockInputs, read_block_inputs
+from aeromatch_cli.blocks.scan import image_id, image_ids, scan_images
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError, InputError
+
+EAST, NORTH, UP = np.eye(3)
+
+
+def read(images: Path, poses: Path | str | None = None, **options: object) -> BlockInputs:
+    settings: dict = {"sigma_position_m": 2.0, "sigma_angle_deg": 3.0} | options
+    return read_block_inputs(images, None if poses is None else str(poses), **settings)
+
+
+def axes(inputs: BlockInputs, image: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """World directions of image right, image top and the line of sight."""
+    rotation = inputs.poses[image].world_rotation
+    assert rotation is not None
+    return rotation[0], -rotation[1], rotation[2]
+
+
+def write_poses(folder: Path, text: str) -> Path:
+    path = folder / "poses.csv"
+    path.write_text(text)
+    return path
+
+
+# Scan
+
+
+def test_scan_finds_images_at_any_depth_and_says_what_it_passed_over(tmp_path: Path) -> None:
+    for name in ("b.JPG", "a/b.jpg", "a/c.TIFF", "d.png", "x.jpg/inside.jpeg"):
+        write_image(tmp_path / name)
+    for name in (".hidden/e.jpg", ".f.jpg", "notes.txt", "._b.JPG"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "empty.jpg").touch()
+    (tmp_path / "broken.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    (tmp_path / "a" / "loop").symlink_to(tmp_path)
+    names, failures = scan_images(tmp_path)
+    assert names == ["a/b.jpg", "a/c.TIFF", "b.JPG", "d.png", "x.jpg/inside.jpeg"]
+    lost = {failure.name: failure.image_lost for failure in failures}
+    assert lost == {"._b.JPG": False, "broken.jpg": True, "empty.jpg": True, "x.jpg": False}
+
+
+def test_scan_of_no_folder_or_an_unreadable_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="does not exist"):
+        scan_images(tmp_path / "none")
+    with pytest.raises(ConfigError, match="is not a folder"):
+        scan_images(write_image(tmp_path / "a.jpg"))
+
+    def denied(self: Path) -> object:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(ConfigError, match=r"cannot be read \(Permission denied\)"):
+        scan_images(tmp_path)
+
+
+def test_an_unreadable_subfolder_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_image(tmp_path / "a.jpg")
+    write_image(tmp_path / "sub" / "b.jpg")
+    scandir = os.scandir
+
+    def denied_below(path: str) -> object:
+        if Path(path).name == "sub":
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", denied_below)
+    names, failures = scan_images(tmp_path)
+    assert names == ["a.jpg"]
+    assert [(failure.name, failure.image_lost) for failure in failures] == [("sub", True)]
+
+
+def test_image_ids() -> None:
+    assert image_id("a/1.jpg") == "a--1_jpg"
+    assert image_id("DJI_0001.JPG") == "DJI_0001_JPG"
+    assert image_id("2023-05-01 x.jpg").startswith("2023-05-01_x_jpg-")
+    assert len(image_id("x" * 400 + ".jpg")) < 200
+
+
+@given(st.lists(st.text("aA-_./ ü", min_size=1, max_size=8).map(lambda stem: stem + ".jpg"), unique=True))
+def test_image_ids_are_unique_plain_and_independent_of_each_other(names: list[str]) -> None:
+    ids = image_ids(names)
+    assert len(set(ids.values())) == len(names)
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+", value) for value in ids.values())
+    assert all(ids[name] == image_ids([name])[name] for name in names)
+
+
+# Conventions, by hand
+
+
+def test_dji_gimbal_at_yaw_90_pitch_minus_90_has_its_top_to_the_east(tmp_path: Path) -> None:
+    write_dji(tmp_path / "e.jpg", 28.0, -81.0, 150.0, yaw=90.0)  # on UTM 17's central meridian: no convergence
+    write_dji(tmp_path / "n.jpg", 28.0, -81.0, 150.0, yaw=0.0, pitch=-45.0)
+    inputs = read(tmp_path, "exif")
+    right, top, sight = axes(inputs, "e_jpg")
+    assert [*right, *top, *sight] == pytest.approx([*-NORTH, *EAST, *-UP], abs=1e-9)
+    right, top, sight = axes(inputs, "n_jpg")
+    assert [*right, *sight] == pytest.approx([*EAST, *((NORTH - UP) / np.sqrt(2))], abs=1e-9)
+
+
+def test_parrot_zero_angles_have_their_top_to_the_north_and_positive_pitch_looks_ahead(tmp_path: Path) -> None:
+    gps = gps_tags(28.0, -81.0, 150.0)
+    for name, pitch in (("0.jpg", 0), ("10.jpg", 10)):
+        write_image(tmp_path / name, gps=gps, xmp=PARROT_XMP.format(yaw=0, pitch=pitch, roll=0))
+    inputs = read(tmp_path, "exif")
+    right, top, sight = axes(inputs, "0_jpg")
+    assert [*right, *top, *sight] == pytest.approx([*EAST, *NORTH, *-UP], abs=1e-9)
+    assert axes(inputs, "10_jpg")[2] @ NORTH == pytest.approx(np.sin(np.deg2rad(10)))
+
+
+def test_zero_omega_phi_kappa_and_the_matching_quaternion(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.jpg")
+    for columns in ("omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0", "qw,qx,qy,qz\na.jpg,1,2,3,0,1,0,0"):
+        inputs = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{columns}\n"))
+        right, top, sight = axes(inputs, "a_jpg")
+        assert [*right, *top, *sight] == pytest.approx([*EAST, *NORTH, *-UP], abs=1e-9)
+        assert (inputs.crs, inputs.origin_m) == ("local", (0.0, 0.0, 0.0))
+        assert inputs.poses["a_jpg"].center_m.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_true_yaw_is_turned_to_the_grid_and_grid_yaw_is_not(tmp_path: Path) -> None:
+    """One degree east of the meridian at 28 N, true north lies 0.4695 degrees left of grid north."""
+    write_image(tmp_path / "a.jpg")
+    angles = "yaw_deg,pitch_deg,roll_deg"
+    geographic = read(tmp_path, write_poses(tmp_path, f"image,lat,lon,alt,{angles}\na.jpg,28,-80,150,0,-90,0\n"))
+    top = axes(geographic, "a_jpg")[1]
+    assert np.rad2deg(np.arctan2(top[0], top[1])) == pytest.approx(-0.4695, abs=1e-3)
+    grid = read(
+        tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,598300,3097600,150,0,-90,0\n"), crs="EPSG:32617"
+    )
+    assert axes(grid, "a_jpg")[1] == pytest.approx(NORTH, abs=1e-9)
+    assert geographic.poses["a_jpg"].center_m == pytest.approx([308.9, 584.1, 150.0], abs=400)
+    nadir = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"), angles="nadir")
+    assert axes(nadir, "a_jpg")[2] == pytest.approx(-UP, abs=1e-9)
+    gimbal = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"))
+    assert axes(gimbal, "a_jpg")[2] == pytest.approx(NORTH, abs=1e-9)
+
+
+# Whole blocks
+
+
+def test_exif_block(tmp_path: Path) -> None:
+    for row in range(3):
+        write_dji(tmp_path / f"{row}.jpg", 46.84, -91.99 + row * 1e-4, 200.0 + row, relative=41.0 + row)
+    inputs = read(tmp_path, "exif")
+    assert (inputs.crs, inputs.origin_m) == ("EPSG:32615", (577000.0, 5187000.0, 0.0))
+    assert [image.image_id for image in inputs.images] == ["0_jpg", "1_jpg", "2_jpg"]
+    assert set(inputs.cameras) == {"dji-fc6310_8.8mm_f30_40x30"}
+    step_m = inputs.poses["1_jpg"].center_m - inputs.poses["0_jpg"].center_m
+    assert np.linalg.norm(step_m[:2]) == pytest.approx(1e-4 * 111320 * np.cos(np.deg2rad(46.84)), rel=5e-3)
+    assert step_m[2] == pytest.approx(1.0)
+    assert inputs.ground_hint_z_m == pytest.approx(159.0)
+    assert inputs.ground_hint_source == "XMP relative altitude of 3 images"
+    assert (inputs.warnings, inputs.failures) == ((), ())
+    assert (inputs.poses["0_jpg"].sigma_position_m, inputs.poses["0_jpg"].sigma_angle_deg) == (2.0, 3.0)
+
+
+def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
+    write_dji(tmp_path / "good.jpg", 46.84, -91.99, 200.0)
+    write_image(tmp_path / "noposition.jpg")
+    write_image(tmp_path / "noangles.jpg", gps=gps_tags(46.84, -91.99, 200.0))
+    write_image(tmp_path / "zero.jpg", gps=gps_tags(0.0, 0.0, 200.0))
+    write_image(tmp_path / "noaltitude.jpg", gps=gps_tags(46.84, -91.99, None))
+    (tmp_path / "corrupt.jpg").write_bytes(b"\xff\xd8\xff\xe1 no picture")
+    (tmp_path / "empty.jpg").touch()
+    (tmp_path / "._good.jpg").write_bytes(b"x")
+    inputs = read(tmp_path, "exif")
+    assert {image.image_id for image in inputs.images} == {
+        *("good_jpg", "noposition_jpg", "noangles_jpg", "zero_jpg", "noaltitude_jpg")
+    }
+    assert set(inputs.poses) == {"good_jpg", "noangles_jpg"}
+    assert inputs.poses["noangles_jpg"].world_rotation is None
+    assert [(failure.name, failure.stage) for failure in inputs.failures] == [
+        ("corrupt.jpg", "read"),
+        ("empty.jpg", "read"),
+    ]
+    text = "\n".join(inputs.warnings)
+    for words in (
+        "._good.jpg",
+        "2 of 5 images (noposition.jpg, zero.jpg) have no GPS",
+        "no angles",
+        "without altitude",
+    ):
+        assert words in text
+    assert "(0, 0): no fix" in text
+
+
+def test_nothing_usable(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no image"):
+        read(tmp_path)
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(InputError, match=r"none of the 1 images .* a\.jpg: file is empty"):
+        read(tmp_path)
+
+
+def test_without_poses_every_image_is_unposed(tmp_path: Path) -> None:
+    write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
+    for poses in (None, ""):
+        inputs = read(tmp_path, poses)
+        assert (len(inputs.images), dict(inputs.poses), inputs.crs) == (1, {}, "local")
+
+
+def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:
+    for name in ("a/1.jpg", "b/1.jpg", "b/2.JPG", "c/3.jpg"):
+        write_image(tmp_path / name)
+    table = "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,2,0,9\n2.jpg,3,0,9\n1.jpg,4,0,9\nlost.jpg,5,0,9\n3,6,0,9\n"
+    inputs = read(tmp_path, write_poses(tmp_path, table))
+    found = {image.name: inputs.poses[image.image_id].center_m[0] for image in inputs.images}
+    assert found == {"a/1.jpg": 1.0, "b/1.jpg": 2.0, "b/2.JPG": 3.0, "c/3.jpg": 6.0}
+    text = "\n".join(inputs.warnings)
+    assert "names 1 images that are not in the folder: lost.jpg" in text
+    assert "names that several images have (1.jpg)" in text
+
+    partial = read(tmp_path, write_poses(tmp_path, "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,,,\n"))
+    assert set(partial.poses) == {"a--1_jpg"}
+    assert any("2 of 4 images are not in" in warning for warning in partial.warnings)
+    assert any("line 3, column x" in warning for warning in partial.warnings)
+    with pytest.raises(
+        ConfigError, match=r"names none of the 4 images .* it says lost\.jpg, the folder holds a/1\.jpg"
+    ):
+        read(tmp_path, write_poses(tmp_path, "image,x,y,z\nlost.jpg,1,0,9\n"))
+    with pytest.raises(ConfigError, match=r"both mean the image b/2\.JPG"):
+        read(tmp_path, write_poses(tmp_path, "image,x,y,z\nb/2.JPG,1,0,9\n2.jpg,1,0,9\n"))
+
+
+def test_block_json_gives_camera_crs_and_ground(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    write_image(images / "a.jpg", main={274: 6})
+    write_image(images / "cropped.jpg", (40, 20))
+    camera = {"model": "SIMPLE_RADIAL", "width": 80, "height": 60, "params": [100, 40, 30, 0.01]}
+    block = tmp_path / "block.json"
+    block.write_text(json.dumps({"crs": "EPSG:32615", "cameras": {"1": camera}, "ground_z": {"p50": 161.6}}))
+    poses = write_poses(tmp_path, "image,x,y,z,sigma_position_m\na.jpg,576663.2,5188164.9,197.4,0.5\n")
+    inputs = read(images, poses, cameras=str(block))
+    assert (inputs.crs, inputs.origin_m) == ("EPSG:32615", (576000.0, 5188000.0, 0.0))
+    assert (inputs.ground_hint_z_m, inputs.ground_hint_source) == (161.6, "ground height of block.json")
+    (image,) = inputs.images
+    assert (image.exif_orientation, image.width_px, image.height_px) == (6, 40, 30)
+    assert inputs.cameras[image.camera_id].params == pytest.approx((50.0, 19.5, 14.5, 0.01))
+    assert inputs.poses["a_jpg"].center_m == pytest.approx([663.2, 164.9, 197.4])
+    assert inputs.poses["a_jpg"].sigma_position_m == 0.5
+    assert inputs.failures[0].name == "cropped.jpg"
+    other = read(images, poses, cameras=str(block), crs="EPSG:32616")
+    assert (other.crs, other.ground_hint_z_m, other.ground_hint_source) == ("EPSG:32616", None, "")
+
+
+def test_cameras_by_folder_and_by_column(tmp_path: Path) -> None:
+    for name in ("l/1.jpg", "r/1.jpg", "top.jpg"):
+        write_dji(tmp_path / name, 46.84, -91.99, 200.0)
+    assert len(read(tmp_path).cameras) == 1
+    assert len(read(tmp_path, cameras="folder").cameras) == 3
+    table = "image,x,y,z,camera\nl/1.jpg,1,0,9,A\nr/1.jpg,2,0,9,A\ntop.jpg,3,0,9,B\n"
+    by_column = read(tmp_path, write_poses(tmp_path, table))
+    ids = {image.name: image.camera_id for image in by_column.images}
+    assert ids["l/1.jpg"] == ids["r/1.jpg"] != ids["top.jpg"]
+
+
+def test_a_growing_block_keeps_its_frame(tmp_path: Path) -> None:
+    write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
+    first = read(tmp_path, "exif")
+    for row in range(3):
+        write_dji(tmp_path / f"b{row}.jpg", 46.9, -89.99, 200.0)  # moves the median two kilometres and one zone on
+    grown = read(tmp_path, "exif", known_frame=WorldFrame(first.crs, first.origin_m))
+    assert (grown.crs, grown.origin_m) == (first.crs, first.origin_m)
+    assert grown.poses["a_jpg"].center_m.tolist() == first.poses["a_jpg"].center_m.tolist()
+    assert read(tmp_path, "exif").crs == "EPSG:32616"
+
+
+def test_positions_outside_the_crs_and_bad_arguments(tmp_path: Path) -> None:
+    write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
+    with pytest.raises(ConfigError, match="unknown"):
+        read(tmp_path, "exif", crs="EPSG:nothing")
+    with pytest.raises(ConfigError, match="local frame"):
+        read(tmp_path, "exif", crs="local")
+    with pytest.raises(ConfigError, match="angles 'down' is unknown"):
+        read(tmp_path, "exif", angles="down")
+    with pytest.raises(ConfigError, match="camera file"):
+        read(tmp_path, "exif", cameras=str(tmp_path / "none.yaml"))
+
+
+def test_facts_may_be_read_elsewhere(tmp_path: Path) -> None:
+    write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
+    write_image(tmp_path / "b.jpg")
+    inputs = read(tmp_path, read_facts=lambda paths: ["refused", *map(exif_or_reason, paths[1:])])
+    assert inputs.failures[0].reason == "refused"
+    assert [image.name for image in inputs.images] == ["b.jpg"]

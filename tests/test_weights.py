@@ -1,0 +1,187 @@
+"""Weights files: read strictly, found by name or path, recorded with their SHA-256."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.lightglue import Dimensions, build_lightglue
+from aeromatch_cli.nets.weights import (
+    WeightsCheck,
+    add_weights,
+    list_weights,
+    read_tensors,
+    resolve_weights,
+    sha256_of_file,
+    verify_weights,
+    weights_folder,
+)
+
+DIMENSIONS = Dimensions(input_dim=8, descriptor_dim=16, n_layers=2, num_heads=2, add_scale_ori=True)
+
+
+@pytest.fixture(autouse=True)
+def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def lightglue_file(tmp_path: Path) -> Path:
+    path = tmp_path / "small.safetensors"
+    save_file(build_lightglue(DIMENSIONS).state_dict(), path)
+    return path
+
+
+def test_sha256_is_that_of_the_content(tmp_path: Path) -> None:
+    (tmp_path / "abc").write_bytes(b"abc")
+    # FIPS 180-2, appendix B.1.
+    assert sha256_of_file(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_the_folder_follows_xdg(data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert weights_folder() == data_home / "aeromatch" / "weights"
+    monkeypatch.setenv("XDG_DATA_HOME", "relative/is/ignored")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert weights_folder() == tmp_path / ".local" / "share" / "aeromatch" / "weights"
+
+
+def test_added_weights_are_listed_found_and_verified(lightglue_file: Path) -> None:
+    assert list_weights() == ()
+    assert verify_weights() == ()
+    entry = add_weights(lightglue_file)
+    assert entry.sha256 == hashlib.sha256(lightglue_file.read_bytes()).hexdigest()
+    assert (entry.name, entry.architecture) == ("small.safetensors", "lightglue")
+    assert entry.size_bytes == lightglue_file.stat().st_size
+    assert add_weights(lightglue_file) == entry
+    assert list_weights() == (entry,)
+    stored = weights_folder() / "small.safetensors"
+    assert stored.read_bytes() == lightglue_file.read_bytes()
+    assert resolve_weights("small") == resolve_weights("small.safetensors") == stored
+    assert sorted(path.name for path in weights_folder().iterdir()) == ["index.json", "small.safetensors"]
+    assert verify_weights() == (WeightsCheck("small.safetensors", "ok"),)
+
+
+def test_verify_sees_changed_missing_and_foreign_files(lightglue_file: Path, tmp_path: Path) -> None:
+    add_weights(lightglue_file)
+    other = lightglue_file.rename(tmp_path / "other.safetensors")
+    add_weights(other)
+    folder = weights_folder()
+    content = bytearray((folder / "small.safetensors").read_bytes())
+    content[-1] ^= 1
+    (folder / "small.safetensors").write_bytes(content)
+    (folder / "other.safetensors").unlink()
+    (folder / "foreign.pth").write_bytes(b"")
+    assert [(check.name, check.state) for check in verify_weights()] == [
+        ("foreign.pth", "unrecorded"),
+        ("other.safetensors", "missing"),
+        ("small.safetensors", "changed"),
+    ]
+
+
+def test_a_taken_name_is_not_overwritten(lightglue_file: Path, tmp_path: Path) -> None:
+    first = add_weights(lightglue_file)
+    (tmp_path / "again").mkdir()
+    namesake = tmp_path / "again" / "small.safetensors"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        changed = {key: torch.randn_like(value) for key, value in build_lightglue(DIMENSIONS).state_dict().items()}
+    save_file(changed, namesake)
+    with pytest.raises(ConfigError, match="exists with other content"):
+        add_weights(namesake)
+    assert list_weights() == (first,)
+
+
+def test_what_no_network_takes_is_not_added(tmp_path: Path) -> None:
+    path = tmp_path / "linear.safetensors"
+    save_file({"weight": torch.zeros(2, 2)}, path)
+    with pytest.raises(ConfigError, match="is not a LightGlue"):
+        add_weights(path)
+    assert not weights_folder().exists()
+
+
+def test_a_path_is_taken_as_it_is(lightglue_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert resolve_weights(str(lightglue_file)) == lightglue_file
+    monkeypatch.chdir(lightglue_file.parent)
+    assert resolve_weights("small.safetensors") == lightglue_file
+    assert resolve_weights("./small.safetensors") == lightglue_file
+
+
+def test_unknown_weights_say_what_to_do(lightglue_file: Path) -> None:
+    add_weights(lightglue_file)
+    with pytest.raises(ConfigError, match=r"'sift'.*there: small.safetensors.*aeromatch weights add PATH"):
+        resolve_weights("sift")
+
+
+def test_a_broken_index_says_what_to_do(lightglue_file: Path) -> None:
+    add_weights(lightglue_file)
+    (weights_folder() / "index.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"index.json cannot be read.*delete it"):
+        list_weights()
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".pt", ".safetensors"])
+def test_every_format_reads_the_same_tensors(tmp_path: Path, suffix: str) -> None:
+    tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1.5])}
+    path = tmp_path / f"file{suffix}"
+    if suffix == ".safetensors":
+        save_file(tensors, path)
+    else:
+        torch.save(tensors, path)
+    read = read_tensors(path)
+    assert read.keys() == tensors.keys()
+    assert all(torch.equal(read[key], tensors[key]) for key in tensors)
+
+
+@pytest.mark.parametrize("container", ["model", "state_dict"])
+def test_a_training_checkpoint_is_taken_by_its_network(tmp_path: Path, container: str) -> None:
+    torch.save({container: {"a": torch.ones(2)}, "epoch": 3}, tmp_path / "checkpoint.pth")
+    assert torch.equal(read_tensors(tmp_path / "checkpoint.pth")["a"], torch.ones(2))
+
+
+@pytest.mark.parametrize("name", ["damaged.pth", "damaged.safetensors"])
+def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"not a weights file")
+    with pytest.raises(ConfigError, match=f"{name} cannot be read as"):
+        read_tensors(tmp_path / name)
+
+
+def test_a_truncated_file_is_named(lightglue_file: Path) -> None:
+    lightglue_file.write_bytes(lightglue_file.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match=r"small\.safetensors cannot be read as"):
+        read_tensors(lightglue_file)
+
+
+def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
+    marker = tmp_path / "executed"
+
+    class Bomb:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return Path.touch, (str(marker),)
+
+    torch.save({"a": Bomb()}, tmp_path / "bomb.pth")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_tensors(tmp_path / "bomb.pth")
+    assert not marker.exists()
+
+
+def test_other_contents_are_refused(tmp_path: Path) -> None:
+    torch.save([1, 2], tmp_path / "list.pth")
+    with pytest.raises(ConfigError, match="no named tensors"):
+        read_tensors(tmp_path / "list.pth")
+    torch.save({"a": 1.0}, tmp_path / "number.pth")
+    with pytest.raises(ConfigError, match="entry 'a' is not a tensor"):
+        read_tensors(tmp_path / "number.pth")
+    save_file({"a": torch.tensor([1.0, float("nan")])}, tmp_path / "nan.safetensors")
+    with pytest.raises(ConfigError, match="tensor a holds NaN"):
+        read_tensors(tmp_path / "nan.safetensors")
+    (tmp_path / "weights.onnx").touch()
+    with pytest.raises(ConfigError, match=r"unknown suffix '.onnx'; use one of .safetensors"):
+        read_tensors(tmp_path / "weights.onnx")
+    with pytest.raises(ConfigError, match=r"absent\.pth does not exist"):
+        read_tensors(tmp_path / "absent.pth")
