@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from aeromatch_cli.geometry.epipolar import essential, fundamental_from_poses, r
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_quaternion
 from aeromatch_cli.geometry.warps import undistorted_from_ground
 from aeromatch_cli.strategies.exporters import EXPORTERS, Colmap, ExportContents, ExportSummary, PairContents
+
+zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
 
 CAMERA_A = Camera("OPENCV", 1000, 750, (820.0, 815.0, 503.2, 371.1, -0.08, 0.03, 1e-3, -5e-4))
 CAMERA_B = Camera("SIMPLE_RADIAL", 800, 600, (660.0, 399.5, 299.5, -0.05))
@@ -87,7 +90,7 @@ def exported(truth: Truth, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 
 @pytest.fixture
 def database(exported: tuple[Path, ExportSummary]) -> Iterator[Any]:
-    import pycolmap  # the export has used zlib before, without which this import aborts the process
+    import pycolmap
 
     with pycolmap.Database.open(exported[0] / "database.db") as opened:
         yield opened

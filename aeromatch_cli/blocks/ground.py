@@ -137,7 +137,7 @@ def _read_extent(
 
     frames: CRS of the DEM and of the block. Cells are as fine as the DEM's; within one CRS they are its own.
     """
-    from rasterio.transform import from_origin
+    import rasterio
     from rasterio.warp import Resampling, reproject, transform_bounds
 
     left, bottom, right, top = transform_bounds(frames[1], frames[0], *low, *high)
@@ -152,10 +152,10 @@ def _read_extent(
         size = (high - low) / np.maximum(np.array([right - left, top - bottom]) / cells, 1.0)
     size = size * np.maximum(np.ceil((high - low) / size / max_cells), 1.0)
     columns, rows = np.ceil((np.array([high[0] - west, north - low[1]])) / size).astype(int) + 1
-    transform = from_origin(west, north, *size)
+    transform = rasterio.Affine(size[0], 0.0, west, 0.0, -size[1], north)
     heights = np.full((rows, columns), np.nan)
     reproject(
-        _band(dataset),
+        rasterio.band(dataset, 1),
         heights,
         src_transform=own,
         src_crs=frames[0],
@@ -167,12 +167,6 @@ def _read_extent(
         tolerance=0.0,
     )
     return heights, transform
-
-
-def _band(dataset: DatasetReader) -> Any:
-    import rasterio
-
-    return rasterio.band(dataset, 1)
 
 
 def _extent_text(low: FloatArray, high: FloatArray, crs: str) -> str:

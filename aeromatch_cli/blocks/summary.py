@@ -46,7 +46,7 @@ class BlockSummary:
         found = [
             f"images           {self.images}, {self.positioned} with position, {self.oriented} with attitude, "
             f"{self.cameras} camera{'s' if self.cameras != 1 else ''}",
-            f"world            {self.crs}, origin {self.origin_m[0]:g} {self.origin_m[1]:g} {self.origin_m[2]:g}",
+            f"world            {self.crs}, origin {self.origin_m[0]:.0f} {self.origin_m[1]:.0f} {self.origin_m[2]:.0f}",
             f"ground           {self.ground_source or 'unknown'}",
         ]
         if self.positioned:

@@ -171,7 +171,7 @@ def notices(
     if lost:
         text = "They have no matches on file: the match stage failed on them or has not run."
         found.append(Notice("warn", f"{lost:,} pairs were not judged", text))
-    found += [Notice("warn", "Input", warning) for warning in warnings]
+    found += [Notice("warn", "Remark on the input", warning) for warning in warnings]
     return found
 
 

@@ -178,14 +178,15 @@ def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], lin
 
 
 def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> _Frame:
-    """All cameras, and footprints up to the 2nd and 98th percentile of their corners: one view of the horizon must
-    not shrink the block to a dot."""
+    """All cameras, and of the footprints what does not shrink the block to a dot, as views of the horizon would."""
     centers = np.array([[s.x_m, s.y_m] for s in stations])
     low, high = centers.min(axis=0), centers.max(axis=0)
     if footprints:
         corners = np.concatenate(list(footprints))
-        low = np.minimum(low, np.percentile(corners, 2, axis=0))
-        high = np.maximum(high, np.percentile(corners, 98, axis=0))
+        sizes = [float(np.ptp(polygon, axis=0).max()) for polygon in footprints]
+        most = max(0.6 * float((high - low).max()), 0.15 * float(np.median(sizes)))
+        low = np.maximum(np.minimum(low, corners.min(axis=0)), low - most)
+        high = np.minimum(np.maximum(high, corners.max(axis=0)), high + most)
     span = np.maximum(high - low, max(float((high - low).max()) * 0.02, 1.0))
     middle = (low + high) / 2
     low, high = middle - span * 0.54, middle + span * 0.54
@@ -234,7 +235,9 @@ def _outlines(frame: _Frame, polygons: Sequence[FloatArray]) -> list[str]:
             parts.append(f"M{'L'.join(f'{frame.x(x):.1f} {frame.y(y):.1f}' for x, y in polygon)}Z")
     if len(polygons) > 200:
         return [f'<path class="outline many" d="{"".join(parts)}"/>']
-    return ['<g class="footprints">', *(f'<path class="outline" d="{part}"/>' for part in parts), "</g>"]
+    # Overlapping fills add up: the whole block together must stay paler than its pair lines.
+    fill = f'<g fill-opacity="{min(0.05, 0.4 / max(len(parts), 1)):.4f}">'
+    return [fill, *(f'<path class="outline" d="{part}"/>' for part in parts), "</g>"]
 
 
 def _lines(place: dict[str, tuple[float, float]], links: Sequence[Link], limits: Sequence[int]) -> list[str]:
@@ -304,17 +307,17 @@ def _map_legend(limits: Sequence[int], links: Sequence[Link]) -> tuple[tuple[str
 
 def histogram(values: Sequence[float], label: str, unit: str) -> str:
     """Bars over about 24 equal classes with a rounded width. values: counts, at least one of them."""
-    width, height, left, bottom, top = 540.0, 210.0, 44.0, 40.0, 12.0
+    width, height, left, right, bottom, top = 540.0, 210.0, 44.0, 26.0, 40.0, 12.0
     step = max(1.0, nice_step(max(max(values), 1.0), 24))
     bins = int(max(values) // step) + 1
     counts = np.bincount((np.asarray(values, dtype=np.float64) // step).astype(int), minlength=bins)
-    inner_width, inner_height = width - left - 10, height - bottom - top
+    inner_width, inner_height = width - left - right, height - bottom - top
     peak, bar = float(counts.max()), inner_width / bins
     parts = [f'<svg class="histogram" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">']
     y_step = max(1.0, nice_step(peak, 4))
     for k in range(int(peak // y_step) + 1):
         y = top + inner_height * (1 - k * y_step / peak)
-        parts.append(f'<path class="grid" d="M{left} {y:.1f}H{width - 10:.1f}"/>')
+        parts.append(f'<path class="grid" d="M{left} {y:.1f}H{width - right:.1f}"/>')
         parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{k * y_step:,.0f}</text>')
     for index, count in enumerate(counts):
         if count:
@@ -372,7 +375,8 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
     chosen = _spread(points0, MAX_PREVIEW_LINES)
     dots = _spread(points0, MAX_PREVIEW_POINTS)
     parts = [
-        f'<svg class="preview" viewBox="0 0 {width} {height}" role="img" aria-label="{escape(label)}">',
+        f'<svg class="preview" viewBox="0 0 {width} {height}" style="max-width:{1.14 * width:.0f}px" role="img" '
+        f'aria-label="{escape(label)}">',
         f'<image href="{uri0}" x="0" y="0" width="{size0[0]}" height="{size0[1]}"/>',
         f'<image href="{uri1}" x="{offset}" y="0" width="{size1[0]}" height="{size1[1]}"/>',
     ]

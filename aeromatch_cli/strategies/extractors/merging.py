@@ -15,8 +15,8 @@ def merge_keypoints(points_px: FloatArray, sizes_px: FloatArray, view_idx: IntAr
     """Keypoint number of each feature (N,) and the feature that stands for each keypoint (K,), both int64.
 
     points_px (N, 2), sizes_px (N,) in the source frame, views ascending. Neighbours in the list of equal view, place
-    and size are one keypoint (several orientations). A keypoint of a later view joins the nearest one of the views before it, if each
-    is the other's nearest, within 1 px and a size ratio of 1.5; the earliest view's place stands.
+    and size are one keypoint (several orientations). A keypoint of a later view joins the nearest one of the views
+    before it, if each is the other's nearest, within 1 px and a size ratio of 1.5; the earliest view's place stands.
     """
     if len(points_px) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -40,8 +40,10 @@ def _same_points(
 ) -> tuple[IntArray, IntArray]:
     from scipy.spatial import cKDTree
 
-    distance, forward = cKDTree(points_px[old]).query(points_px[new])
-    _, backward = cKDTree(points_px[new]).query(points_px[old])
+    if len(new) == 0 or len(old) == 0:
+        return new[:0], old[:0]
+    distance, forward = (np.asarray(x) for x in cKDTree(points_px[old]).query(points_px[new]))
+    backward = np.asarray(cKDTree(points_px[new]).query(points_px[old])[1])
     ratio = sizes_px[new] / sizes_px[old[forward]]
     same = (distance <= _MERGE_DISTANCE_PX) & (backward[forward] == np.arange(len(new)))
     same &= (ratio <= _MERGE_SIZE_RATIO) & (ratio >= 1.0 / _MERGE_SIZE_RATIO)

@@ -5,6 +5,7 @@ Source: Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012 (RootSIFT). The d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -25,27 +26,28 @@ _DESCRIPTOR_LENGTH = 128
 
 
 class Sift(Strategy):
-    """SIFT keypoints and RootSIFT descriptors of all views of one image.
-
-    keypoints: points per image, over all its views: exactly so many, fewer only where fewer exist. A point with two
-    orientations counts once and has two descriptors.
-    contrast_threshold: OpenCV's, divided by octave_layers inside; edge_threshold: largest ratio of curvatures.
-    selection: which points a cell gives first: "balanced" by response x size^2 (found again most often in neighbouring
-    images), "scale" the largest, "response" the most contrasted.
-    per_cell: average features per cell of the even selection; larger is less even.
-    """
+    """SIFT keypoints and RootSIFT descriptors of all views of one image."""
 
     version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["sift"] = "sift"
-    keypoints: int = Field(4000, ge=1)
-    contrast_threshold: float = Field(0.01, gt=0.0)
-    edge_threshold: float = Field(10.0, gt=1.0)
-    octave_layers: int = Field(3, ge=1)
-    sigma: float = Field(1.6, gt=0.5)
-    selection: Literal["balanced", "scale", "response"] = "balanced"
-    per_cell: int = Field(200, ge=1)
+    keypoints: int = Field(
+        4000,
+        ge=1,
+        description="Points per image over all its views: exactly so many, fewer only where fewer exist. "
+        "A point with several orientations counts once.",
+    )
+    contrast_threshold: float = Field(0.01, gt=0.0, description="Smallest contrast, divided by octave_layers inside.")
+    edge_threshold: float = Field(10.0, gt=1.0, description="Largest ratio of the two curvatures.")
+    octave_layers: int = Field(3, ge=1, description="Scales per octave.")
+    sigma: float = Field(1.6, gt=0.5, description="Blur of the first scale, pixels of the doubled image.")
+    selection: Literal["balanced", "scale", "response"] = Field(
+        "balanced",
+        description="What a cell gives first: the largest, the most contrasted, or response x size^2 (balanced).",
+    )
+    per_cell: int = Field(200, ge=1, description="Keypoints per cell of the even spread; larger is less even.")
 
-    def __call__(self, camera: Camera, views: tuple[ViewPixels, ...]) -> Features:
+    def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
         found = [_in_source(camera, view, self._detect(view, index)) for index, view in enumerate(views)]
         raw = _concatenate(found)
@@ -67,7 +69,7 @@ class Sift(Strategy):
     def _detect(self, view: ViewPixels, view_idx: int) -> _Raw:
         import cv2
 
-        detector = cv2.SIFT_create(
+        detector = cv2.SIFT.create(
             nfeatures=0,
             nOctaveLayers=self.octave_layers,
             contrastThreshold=self.contrast_threshold,
@@ -155,7 +157,9 @@ def _in_source(camera: Camera, view: ViewPixels, raw: _Raw) -> _Raw:
         return raw
     warp = view.view.undistorted_from_view
     points = raw.points_px.astype(np.float64)
-    ring = [source_from_view(camera, warp, points + step) for step in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))]
+    ring = [
+        source_from_view(camera, warp, points + step) for step in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
+    ]
     along_x, along_y = ring[0] - ring[1], ring[2] - ring[3]
     scale = np.sqrt(np.abs(along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]))
     source = source_from_view(camera, warp, points)
@@ -166,7 +170,9 @@ def _in_source(camera: Camera, view: ViewPixels, raw: _Raw) -> _Raw:
     return moved.take(inside)
 
 
-def _features(raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, views: tuple[ViewPixels, ...]) -> Features:
+def _features(
+    raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, views: Sequence[ViewPixels]
+) -> Features:
     """The chosen keypoints and all their descriptors, those of one keypoint side by side."""
     number = np.full(int(keypoint_idx.max(initial=-1)) + 1, -1, np.int64)
     number[chosen] = np.arange(len(chosen))

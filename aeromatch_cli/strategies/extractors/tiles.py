@@ -66,7 +66,10 @@ def _spans(length_px: int, count: int, margin_px: int) -> list[tuple[int, int, f
     cuts = [outer + inner * k for k in range(count - 1)]
     aligned = [round(cut / _ALIGN_PX) * _ALIGN_PX for cut in cuts]
     lows, highs = [-np.inf, *(cut - 0.5 for cut in aligned)], [*(cut - 0.5 for cut in aligned), np.inf]
-    starts, ends = [0, *(max(0, cut - margin_px) for cut in aligned)], [*(cut + margin_px for cut in aligned), length_px]
+    starts, ends = (
+        [0, *(max(0, cut - margin_px) for cut in aligned)],
+        [*(cut + margin_px for cut in aligned), length_px],
+    )
     return [
         (start, min(end, length_px), float(low), float(high))
         for start, end, low, high in zip(starts, ends, lows, highs, strict=True)

@@ -20,20 +20,20 @@ from aeromatch_cli.strategies import Strategy
 class Poselib(Strategy):
     """Keeps the matches that one two-view geometry explains.
 
-    threshold_px: largest Sampson error in undistorted pixels at the focal length. min_inliers: fewer matches given
-    are "not verifiable", fewer inliers reject the pair; the gate comes after the estimator, which calls 7 of 7 random
-    matches inliers. confidence, min_iterations, max_iterations: when sampling stops. model: "relative_pose" with the
-    cameras, "fundamental" without.
+    The gate on the number of inliers comes after the estimator, which calls 7 of 7 random matches inliers.
     """
 
     version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["poselib"] = "poselib"
-    model: Literal["relative_pose", "fundamental"] = "relative_pose"
-    threshold_px: float = Field(4.0, gt=0.0)
-    min_inliers: int = Field(15, ge=8)
-    confidence: float = Field(0.999, gt=0.0, lt=1.0)
-    min_iterations: int = Field(50, ge=1)
-    max_iterations: int = Field(3000, ge=1)
+    model: Literal["relative_pose", "fundamental"] = Field(
+        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without."
+    )
+    threshold_px: float = Field(4.0, gt=0.0, description="Largest Sampson error, undistorted pixels.")
+    min_inliers: int = Field(15, ge=8, description="Fewer matches are not verifiable, fewer inliers reject the pair.")
+    confidence: float = Field(0.999, gt=0.0, lt=1.0, description="Sampling stops at this chance of a clean sample.")
+    min_iterations: int = Field(50, ge=1, description="Samples drawn at least.")
+    max_iterations: int = Field(3000, ge=1, description="Samples drawn at most.")
 
     def __call__(self, points0_px: FloatArray, points1_px: FloatArray, geometry: PairGeometry, seed: int) -> Verdict:
         """points (M, 2) in stored pixels. The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""

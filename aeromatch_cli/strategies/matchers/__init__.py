@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 
-MATCHERS = {"nearest": Nearest}
+MATCHERS: dict[str, type[Nearest] | type[LightGlue]] = {"nearest": Nearest, "lightglue": LightGlue}

@@ -27,16 +27,14 @@ Multiply = Callable[[int, int, NDArray[Any]], NDArray[Any]]
 
 
 class Nearest(Strategy):
-    """Mutual nearest neighbours over all descriptors of both images, at most one match per keypoint.
-
-    ratio: distance to the nearest over distance to the nearest of another keypoint, from image 0's side.
-    ratio_both: the same from image 1's side as well.
-    """
+    """Mutual nearest neighbours over all descriptors of both images, at most one match per keypoint."""
 
     version: ClassVar[int] = 1
     name: Literal["nearest"] = "nearest"
-    ratio: float = Field(0.8, gt=0.0, le=1.0)
-    ratio_both: bool = False
+    ratio: float = Field(
+        0.8, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
+    )
+    ratio_both: bool = Field(False, description="The ratio must hold from image 1's side as well.")
 
     def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches:
         """Matches of one pair, sorted by keypoint of image 0; geometry is not used. Scores are 1 - d1/d2."""
@@ -134,8 +132,9 @@ def _scan(
     # Descriptors of one keypoint side by side, so that the nearest one's siblings are a short run of columns.
     run_start, run_length = _runs(target_keypoint_idx)
     nearest = np.empty(len(queries), np.int64)
-    best, second = np.empty(len(queries), dtype), np.empty(len(queries), dtype)
-    column_best = np.full(len(targets), _lowest(np.dtype(dtype)), dtype)
+    best: NDArray[Any] = np.empty(len(queries), dtype)
+    second: NDArray[Any] = np.empty(len(queries), dtype)
+    column_best: NDArray[Any] = np.full(len(targets), _lowest(np.dtype(dtype)), dtype)
     for start in range(0, len(queries), _BLOCK_ROWS):
         stop = min(start + _BLOCK_ROWS, len(queries))
         scores = multiply(start, stop, norms_t)
@@ -159,9 +158,9 @@ def _runs(keypoint_idx: IntArray) -> tuple[IntArray, IntArray]:
 
 def _product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
     """How to compute 2 q.t - |t|^2 for a block of queries, with the squared norms and the type of the result."""
-    if queries.dtype == np.uint8 and targets.dtype == np.uint8 and queries.shape[1] <= _COMPONENTS_EXACT:
-        if _has_integer_product():
-            return _integer_product(queries, targets)
+    are_bytes = queries.dtype == np.uint8 and targets.dtype == np.uint8 and queries.shape[1] <= _COMPONENTS_EXACT
+    if are_bytes and _has_integer_product():
+        return _integer_product(queries, targets)
     q, t = queries.astype(np.float32), targets.astype(np.float32)
     transposed = t.T
     buffer = np.empty((min(_BLOCK_ROWS, len(q)), len(t)), np.float32)
@@ -176,9 +175,7 @@ def _product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, ND
     return multiply, (q * q).sum(axis=1), (t * t).sum(axis=1), np.float32
 
 
-def _integer_product(
-    queries: NDArray[Any], targets: NDArray[Any]
-) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
+def _integer_product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
     """The same on signed bytes: distances do not change when both sides are shifted by 128."""
     import torch
 

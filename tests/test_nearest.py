@@ -1,0 +1,160 @@
+"""Mutual nearest neighbours against a brute-force reference."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeromatch_cli.data import Features, Pair, PairGeometry
+from aeromatch_cli.geometry.cameras import from_colmap
+from aeromatch_cli.strategies.matchers import MATCHERS
+from aeromatch_cli.strategies.matchers import nearest as nearest_module
+from aeromatch_cli.strategies.matchers.nearest import Nearest, mutual_nearest, one_to_one
+
+CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
+GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)
+
+
+def reference(d0, d1, k1, ratio, k0=None):
+    """Every distance in exact integers, every rule by a loop."""
+    a, b = d0.astype(np.int64), d1.astype(np.int64)
+    squared = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)
+    found = []
+    for i in range(len(a)):
+        j = int(squared[i].argmin())
+        if squared[:, j].min() != squared[i, j] or j in [c for _, c in found]:
+            continue
+        others = squared[i][k1 != k1[j]]
+        passes = len(others) == 0 or (others.min() > 0 and np.sqrt(squared[i, j] / others.min()) < ratio)
+        if passes and k0 is not None:
+            back = squared[:, j][k0 != k0[i]]
+            passes = len(back) == 0 or (back.min() > 0 and np.sqrt(squared[i, j] / back.min()) < ratio)
+        if passes:
+            found.append((i, j))
+    return found
+
+
+def descriptors(rng, count, noise, base=None):
+    fresh = rng.integers(0, 256, (count, 128))
+    if base is not None:
+        n = min(count, len(base))
+        fresh[:n] = np.clip(base[:n].astype(int) + rng.integers(-noise, noise + 1, (n, 128)), 0, 255)
+    return fresh.astype(np.uint8)
+
+
+def features(described, keypoint_idx=None):
+    count = len(described)
+    keypoint_idx = np.arange(count) if keypoint_idx is None else np.asarray(keypoint_idx)
+    keypoints = np.random.default_rng(0).uniform(0, 80, (int(keypoint_idx.max(initial=-1)) + 1, 2)).astype(np.float32)
+    zeros = np.zeros(count, np.float32)
+    return Features(
+        keypoints_px=keypoints,
+        sizes_px=np.ones(len(keypoints), np.float32),
+        responses=np.ones(len(keypoints), np.float32),
+        descriptors=described,
+        descriptor_keypoint_idx=keypoint_idx.astype(np.int32),
+        view_idx=np.zeros(count, np.int32),
+        view_keypoints_px=keypoints[keypoint_idx],
+        view_size_px=zeros,
+        view_orientation_deg=zeros,
+        view_sizes_px=np.array([[100, 80]], np.int32),
+        view_angles_deg=np.zeros(1, np.float32),
+    )
+
+
+@pytest.fixture(params=[True, False], ids=["bytes", "float32"])
+def arithmetic(request, monkeypatch):
+    """Both ways to multiply; the byte way only where this processor has it."""
+    if request.param and not nearest_module._has_integer_product():
+        pytest.skip("no byte product on this processor")
+    monkeypatch.setattr(nearest_module, "_has_integer_product", lambda: request.param)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 150), st.integers(1, 40), st.sampled_from([5, 60, 120]), st.booleans())
+def test_equals_brute_force(seed, count0, count1, noise, both):
+    rng = np.random.default_rng(seed)
+    d0 = descriptors(rng, count0, 0)
+    d1 = descriptors(rng, count1, noise, d0)
+    k0 = np.sort(rng.integers(0, max(1, count0 // 2), count0))
+    k1 = np.sort(rng.integers(0, max(1, count1 // 2), count1))
+    rows, columns, ratios = mutual_nearest(d0, d1, k0, k1, ratio=0.8, ratio_both=both)
+    expected = reference(d0, d1, k1, 0.8, k0 if both else None)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == expected
+    assert (ratios < 0.8).all()
+
+
+def test_both_arithmetics_are_exact(arithmetic):
+    rng = np.random.default_rng(7)
+    # Bytes at their limits make the largest sums.
+    d0 = np.where(rng.random((300, 128)) < 0.5, 0, 255).astype(np.uint8)
+    d1 = d0[:200] ^ (rng.random((200, 128)) < 0.1).astype(np.uint8) * 255
+    rows, columns, _ = mutual_nearest(d0, d1, np.arange(300), np.arange(200), ratio=0.8)
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == reference(d0, d1, np.arange(200), 0.8)
+    assert len(rows) > 190
+
+
+def test_float_descriptors_are_matched_too():
+    rng = np.random.default_rng(3)
+    d0 = rng.standard_normal((150, 64)).astype(np.float32)
+    d1 = d0[::-1] + 0.05 * rng.standard_normal((150, 64)).astype(np.float32)
+    rows, columns, _ = mutual_nearest(d0, d1, np.arange(150), np.arange(150), ratio=0.8)
+    assert np.array_equal(columns, 149 - rows)
+    assert len(rows) == 150
+
+
+def test_matches_are_one_to_one_in_keypoints():
+    rng = np.random.default_rng(1)
+    base = descriptors(rng, 60, 0)
+    # Every keypoint has two descriptors, and both find their partner.
+    first, second = features(base, np.arange(60) // 2), features(descriptors(rng, 60, 8, base), np.arange(60) // 2)
+    matches = Nearest()(first, second, GEOMETRY)
+    assert np.array_equal(matches.indices, np.stack([np.arange(30)] * 2, axis=1))
+    assert matches.indices.dtype == np.int32
+    assert matches.view_pairs.shape == (30, 2)
+    assert (matches.scores > 0.2).all()
+    assert (matches.scores <= 1.0).all()
+
+
+def test_the_runner_up_is_another_keypoint():
+    rng = np.random.default_rng(2)
+    base = descriptors(rng, 20, 0)
+    twins = np.repeat(base, 2, axis=0)
+    assert len(Nearest()(features(base), features(twins, np.arange(40) // 2), GEOMETRY).indices) == 20
+    # The same descriptors as keypoints of their own are ambiguous.
+    assert len(Nearest()(features(base), features(twins), GEOMETRY).indices) == 0
+
+
+@pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (1, 1)])
+def test_few_descriptors_do_no_harm(count0, count1):
+    d = descriptors(np.random.default_rng(0), 5, 0)
+    matches = Nearest()(features(d[:count0]), features(d[:count1]), GEOMETRY)
+    assert matches.indices.shape == (min(count0, count1), 2)
+    assert matches.scores.shape == (min(count0, count1),)
+
+
+def test_two_runs_are_equal_to_the_bit(arithmetic):
+    rng = np.random.default_rng(5)
+    base = descriptors(rng, 500, 0)
+    pair = features(base), features(descriptors(rng, 450, 40, base))
+    first, second = Nearest()(*pair, GEOMETRY), Nearest()(*pair, GEOMETRY)
+    assert np.array_equal(first.indices, second.indices)
+    assert np.array_equal(first.scores, second.scores)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 8), st.integers(0, 5)), max_size=30))
+def test_one_to_one_is_greedy(rows):
+    idx0, idx1, costs = (np.array([row[k] for row in rows], dtype=np.int64) for k in range(3))
+    expected, used0, used1 = [], set(), set()
+    for k in np.argsort(costs, kind="stable").tolist():
+        if idx0[k] not in used0 and idx1[k] not in used1:
+            expected.append(k)
+            used0.add(idx0[k])
+            used1.add(idx1[k])
+    assert sorted(one_to_one(idx0, idx1, costs.astype(float)).tolist()) == sorted(expected)
+
+
+def test_the_table_names_its_classes():
+    assert set(MATCHERS) == {"nearest", "lightglue"}
+    assert all(MATCHERS[name].model_fields["name"].default == name for name in MATCHERS)

@@ -1,0 +1,226 @@
+"""SIFT against rendered truth: places, budget, spread, tiles, masks, views."""
+
+import cv2
+import numpy as np
+import pytest
+
+from aeromatch_cli.data import Camera, View
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors import sift as sift_module
+from aeromatch_cli.strategies.extractors.merging import merge_keypoints
+from aeromatch_cli.strategies.extractors.selection import even_selection
+from aeromatch_cli.strategies.extractors.sift import Sift, root_sift
+from aeromatch_cli.strategies.extractors.tiles import tiles
+
+
+def camera_of(gray):
+    height, width = gray.shape
+    return Camera("PINHOLE", width, height, (1000.0, 1000.0, (width - 1) / 2, (height - 1) / 2))
+
+
+def source(gray, valid=None):
+    height, width = gray.shape
+    return ViewPixels(View("source", width, height, np.eye(3), is_source=True, angle_deg=0.0), gray, valid)
+
+
+def extract(gray, valid=None, **settings):
+    return Sift(**settings)(camera_of(gray), (source(gray, valid),))
+
+
+def texture(width, height, seed=0):
+    """Noise with structure at several scales."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros((height, width))
+    for scale in (2, 4, 8, 16):
+        coarse = rng.standard_normal((height // scale + 2, width // scale + 2))
+        total += scale**0.5 * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + 25 * total, 0, 255).astype(np.uint8)
+
+
+def blobs(centers, sigma, size=160):
+    y, x = np.mgrid[:size, :size]
+    gray = np.full((size, size), 60.0)
+    for cx, cy in centers:
+        gray += 150 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2))
+    return np.rint(gray).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [2.0, 3.0, 6.0])
+def test_a_blob_is_found_at_its_centre(sigma):
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(12):
+        centre = 80 + rng.uniform(-0.5, 0.5, 2)
+        keypoints = extract(blobs([centre], sigma)).keypoints_px
+        distance = np.linalg.norm(keypoints - centre, axis=1)
+        errors.append(keypoints[distance.argmin()] - centre)
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.03
+    assert np.abs(errors).max() < 0.1
+
+
+def test_the_size_is_the_blobs_diameter():
+    features = extract(blobs([(80.3, 79.8)], 5.0))
+    nearest = np.linalg.norm(features.keypoints_px - [80.3, 79.8], axis=1).argmin()
+    # The scale space extremum of a Gaussian blob lies near its own sigma; the size is twice the scale.
+    assert features.sizes_px[nearest] == pytest.approx(10.0, rel=0.15)
+
+
+@pytest.mark.parametrize("budget", [1, 100, 777])
+def test_the_budget_is_exact(budget):
+    features = extract(texture(400, 300), keypoints=budget)
+    assert features.keypoints_px.shape == (budget, 2)
+    assert len(features.descriptors) >= budget
+    assert np.array_equal(np.unique(features.descriptor_keypoint_idx), np.arange(budget))
+
+
+def test_fewer_only_where_fewer_exist():
+    gray = texture(200, 150)
+    everything = extract(gray, keypoints=10**6)
+    assert len(extract(gray, keypoints=len(everything.keypoints_px) + 1).keypoints_px) == len(everything.keypoints_px)
+    assert len(np.unique(everything.keypoints_px, axis=0)) > 0.9 * len(everything.keypoints_px)
+
+
+def test_the_arrays_have_the_documented_types():
+    features = extract(texture(300, 200), keypoints=50)
+    count = len(features.descriptors)
+    assert features.keypoints_px.dtype == np.float32
+    assert features.descriptors.dtype == np.uint8
+    assert features.descriptors.shape == (count, 128)
+    assert features.descriptor_keypoint_idx.dtype == np.int32
+    assert (np.diff(features.descriptor_keypoint_idx) >= 0).all()
+    assert np.array_equal(features.view_sizes_px, [[300, 200]])
+    rows = features.descriptor_keypoint_idx
+    assert np.array_equal(features.view_keypoints_px, features.keypoints_px[rows])
+    assert (features.view_orientation_deg >= 0).all()
+    assert (features.view_orientation_deg <= 360).all()
+
+
+def test_an_empty_picture_gives_empty_features_of_the_right_shapes():
+    features = extract(np.full((64, 80), 127, np.uint8))
+    assert features.keypoints_px.shape == (0, 2)
+    assert features.descriptors.shape == (0, 128)
+    assert features.descriptors.dtype == np.uint8
+    assert features.descriptor_keypoint_idx.dtype == np.int32
+    assert features.view_keypoints_px.shape == (0, 2)
+    assert features.view_sizes_px.shape == (1, 2)
+
+
+def test_two_runs_are_equal_to_the_bit():
+    gray = texture(300, 250)
+    first, second = extract(gray, keypoints=300), extract(gray, keypoints=300)
+    assert all(np.array_equal(a, b) for a, b in zip(vars(first).values(), vars(second).values(), strict=True))
+
+
+def uneven(seed=0):
+    """Strong texture on the left third, weak texture elsewhere."""
+    gray = texture(600, 300, seed).astype(float)
+    gray[:, 200:] = 128 + (gray[:, 200:] - 128) * 0.25
+    return np.rint(gray).astype(np.uint8)
+
+
+def cells_hit(points):
+    return len(np.unique((points // 25).astype(int), axis=0))
+
+
+def test_the_selection_is_more_even_than_the_strongest():
+    gray = uneven()
+    even = extract(gray, keypoints=300, selection="response", per_cell=4).keypoints_px
+    strongest = extract(gray, keypoints=300, selection="response", per_cell=300).keypoints_px
+    assert cells_hit(even) > 1.5 * cells_hit(strongest)
+    assert (even[:, 0] > 200).mean() > 0.5
+    assert (strongest[:, 0] > 200).mean() < 0.1
+
+
+def test_even_selection_by_hand():
+    points = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [11.0, 1.0], [12.0, 2.0]])
+    strengths = np.array([5.0, 9.0, 7.0, 1.0, 2.0])
+    # Two cells of 10 x 10 px; the first round gives 1 and 4, the second the stronger of 2 and 3.
+    assert even_selection(points, strengths, 20, 10, 2, 1).tolist() == [1, 4]
+    assert even_selection(points, strengths, 20, 10, 3, 2).tolist() == [1, 2, 4]
+
+
+def test_tiles_share_out_every_pixel_once_and_are_bounded():
+    for width, height in [(5472, 3648), (2304, 1728), (4000, 2250), (11000, 700), (100, 90)]:
+        layout = tiles(width, height, 4_000_000, 128)
+        y, x = np.mgrid[0:height:7, 0:width:7]
+        points = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+        owners = sum(tile.owns(points).astype(int) for tile in layout)
+        assert (owners == 1).all()
+        for tile in layout:
+            assert (tile.x1 - tile.x0) * (tile.y1 - tile.y0) <= 4_000_000
+            mine = points[tile.owns(points)]
+            for low, high, values, end in ((tile.x0, tile.x1, mine[:, 0], width), (tile.y0, tile.y1, mine[:, 1], height)):
+                assert low == 0 or values.min() - low >= 120
+                assert high == end or high - values.max() >= 120
+
+
+def test_tiles_find_the_same_keypoints(monkeypatch):
+    gray = texture(1400, 900, seed=3)
+    whole = extract(gray, keypoints=10**6)
+    monkeypatch.setattr(sift_module, "_TILE_AREA_PX", 400_000)
+    assert len(tiles(1400, 900, 400_000, 128)) > 3
+    tiled = extract(gray, keypoints=10**6)
+    a = {(round(float(x), 2), round(float(y), 2)) for x, y in whole.keypoints_px}
+    b = {(round(float(x), 2), round(float(y), 2)) for x, y in tiled.keypoints_px}
+    assert len(a) > 2000
+    assert len(a ^ b) < 0.01 * len(a)
+    assert len(tiled.keypoints_px) == pytest.approx(len(whole.keypoints_px), rel=0.005)
+
+
+def test_nothing_is_found_under_or_at_the_edge_of_a_mask():
+    gray = texture(400, 300)
+    valid = np.ones(gray.shape, dtype=bool)
+    valid[:, 200:] = False
+    gray[:, 200:] = 0
+    features = extract(gray, valid, keypoints=10**6)
+    assert len(features.keypoints_px) > 300
+    assert (features.keypoints_px[:, 0] + features.sizes_px < 200).all()
+    assert len(extract(gray, np.zeros_like(valid)).keypoints_px) == 0
+
+
+def test_root_sift_has_length_512():
+    rng = np.random.default_rng(0)
+    raw = rng.integers(0, 60, (50, 128)).astype(np.uint8)
+    described = root_sift(raw)
+    assert np.linalg.norm(described.astype(float), axis=1) == pytest.approx(np.full(50, 512.0), rel=0.005)
+    expected = np.sqrt(raw / raw.sum(axis=1, keepdims=True, dtype=float)) * 512
+    assert np.abs(described - expected).max() <= 0.5001
+    assert root_sift(np.eye(128, dtype=np.uint8)[:1]).max() == 255
+    assert root_sift(np.zeros((1, 128), np.uint8)).max() == 0
+
+
+def shrunk_view(gray, factor=2):
+    """The picture at half size as a view, in the pixel-centre convention."""
+    height, width = gray.shape
+    small = cv2.resize(gray, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    shift = (factor - 1) / 2
+    warp = np.array([[factor, 0.0, shift], [0.0, factor, shift], [0.0, 0.0, 1.0]])
+    view = View("half", width // factor, height // factor, warp, is_source=False, angle_deg=10.0)
+    return ViewPixels(view, small, None)
+
+
+def test_views_are_merged_in_source_pixels():
+    rng = np.random.default_rng(5)
+    centres = [(40.0 + 80 * i + rng.uniform(-1, 1), 40.0 + 80 * j + rng.uniform(-1, 1)) for i in range(4) for j in range(4)]
+    gray = blobs(centres, 6.0, size=320)
+    features = Sift()(camera_of(gray), (source(gray), shrunk_view(gray)))
+    assert set(features.view_idx.tolist()) == {0, 1}
+    for centre in centres:
+        near = np.flatnonzero((np.linalg.norm(features.keypoints_px - centre, axis=1) < 0.5) & (features.sizes_px > 8))
+        assert len(near) == 1
+        of_point = features.descriptor_keypoint_idx == near[0]
+        assert set(features.view_idx[of_point].tolist()) == {0, 1}
+        half = of_point & (features.view_idx == 1)
+        assert features.view_keypoints_px[half][0] == pytest.approx((np.array(centre) - 0.5) / 2, abs=0.2)
+        assert features.view_size_px[half][0] * 2 == pytest.approx(features.sizes_px[near[0]], rel=0.3)
+    assert np.array_equal(features.view_sizes_px, [[320, 320], [160, 160]])
+    assert features.view_angles_deg.tolist() == [0.0, 10.0]
+
+
+def test_merging_by_hand():
+    points = np.array([[5.0, 5.0], [5.0, 5.0], [9.0, 9.0], [5.4, 5.0], [20.0, 3.0], [9.3, 9.0]])
+    sizes = np.array([4.0, 4.0, 4.0, 4.5, 2.0, 40.0])
+    numbers, standing = merge_keypoints(points, sizes, np.array([0, 0, 0, 1, 1, 1]))
+    # The fourth joins the first; the last one is near the third, but ten times as large.
+    assert numbers.tolist() == [0, 0, 1, 0, 2, 3]
+    assert standing.tolist() == [0, 2, 4, 5]

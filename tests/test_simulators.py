@@ -1,0 +1,159 @@
+"""Virtual views by geometry: a ground point through the camera and through the view is the same source pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeromatch_cli.data import Camera, FloatArray, Pose, View
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.footprints import ground_footprint, ground_sampling_distance_m
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.geometry.warps import area_scale, source_from_view
+from aeromatch_cli.strategies.simulators import SIMULATORS
+from aeromatch_cli.strategies.simulators.ground import GroundView
+
+PINHOLE = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
+LENS = Camera("OPENCV", 1000, 800, (820.0, 815.0, 503.2, 391.1, -0.08, 0.03, 1e-3, -5e-4))
+GROUND_Z = 12.0
+
+
+def pose(omega_deg: float, phi_deg: float, kappa_deg: float, height_m: float = 112.0) -> Pose:
+    return Pose(np.array([300.0, 200.0, height_m]), from_omega_phi_kappa(omega_deg, phi_deg, kappa_deg), 1.0, 1.0)
+
+
+def world_from_view(camera: Camera, seen_from: Pose, view: View, points_px: FloatArray) -> FloatArray:
+    """World points (N, 3) on the ground of view pixels, from the view's own north-west corner and scale."""
+    from aeromatch_cli.geometry.frames import apply_homography
+    from aeromatch_cli.geometry.warps import undistorted_from_ground
+
+    inverse = np.linalg.inv(undistorted_from_ground(camera, seen_from, GROUND_Z)) @ view.undistorted_from_view
+    xy = apply_homography(inverse / inverse[2, 2], points_px)
+    return np.column_stack([xy, np.full(len(xy), GROUND_Z)])
+
+
+@pytest.mark.parametrize("name", sorted(SIMULATORS))
+@pytest.mark.parametrize("known", [(None, GROUND_Z, 0.1), (pose(0, 0, 0), None, 0.1), (pose(0, 0, 0), GROUND_Z, None)])
+def test_without_geometry_every_simulator_gives_the_source(
+    name: str, known: tuple[Pose | None, float | None, float | None]
+) -> None:
+    (view,) = SIMULATORS[name]()(LENS, *known)
+    assert view.is_source
+    assert (view.name, view.width_px, view.height_px, view.angle_deg) == ("source", 1000, 800, 0.0)
+    np.testing.assert_array_equal(view.undistorted_from_view, np.eye(3))
+
+
+@pytest.mark.parametrize("name", sorted(SIMULATORS))
+def test_simulators_are_frozen_recipes(name: str) -> None:
+    recipe = SIMULATORS[name]()
+    assert recipe.name == name
+    assert hash(recipe) == hash(SIMULATORS[name]())
+    with pytest.raises(ValueError, match="Extra inputs"):
+        SIMULATORS[name](unknown=1)  # type: ignore[call-arg]
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS])
+@pytest.mark.parametrize("seen_from", [pose(0, 0, 0), pose(25.0, -10.0, 140.0), pose(70.0, 5.0, -30.0)])
+def test_view_and_camera_agree_on_ground_points(camera: Camera, seen_from: Pose) -> None:
+    (view,) = GroundView()(camera, seen_from, GROUND_Z, 0.2)
+    assert not view.is_source
+    xs, ys = np.meshgrid(np.linspace(0, view.width_px - 1, 23), np.linspace(0, view.height_px - 1, 19))
+    points = np.stack([xs.ravel(), ys.ravel()], axis=1)
+    world = world_from_view(camera, seen_from, view, points)
+    assert seen_from.world_rotation is not None
+    expected = project(camera, seen_from.world_rotation, seen_from.center_m, world)
+    found = source_from_view(camera, view.undistorted_from_view, points)
+    seen = np.isfinite(expected).all(axis=1)
+    assert seen.sum() > 100
+    np.testing.assert_allclose(found[seen], expected[seen], atol=1e-6)
+    assert np.isnan(found[~seen]).any(axis=1).all()
+
+
+def test_nadir_view_by_hand() -> None:
+    # 100 m above ground, 0.1 m per px; the view at 0.2 m per px covers 100 m x 80 m in 500 x 400 px.
+    (view,) = GroundView()(PINHOLE, pose(0, 0, 90.0), GROUND_Z, 0.2)
+    # kappa = 90: the image's x axis points north, so that the view is higher than wide.
+    assert (view.width_px, view.height_px) == (400, 500)
+    assert view.angle_deg == pytest.approx(0.0, abs=1e-6)
+    world = world_from_view(PINHOLE, pose(0, 0, 90.0), view, np.array([[0.0, 0.0], [399.0, 0.0], [0.0, 499.0]]))
+    expected = [[260.1, 249.9, GROUND_Z], [339.9, 249.9, GROUND_Z], [260.1, 150.1, GROUND_Z]]
+    np.testing.assert_allclose(world, expected, atol=1e-9)
+
+
+@given(
+    omega_deg=st.floats(-100.0, 100.0),
+    kappa_deg=st.floats(-180.0, 180.0),
+    gsd_m=st.floats(0.02, 1.0),
+    factor=st.floats(1.0, 6.0),
+)
+@settings(max_examples=100, deadline=None)
+def test_view_is_bounded_and_within_the_cut(omega_deg: float, kappa_deg: float, gsd_m: float, factor: float) -> None:
+    seen_from = pose(omega_deg, 0.0, kappa_deg)
+    strategy = GroundView(max_distance_factor=factor, max_megapixels=1.5)
+    (view,) = strategy(PINHOLE, seen_from, GROUND_Z, gsd_m)
+    if view.is_source:
+        return
+    assert view.width_px * view.height_px <= 1.5e6
+    w, h = view.width_px - 0.5, view.height_px - 0.5
+    corners = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+    inverse = np.linalg.inv(_undistorted_from_world(seen_from)) @ view.undistorted_from_view
+    ground = np.column_stack([corners, np.ones(4)]) @ inverse.T
+    reach = np.abs(ground[:, :2] / ground[:, 2:] - seen_from.center_m[:2]).max()
+    assert reach <= factor * 100.0 * (1.0 + 1e-9)
+
+
+def _undistorted_from_world(seen_from: Pose) -> FloatArray:
+    from aeromatch_cli.geometry.warps import undistorted_from_ground
+
+    return undistorted_from_ground(PINHOLE, seen_from, GROUND_Z)
+
+
+def test_points_behind_the_camera_are_masked() -> None:
+    # Looking south 60 degrees from nadir; a view made by hand that reaches 300 m to the north of the camera.
+    seen_from = pose(-60.0, 0.0, 0.0)
+    (view,) = GroundView()(PINHOLE, seen_from, GROUND_Z, 0.5)
+    north_px = np.array([[view.width_px / 2.0, -y / 0.5] for y in (300.0, 400.0)])
+    assert np.isnan(source_from_view(PINHOLE, view.undistorted_from_view, north_px)).all()
+    inside = source_from_view(PINHOLE, view.undistorted_from_view, np.array([[view.width_px / 2.0, 5.0]]))
+    assert np.isfinite(inside).all()
+
+
+def test_view_is_never_finer_than_the_image() -> None:
+    seen_from = pose(0, 0, 0)
+    assert ground_sampling_distance_m(PINHOLE, seen_from, GROUND_Z) == pytest.approx(0.1)
+    (view,) = GroundView()(PINHOLE, seen_from, GROUND_Z, 0.01)
+    assert (view.width_px, view.height_px) == (1000, 800)
+    (finer,) = GroundView(max_magnification=1.25)(PINHOLE, seen_from, GROUND_Z, 0.01)
+    assert (finer.width_px, finer.height_px) == (1250, 1000)
+
+
+def test_far_ground_is_not_enlarged_beyond_the_stretch() -> None:
+    seen_from = pose(72.0, 0.0, 0.0)
+    wide, tight = GroundView(max_stretch=50.0), GroundView(max_stretch=2.0)
+    far = np.array([[0.0, 0.0]])
+    for strategy, within in ((wide, False), (tight, True)):
+        (view,) = strategy(PINHOLE, seen_from, GROUND_Z, 0.1)
+        far = np.array([[view.width_px / 2.0, 0.0]])  # the northern edge, straight ahead
+        enlargement = 1.0 / float(area_scale(view.undistorted_from_view, far)[0])
+        assert (enlargement <= 2.0 * (1.0 + 1e-6)) is within
+    cut = ground_footprint(PINHOLE, seen_from, GROUND_Z, 500.0)
+    (view,) = tight(PINHOLE, seen_from, GROUND_Z, 0.1)
+    own_gsd = ground_sampling_distance_m(PINHOLE, seen_from, GROUND_Z)
+    assert own_gsd is not None
+    assert view.height_px * own_gsd < 0.8 * np.ptp(cut[:, 1])
+
+
+def test_source_is_view_0_on_request() -> None:
+    source, ground = GroundView(source=True)(PINHOLE, pose(20.0, 0, 0), GROUND_Z, 0.2)
+    assert source.is_source
+    assert not ground.is_source
+    assert ground.angle_deg == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("blind", [pose(180.0, 0, 0), pose(0, 0, 0, height_m=5.0), pose(0, 0, 0, height_m=13.0)])
+def test_images_without_ground_keep_the_source(blind: Pose) -> None:
+    # Looking up; below the ground; so low that nothing of the view is left at this scale.
+    (view,) = GroundView()(PINHOLE, blind, GROUND_Z, 0.5)
+    assert view.is_source

@@ -1,0 +1,162 @@
+"""Each implausible block raises exactly its own warning; a clean block none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aeromatch_cli.blocks.ground import ConstantGround
+from aeromatch_cli.blocks.summary import summarise
+from aeromatch_cli.data import Block, Camera, FloatArray, Image, Pair, Pose
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_yaw_pitch_roll
+
+CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
+ORIGIN = (333000.0, 3100000.0, 0.0)  # EPSG:32617
+
+
+def block(
+    centers_m: FloatArray | None = None,
+    rotations: list[FloatArray | None] | None = None,
+    *,
+    ground_z_m: float = 120.0,
+    crs: str = "EPSG:32617",
+) -> Block:
+    """Six images, 100 m above ground, 20 m apart, tilted and turned a little each."""
+    if centers_m is None:
+        centers_m = np.array([[20.0 * i, 5.0 * i, 220.0 + i] for i in range(6)])
+    if rotations is None:
+        rotations = [from_omega_phi_kappa(2.0 + i, -1.0 * i, 80.0 + i) for i in range(6)]
+    images = tuple(Image(f"img{i}", f"flight/img{i}.jpg", 1000, 800, "cam") for i in range(6))
+    poses = {f"img{i}": Pose(c, r, 1.0, 1.0) for i, (c, r) in enumerate(zip(centers_m, rotations, strict=True))}
+    return Block(images, {"cam": CAMERA}, poses, crs, ORIGIN, ConstantGround(ground_z_m), "given: 120 m", None)
+
+
+def centers(**changes: FloatArray | float) -> FloatArray:
+    found = block()
+    values = np.array([found.poses[image.image_id].center_m for image in found.images])
+    for axis, value in changes.items():
+        values[:, "xyz".index(axis)] = value
+    return values
+
+
+def test_clean_block_has_figures_and_no_warning() -> None:
+    pairs = [
+        Pair("img0", "img1", 0.8, 10.0, "overlap"),
+        Pair("img1", "img2", 0.6, 10.0, "overlap"),
+        Pair("img3", "img4", float("nan"), float("nan"), "position"),
+        Pair("img4", "img5", 0.5, 10.0, "overlap"),
+    ]
+    summary = summarise(block(), pairs)
+    assert summary.warnings == ()
+    assert (summary.images, summary.positioned, summary.oriented, summary.cameras) == (6, 6, 6, 1)
+    assert summary.flying_height_m == pytest.approx((100.0, 102.5, 105.0))
+    assert summary.extent_m == pytest.approx((100.0, 25.0))
+    assert summary.max_tilt_deg > summary.mean_tilt_deg > 2.0
+    assert summary.gsd_m == pytest.approx(0.103, rel=0.02)
+    # Best neighbours: 0.8, 0.8, 0.6, unknown, 0.5, 0.5.
+    assert summary.best_overlap == pytest.approx((0.8 + 0.8 + 0.6 + 0.5 + 0.5) / 5)
+    assert summary.pairs_by_reason == (("overlap", 3), ("position", 1))
+    text = "\n".join(summary.lines())
+    for part in ("6, 6 with position", "EPSG:32617", "given: 120 m", "102.5 m (100.0 to 105.0)", "100.0 m east-west"):
+        assert part in text
+
+
+RELATIVE = centers(z=np.linspace(98.0, 102.0, 6))
+ONE_BELOW = centers()
+ONE_BELOW[2, 2] = 100.0
+NULL_ISLAND = centers()
+# Latitude 0, longitude 0 as UTM zone 31 would have it is outside of zone 17: the raw coordinates are zero here.
+NULL_ISLAND[4, :2] = -np.array(ORIGIN[:2])
+FAR = centers()
+FAR[5, 0] += 1.2e6
+LOW = centers(z=122.0)
+HIGH = centers(z=12120.0 + np.arange(6))
+TILTED = [from_omega_phi_kappa(2.0, 1.0, 10.0 * i) for i in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        (block(ONE_BELOW), ["1 image (flight/img2.jpg)", "below the ground (120 m)", "--ground"]),
+        (block(RELATIVE), ["relative to the take-off point", "98 to 102 m", "6 images", "--ground"]),
+        (block(centers(z=6.0), ground_z_m=-58.0), ["ground lies at -58 m", "relative"]),
+        (block(NULL_ISLAND), ["1 image (flight/img4.jpg)", "latitude 0, longitude 0"]),
+        (block(FAR), ["spread over 1,2", "1 image (flight/img5.jpg)", "--crs"]),
+        (block(centers(x=0.0, y=0.0)), ["all 6 positions are identical"]),
+        (block(LOW), ["6 images", "2.0 to 2.0 m above ground"]),
+        (block(HIGH), ["6 images", "12,000.0 to 12,005.0 m above ground"]),
+        (block(rotations=[from_omega_phi_kappa(0.0, 0.0, 0.0)] * 6), ["all angles of 6 images", "zero"]),
+        (block(rotations=[from_yaw_pitch_roll(-0.8, 0, 0, forward=True)] * 6), ["all angles of 6 images", "zero"]),
+        (block(rotations=[from_yaw_pitch_roll(1.5, 0, 0, forward=False)] * 6), ["all angles of 6 images", "zero"]),
+        (
+            block(rotations=[*TILTED[:2], *[from_omega_phi_kappa(75.0, 0, i) for i in range(4)]]),
+            ["4 images (flight/img2.jpg, flight/img3.jpg, flight/img4.jpg, ...)", "horizon in view"],
+        ),
+    ],
+    ids=[
+        "one below ground",
+        "relative altitude",
+        "low ground",
+        "null island",
+        "far away",
+        "identical",
+        "low",
+        "high",
+        "zero omega phi kappa",
+        "zero gimbal angles",
+        "zero body angles",
+        "horizon",
+    ],
+)
+def test_each_oddity_gives_exactly_its_warning(case: Block, words: list[str]) -> None:
+    warnings = summarise(case).warnings
+    assert len(warnings) == 1, warnings
+    for word in words:
+        assert word in warnings[0]
+
+
+def test_null_island_as_geographic_position() -> None:
+    # In UTM zone 31 (central meridian 3 E) latitude 0, longitude 0 is easting 166021, northing 0.
+    found = block(NULL_ISLAND)
+    moved = {
+        i: replace(p, center_m=p.center_m + np.array([166021.0, 0, 0])) if i == "img4" else p
+        for i, p in found.poses.items()
+    }
+    found = replace(found, crs="EPSG:32631", poses=moved)
+    (warning,) = summarise(found).warnings
+    assert "latitude 0, longitude 0" in warning
+
+
+def test_local_frame_may_hold_zero_and_low_ground() -> None:
+    shifted = replace(block(centers(z=42.0), ground_z_m=-58.0, crs="local"), origin_m=(0.0, 0.0, 0.0))
+    assert summarise(shifted).warnings == ()
+
+
+def test_guessed_focal_length_and_unpaired_images() -> None:
+    (guessed,) = summarise(block(), guessed_cameras=("cam",)).warnings
+    assert "focal length of 6 images" in guessed
+    assert "--cameras" in guessed
+    pairs = [Pair(f"img{i}", f"img{i + 1}", 0.8, 5.0, "overlap") for i in range(4)]
+    summary = summarise(block(), pairs)
+    assert summary.unpaired == ("flight/img5.jpg",)
+    (unpaired,) = summary.warnings
+    assert "1 image (flight/img5.jpg)" in unpaired
+
+
+def test_block_without_any_pose_is_summed_up() -> None:
+    bare = replace(block(), poses={}, ground=None, ground_source="", crs="local")
+    summary = summarise(bare, [Pair("img0", "img1", float("nan"), float("nan"), "name")])
+    assert (summary.positioned, summary.oriented) == (0, 0)
+    assert np.isnan(summary.flying_height_m).all()
+    text = "\n".join(summary.lines())
+    assert "without position 6: paired by name and time" in text
+    assert "nan" not in text
+
+
+def test_missing_attitude_is_stated() -> None:
+    rotations: list[FloatArray | None] = [*TILTED[:4], None, None]
+    summary = summarise(block(rotations=rotations))
+    assert summary.warnings == ()
+    assert "without attitude 2: paired by position" in "\n".join(summary.lines())
