@@ -6,16 +6,17 @@ defaults, a preset or file holding differences, and overrides, in this order; th
 
 from __future__ import annotations
 
-import difflib
+import copy
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args
+from typing import Annotated, Any, Literal, Union
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
+from aeromatch_cli.config_faults import accidents, describe, nearest
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers import ENHANCERS
@@ -38,9 +39,11 @@ def _named(value: Any) -> Any:
 
 
 def _chain(value: Any) -> Any:
-    """`a+b` and a single mapping are chains too."""
+    """`a+b` and a single mapping are chains too; null and `none` are the empty one."""
+    if value is None or value == "none":
+        return []
     if isinstance(value, str):
-        value = value.split("+")
+        value = [name.strip() for name in value.split("+")]
     elif isinstance(value, Mapping):
         value = [value]
     return [_named(item) for item in value] if isinstance(value, Sequence) else value
@@ -55,7 +58,7 @@ def _choice(table: Mapping[str, type[Strategy]]) -> Any:
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class BlockSettings(_Section):
@@ -74,6 +77,11 @@ class BlockSettings(_Section):
     sigma_angle_deg: float = Field(3.0, gt=0, description="Standard deviation of each angle, degrees.")
     max_size_px: int = Field(0, ge=0, description="Larger images are reduced to this longer side; 0 = never.")
 
+    @field_validator("crs", "ground", mode="before")
+    @classmethod
+    def _number_as_text(cls, value: Any) -> Any:
+        return str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
 
 class RunSettings(_Section):
     """How it is run; nothing here changes a result."""
@@ -88,24 +96,42 @@ class RunSettings(_Section):
 class Settings(_Section):
     """The whole tree."""
 
-    workspace: str = Field("aeromatch-work", description="Folder for every result; made if missing.")
+    workspace: str = Field("aeromatch-work", min_length=1, description="Folder for every result; made if missing.")
     seed: int = Field(0, ge=0, description="Seed of everything random.")
-    block: BlockSettings = BlockSettings()
-    run: RunSettings = RunSettings()
-    pairs: _choice(PAIRINGS) = PAIRINGS["overlap"]()  # type: ignore[valid-type]
-    enhance: _choice(ENHANCERS) = ENHANCERS["none"]()  # type: ignore[valid-type]
-    simulate: _choice(SIMULATORS) = SIMULATORS["ground"]()  # type: ignore[valid-type]
-    extract: _choice(EXTRACTORS) = EXTRACTORS["sift"]()  # type: ignore[valid-type]
-    match: _choice(MATCHERS) = MATCHERS["nearest"]()  # type: ignore[valid-type]
-    filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(_chain)] = (  # type: ignore[valid-type]
-        FILTERS["poselib"](),
+    block: BlockSettings = Field(BlockSettings(), description="What was flown.")
+    run: RunSettings = Field(RunSettings(), description="How it is run; nothing here changes a result.")
+    pairs: _choice(PAIRINGS) = Field(  # type: ignore[valid-type]
+        PAIRINGS["overlap"](), description="Which images are compared."
     )
-    export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(_chain)] = (  # type: ignore[valid-type]
-        EXPORTERS["colmap"](),
+    enhance: _choice(ENHANCERS) = Field(  # type: ignore[valid-type]
+        ENHANCERS["none"](), description="What is done to a picture before anything else."
+    )
+    simulate: _choice(SIMULATORS) = Field(  # type: ignore[valid-type]
+        SIMULATORS["ground"](), description="From where a picture is looked at: virtual views."
+    )
+    extract: _choice(EXTRACTORS) = Field(  # type: ignore[valid-type]
+        EXTRACTORS["sift"](), description="Features of each image, over all its views."
+    )
+    match: _choice(MATCHERS) = Field(  # type: ignore[valid-type]
+        MATCHERS["nearest"](), description="Which features of two images belong together."
+    )
+    filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(_chain)] = Field(  # type: ignore[valid-type]
+        (FILTERS["poselib"](),), description="Which matches are kept: a chain, each sees what those before it left."
+    )
+    export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(_chain)] = Field(  # type: ignore[valid-type]
+        (EXPORTERS["colmap"](),), description="For which programs the result is written: a list."
     )
 
+    @field_validator("export")
+    @classmethod
+    def _one_folder_each(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
+        names = [getattr(exporter, "name", "") for exporter in value]
+        if len(set(names)) < len(names):
+            raise ValueError(f"each exporter at most once, its folder has its name: {', '.join(names)}")
+        return value
 
-FAMILIES: dict[str, Mapping[str, type[Strategy]]] = {
+
+FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
     "pairs": PAIRINGS,
     "enhance": ENHANCERS,
     "simulate": SIMULATORS,
@@ -130,30 +156,40 @@ def _preset_folder() -> Path:
 def load(source: str, overrides: Sequence[str] = (), block: Mapping[str, Any] | None = None, **top: Any) -> Settings:
     """Settings of a preset name or YAML file, with `--set` overrides and command-line block options on top.
 
-    overrides: "key.sub=value" texts. block, top: values from the command line; None means not given.
+    overrides: "key.sub=value" texts. block, top: values from the command line; None means not given. Paths in a file
+    are relative to that file, all others to the current folder.
     Raises ConfigError naming the key's place and the nearest valid one.
     """
     tree, origin = _read_tree(source)
     for text in overrides:
         _apply_override(tree, text)
-    given = {key: value for key, value in (block or {}).items() if value is not None}
-    _merge(tree, {"block": _absolute_paths(given, Path.cwd())} if given else {})
-    _merge(tree, {key: value for key, value in top.items() if value is not None})
-    return validate(tree, origin)
+    given = {key: value for key, value in top.items() if value is not None}
+    block_given = {key: value for key, value in (block or {}).items() if value is not None}
+    if block_given:
+        given["block"] = block_given
+    _merge(tree, _absolute_paths(given, tree, Path.cwd()))
+    return validate(tree, f"{origin} with the options given" if overrides or given else origin)
 
 
 def validate(tree: Mapping[str, Any], origin: str = "configuration") -> Settings:
     """Settings of a plain tree. Raises ConfigError listing every fault."""
     try:
-        return Settings.model_validate(tree)
+        settings = Settings.model_validate(tree)
+        faults = list(accidents(tree, settings.model_dump(mode="json")))
     except ValidationError as error:
-        faults = "\n".join(f"  {_describe(dict(fault))}" for fault in error.errors())
-        raise ConfigError(f"{origin} is not valid:\n{faults}") from None
+        faults = [describe(fault, Settings, FAMILIES) for fault in error.errors()]
+    if faults:
+        raise ConfigError(f"{origin} is not valid:\n" + "\n".join(f"  {fault}" for fault in faults))
+    return settings
 
 
 def dump(settings: Settings) -> str:
-    """The complete tree as YAML, every default present."""
-    return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, width=100)
+    """The complete tree as YAML, every default present, for the workspace itself.
+
+    Its `workspace` is therefore `.`: the file runs again where it lies, even after the folder was moved.
+    """
+    tree = settings.model_dump(mode="json") | {"workspace": "."}
+    return yaml.safe_dump(tree, sort_keys=False, width=100, allow_unicode=True)
 
 
 def parse_method(text: str) -> tuple[str, list[str]]:
@@ -165,46 +201,99 @@ def parse_method(text: str) -> tuple[str, list[str]]:
 
 
 def _read_tree(source: str) -> tuple[dict[str, Any], str]:
+    """Defaults with the differences of a preset or file merged in, and the source in words."""
     tree: dict[str, Any] = Settings().model_dump(mode="json")
     path = Path(source)
-    if path.suffix in (".yaml", ".yml") or path.is_file():
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"cannot read configuration {source}: {error}") from None
-        origin, folder = str(path), path.resolve().parent
-    elif source in preset_names():
-        text = (_preset_folder() / f"{source}.yaml").read_text(encoding="utf-8")
-        origin, folder = f"preset {source}", Path.cwd()
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    if not is_yaml and source in preset_names():
+        text, origin, folder = _read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
+    elif is_yaml or path.is_file():
+        text, origin, folder = _read_text(path), str(path), path.absolute().parent
     else:
-        hint = _nearest(source, preset_names())
+        hint = nearest(source, preset_names(), otherwise="")
         raise ConfigError(
             f"{source!r} is neither a YAML file nor a preset; presets are {', '.join(preset_names())}{hint}"
         )
     try:
-        differences = yaml.safe_load(text) or {}
-    except yaml.YAMLError as error:
+        differences = yaml.load(text, _UniqueKeyLoader) or {}
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{origin} is not YAML: {error}") from None
     if not isinstance(differences, dict):
         raise ConfigError(f"{origin} must hold keys and values at the top, not a {type(differences).__name__}")
-    if isinstance(differences.get("block"), dict):
-        differences["block"] = _absolute_paths(differences["block"], folder)
-    if isinstance(differences.get("workspace"), str):
-        differences["workspace"] = str((folder / differences["workspace"]).absolute())
-    _merge(tree, differences)
+    _merge(tree, _absolute_paths(differences, tree, folder) if folder else differences)
     return tree, origin
 
 
-def _absolute_paths(block: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Paths in a file are relative to that file, on the command line to the current folder."""
-    result = dict(block)
-    for key in PATH_KEYS:
-        value = result.get(key)
-        if isinstance(value, str) and value and value not in _WORDS.get(key, ()) and not _is_number(value):
-            result[key] = os.path.normpath(folder / Path(value).expanduser())
-        elif key == "ground" and isinstance(value, int | float) and not isinstance(value, bool):
-            result[key] = str(value)
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"cannot read configuration {path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"cannot read configuration {path}: {error}; save it as UTF-8") from None
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """Refuses a key that is written twice; YAML would silently take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            if isinstance(key_node, yaml.ScalarNode):
+                if key_node.value in seen:
+                    raise yaml.MarkedYAMLError(
+                        problem=f"the key {key_node.value!r} is written twice", problem_mark=key_node.start_mark
+                    )
+                seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def _absolute_paths(differences: Mapping[str, Any], tree: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """`differences` with every path below `folder` unless it is absolute. tree: names the strategies they refer to."""
+    result = dict(differences)
+    if isinstance(result.get("workspace"), str) and result["workspace"]:
+        result["workspace"] = _below(folder, result["workspace"])
+    block = result.get("block")
+    if isinstance(block, Mapping):
+        result["block"] = {key: _absolute_block_path(key, value, folder) for key, value in block.items()}
+    for key, table in FAMILIES.items():
+        current, value = tree.get(key), result.get(key)
+        default = current.get("name") if isinstance(current, Mapping) else None
+        if isinstance(value, Mapping):
+            result[key] = _absolute_strategy_paths(value, table.get(str(value.get("name", default))), folder)
+        elif isinstance(value, list):
+            result[key] = [
+                _absolute_strategy_paths(item, table.get(str(item.get("name"))), folder)
+                if isinstance(item, Mapping)
+                else item
+                for item in value
+            ]
     return result
+
+
+def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
+    if key not in PATH_KEYS or not isinstance(value, str) or not value or value in _WORDS.get(key, ()):
+        return value
+    return value if key == "ground" and _is_number(value) else _below(folder, value)
+
+
+def _absolute_strategy_paths(
+    values: Mapping[str, Any], strategy: type[Strategy] | None, folder: Path
+) -> dict[str, Any]:
+    """A field marked `path` holds a path; one marked "path or name" does where it is written as one or exists."""
+    result = dict(values)
+    for key, field in strategy.model_fields.items() if strategy else ():
+        extra, value = field.json_schema_extra, result.get(key)
+        kind = extra.get("path") if isinstance(extra, dict) else None
+        if not kind or not isinstance(value, str) or not value:
+            continue
+        if kind is True or os.sep in value or Path(_below(folder, value)).is_file():
+            result[key] = _below(folder, value)
+    return result
+
+
+def _below(folder: Path, path: str) -> str:
+    return os.path.normpath(folder / os.path.expanduser(path))  # noqa: PTH111 - Path's raises on an unknown user
 
 
 def _is_number(text: str) -> bool:
@@ -223,92 +312,61 @@ def _merge(tree: dict[str, Any], differences: Mapping[str, Any]) -> None:
             value = _chain(value) if isinstance(current, list) else _named(value)
         if isinstance(current, dict) and isinstance(value, Mapping):
             if "name" in current and value.get("name", current["name"]) != current["name"]:
-                tree[key] = dict(value)
+                tree[key] = copy.deepcopy(dict(value))
             else:
                 _merge(current, value)
-        else:
-            tree[key] = value
+        elif not (isinstance(current, dict) and value is None):  # an empty section changes nothing
+            tree[key] = copy.deepcopy(value)
 
 
 def _apply_override(tree: dict[str, Any], text: str) -> None:
+    """One `--set`: the text becomes a small tree that is merged like a file's."""
     key, separator, value_text = text.partition("=")
-    if not separator or not key.strip():
-        raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set extract.keypoints=8000")
-    try:
-        value = yaml.safe_load(value_text)
-    except yaml.YAMLError:
-        value = value_text
     parts = key.strip().split(".")
+    if not separator or not all(parts):
+        raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set extract.keypoints=8000")
+    value = _override_value(parts, value_text)
+    if isinstance(tree.get(parts[0]), list) and len(parts) > 1:
+        member, table = _member(tree[parts[0]], parts), FAMILIES[parts[0]]
+        inner = _nested(parts[2:], value)
+        _merge(member, _absolute_strategy_paths(inner, table.get(str(member["name"])), Path.cwd()))
+    else:
+        _merge(tree, _absolute_paths(_nested(parts, value), tree, Path.cwd()))
+
+
+def _override_value(parts: Sequence[str], text: str) -> Any:
+    """The text as YAML; for a setting that is text, as it stands: a folder may be named 2024-06-31, 007 or no."""
+    field: Any = Settings.model_fields.get(parts[0])
     if parts[0] == "block" and len(parts) == 2:
-        _merge(tree, {"block": _absolute_paths({parts[1]: value}, Path.cwd())})
-        return
-    node: Any = tree
-    for depth, part in enumerate(parts[:-1]):
-        node = _child(node, part, ".".join(parts[: depth + 1]))
-    if isinstance(node, list):
-        raise ConfigError(f"--set {key}: name a setting of the chain's member, for example {key}.KEY=VALUE")
-    _merge(node, {parts[-1]: value})
+        field = BlockSettings.model_fields.get(parts[1])
+    if field is not None and field.annotation is str:
+        return text
+    try:
+        return yaml.load(text, _UniqueKeyLoader)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return text
 
 
-def _child(node: Any, part: str, place: str) -> Any:
-    if isinstance(node, list):
-        for item in node:
-            if isinstance(item, dict) and item.get("name") == part:
-                return item
-        present = ", ".join(str(item.get("name")) for item in node if isinstance(item, dict))
-        raise ConfigError(f"--set {place}: the chain holds {present}; no member is named {part!r}")
-    if not isinstance(node, dict) or not isinstance(node.get(part), dict | list):
-        known = [k for k, v in node.items() if isinstance(v, dict | list)] if isinstance(node, dict) else []
-        raise ConfigError(f"--set {place}: no such section{_nearest(part, known)}")
-    return node[part]
+def _nested(parts: Sequence[str], value: Any) -> dict[str, Any]:
+    for part in reversed(parts):
+        value = {part: value}
+    return dict(value)
 
 
-def _nearest(word: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else (f"; valid here: {', '.join(known)}" if known else "")
-
-
-def _describe(fault: Mapping[str, Any]) -> str:
-    """One line for one pydantic fault: place, what is wrong, what would be right."""
-    location = tuple(fault["loc"])
-    names = [str(part) for part in _visible(location)]
-    place = ".".join(names)
-    if fault["type"] == "extra_forbidden":
-        siblings = _siblings(location[:-1])
-        return f"{place}: unknown key{_nearest(names[-1], siblings)}"
-    if fault["type"] == "union_tag_invalid":
-        family = FAMILIES[str(location[0])]
-        name = str(fault["ctx"]["tag"])
-        return f"{place}: no strategy is named {name!r}{_nearest(name, list(family))}"
-    if fault["type"] == "literal_error" and location[-1] == "name" and location[0] in FAMILIES:
-        name = str(fault["input"])
-        return f"{place}: no strategy is named {name!r}{_nearest(name, list(FAMILIES[str(location[0])]))}"
-    return f"{place}: {fault['msg']} (got {fault['input']!r})"
-
-
-def _visible(location: tuple[Any, ...]) -> Iterator[Any]:
-    """The location without the union tags that pydantic puts in."""
-    family = FAMILIES.get(str(location[0])) if location else None
-    chained = len(location) > 1 and isinstance(location[1], int)
-    for index, part in enumerate(location):
-        # In a chain the tag names the member and stays; elsewhere it repeats what the section says.
-        is_tag = family is not None and len(family) > 1 and not chained and index == 1 and part in family
-        if not is_tag and not isinstance(part, int):
-            yield part
-
-
-def _siblings(location: tuple[Any, ...]) -> list[str]:
-    model: Any = Settings
-    for part in location:
-        if isinstance(part, int):
-            continue
-        if isinstance(model, type) and issubclass(model, BaseModel) and part in model.model_fields:
-            model = model.model_fields[part].annotation
-        else:
-            family = FAMILIES.get(str(location[0]), {})
-            model = family.get(str(part), model)
-    candidates = [model, *get_args(model)]
-    for candidate in candidates:
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return list(candidate.model_fields)
-    return []
+def _member(chain: Iterable[Any], parts: Sequence[str]) -> dict[str, Any]:
+    """The one member of a chain that `filter.poselib.threshold_px` names."""
+    place, name = ".".join(parts), parts[1]
+    present = [item for item in chain if isinstance(item, dict)]
+    names = [str(item.get("name")) for item in present]
+    found = [item for item in present if item.get("name") == name]
+    if len(found) > 1:
+        raise ConfigError(f"--set {place}: the chain holds {name} more than once; give the whole chain in a YAML file")
+    if not found and name in FAMILIES[parts[0]]:
+        raise ConfigError(
+            f"--set {place}: the chain holds {'+'.join(names) or 'nothing'}; first --set {parts[0]}="
+            f"{'+'.join([name, *names])}"
+        )
+    if not found or len(parts) < 3:
+        example = f"{parts[0]}.{found[0]['name'] if found else (names or list(FAMILIES[parts[0]]))[0]}"
+        raise ConfigError(f"--set {place}: name the chain's member and its setting: {example}.KEY=VALUE")
+    return found[0]

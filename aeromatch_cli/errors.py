@@ -26,3 +26,14 @@ class ItemError(AeromatchError):
 
 class WorkspaceError(AeromatchError):
     """The workspace cannot be read or written (permissions, full disk, written by another version)."""
+
+
+class BrokenFileError(WorkspaceError):
+    """A file of the workspace is missing or damaged, and can be made again once it is deleted."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(path, reason)  # the arguments travel back from worker processes
+        self.path, self.reason = path, reason
+
+    def __str__(self) -> str:
+        return f"cannot read {self.path}: {self.reason}; delete it to have it made again"

@@ -15,10 +15,11 @@ import socket
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 from aeromatch_cli.strategies import Strategy
 
 FORMAT_VERSION = 1
@@ -99,20 +100,32 @@ class Workspace:
         """Make the folder and prove that it can be written; refuse one of another format version."""
         with translated_os_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
-        if self.block.exists():
-            found = read_json(self.block).get("format_version")
-            if found != FORMAT_VERSION:
-                raise WorkspaceError(
-                    f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
-                    "use the version that wrote it, or choose another --workspace"
-                )
-        write_atomically(self.root / ".writable", lambda stream: stream.write(b"") and None)
-        (self.root / ".writable").unlink(missing_ok=True)
+        self.check_version()
+        probe = _temporary_name(self.root / "writable")
+        with translated_os_errors(self.root):
+            probe.touch()
+            probe.unlink()
         remove_stale_temporaries(self.root)
+
+    def check_version(self) -> None:
+        """Raises WorkspaceError where another format version wrote this workspace."""
+        if not self.block.exists():
+            return
+        found = read_json(self.block).get("format_version")
+        if found != FORMAT_VERSION:
+            raise WorkspaceError(
+                f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
+                "use the version that wrote it, or choose another --workspace"
+            )
+
+
+def _host() -> str:
+    """This machine in a file name; no dots, which separate the parts of a temporary name."""
+    return socket.gethostname().replace(".", "-")
 
 
 def _temporary_name(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
+    return path.with_name(f".{path.name}.{_host()}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
 
 
 @contextlib.contextmanager
@@ -124,6 +137,10 @@ def translated_os_errors(path: Path) -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise WorkspaceError(
                 f"disk full while writing {path}; free space and run the same command again, it resumes"
+            ) from error
+        if error.errno in (errno.EEXIST, errno.ENOTDIR):
+            raise WorkspaceError(
+                f"cannot write {path}: a file stands where a folder is needed; choose another --workspace"
             ) from error
         if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
             raise WorkspaceError(f"cannot write {path} ({error.strerror}); choose another --workspace") from error
@@ -150,8 +167,9 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Atomic, UTF-8; a file that already holds the text is left untouched."""
     data = text.encode("utf-8")
-    if path.is_file() and path.read_bytes() == data:
-        return
+    with translated_os_errors(path):
+        if path.is_file() and path.read_bytes() == data:
+            return
     write_atomically(path, lambda stream: stream.write(data))
 
 
@@ -160,22 +178,36 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises WorkspaceError on anything else."""
-    try:
+    """The object in a JSON file. Raises BrokenFileError on anything else."""
+    with readable(path, ValueError):
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
-    if not isinstance(value, dict):
-        raise WorkspaceError(f"{path} holds no JSON object; delete it to have it made again")
+        if not isinstance(value, dict):
+            raise ValueError("it holds no JSON object")
     return value
+
+
+@contextlib.contextmanager
+def readable(path: Path, *faults: type[Exception]) -> Iterator[None]:
+    """Turn what reading a file of the workspace raises into BrokenFileError, or into WorkspaceError where the file
+    itself may be sound (permissions, a failing disk). faults: what broken contents raise.
+    """
+    try:
+        yield
+    except faults as error:
+        raise BrokenFileError(str(path), str(error) or type(error).__name__) from None
+    except FileNotFoundError as error:
+        raise BrokenFileError(str(path), error.strerror) from None
+    except OSError as error:
+        raise WorkspaceError(f"cannot read {path}: {error.strerror or error}; check its permissions and disk") from None
 
 
 def remove_stale_temporaries(root: Path) -> None:
     """Delete what a killed process of this machine left behind; files of live processes stay."""
-    host = socket.gethostname()
     for path in root.rglob(".*.tmp"):
         parts = path.name.rsplit(".", 4)
-        if len(parts) == 5 and parts[1] == host and parts[2].isdigit() and not _alive(int(parts[2])):
+        # In a container a restarted run has the process id of the killed one: no file of its own exists yet.
+        ours = len(parts) == 5 and parts[1] == _host() and parts[2].isdigit()
+        if ours and (int(parts[2]) == os.getpid() or not _alive(int(parts[2]))):
             with contextlib.suppress(OSError):
                 path.unlink()
 
@@ -208,7 +240,14 @@ def _plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 (hex) of a whole file, for weights."""
+    """SHA-256 (hex) of a whole file, for weights; read again only when the file has changed."""
+    status = path.stat()
+    return _file_digest(path, status.st_size, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _file_digest(path: Path, size: int, stamp: int) -> str:
+    del size, stamp  # only tell changed files apart
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

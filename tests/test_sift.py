@@ -149,7 +149,10 @@ def test_tiles_share_out_every_pixel_once_and_are_bounded():
         for tile in layout:
             assert (tile.x1 - tile.x0) * (tile.y1 - tile.y0) <= 4_000_000
             mine = points[tile.owns(points)]
-            for low, high, values, end in ((tile.x0, tile.x1, mine[:, 0], width), (tile.y0, tile.y1, mine[:, 1], height)):
+            for low, high, values, end in (
+                (tile.x0, tile.x1, mine[:, 0], width),
+                (tile.y0, tile.y1, mine[:, 1], height),
+            ):
                 assert low == 0 or values.min() - low >= 120
                 assert high == end or high - values.max() >= 120
 
@@ -201,7 +204,9 @@ def shrunk_view(gray, factor=2):
 
 def test_views_are_merged_in_source_pixels():
     rng = np.random.default_rng(5)
-    centres = [(40.0 + 80 * i + rng.uniform(-1, 1), 40.0 + 80 * j + rng.uniform(-1, 1)) for i in range(4) for j in range(4)]
+    centres = [
+        (40.0 + 80 * i + rng.uniform(-1, 1), 40.0 + 80 * j + rng.uniform(-1, 1)) for i in range(4) for j in range(4)
+    ]
     gray = blobs(centres, 6.0, size=320)
     features = Sift()(camera_of(gray), (source(gray), shrunk_view(gray)))
     assert set(features.view_idx.tolist()) == {0, 1}

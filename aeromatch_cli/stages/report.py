@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib import resources
 from pathlib import PurePosixPath
 from typing import Any
@@ -14,12 +14,13 @@ import numpy as np
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import FloatArray, Matches
 from aeromatch_cli.errors import ItemError, WorkspaceError
 from aeromatch_cli.formats import read_keypoints, read_match_row, read_verified_row
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.images import read_pixels
 from aeromatch_cli.stages import report_figures as figures
+from aeromatch_cli.stages import report_map
 from aeromatch_cli.stages.common import Context, StageReport
 from aeromatch_cli.stages.filter import WEAK_MATCHES, match_points, summarise
 from aeromatch_cli.stages.report_rows import NOT_JUDGED, ImageRow, PairRow, StageRow, failure_rows, gather, stage_rows
@@ -83,7 +84,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     stages = stage_rows(context.workspace)
     return template.render(
         version=__version__,
-        made=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         headline=_headline(images, pairs, facts, failures),
         notices=notices(images, pairs, facts, contradictions, remarks["warnings"]),
@@ -164,7 +165,7 @@ def notices(
         ("none", "images have no position", "They were paired by name or time and are not on the map."),
         ("position", "images have no usable attitude", "They were paired by position and have no footprint."),
     ):
-        items = tuple(row.image_id for row in images if row.pose == pose)
+        items = tuple(row.image_id for row in images if row.pose == pose and row.image_id not in contradictions)
         if items:
             found.append(Notice("warn", f"{len(items):,} {title}", text, items))
     lost = sum(row.state == NOT_JUDGED for row in pairs)
@@ -216,7 +217,7 @@ def _histogram(values: Sequence[int], label: str, unit: str) -> str:
 
 def _map(
     context: Context, images: Sequence[ImageRow], pairs: Sequence[PairRow], contradictions: Mapping[str, float]
-) -> figures.MapFigure | None:
+) -> report_map.MapFigure | None:
     """None where no image has a position."""
     labels = _labels([row.name for row in images])
     stations = []
@@ -225,18 +226,20 @@ def _map(
         if pose is None or not np.isfinite(pose.center_m).all():
             continue
         x, y, z = (float(value) for value in pose.center_m)
-        title = f"{row.name}: {row.verified_matches:,} verified matches in {row.verified_pairs} of {row.pairs} pairs, z {z:.1f} m"
+        ties = f"{row.verified_matches:,} verified matches in {row.verified_pairs} of {row.pairs} pairs"
+        title = f"{row.name}: {ties}, z {z:.1f} m"
         weak = row.verified_matches < WEAK_MATCHES
-        stations.append(figures.Station(row.image_id, label, title, x, y, weak, row.image_id in contradictions))
+        stations.append(report_map.Station(row.image_id, label, title, x, y, weak, row.image_id in contradictions))
     if not stations:
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
-    return figures.block_map(stations, footprints, [_link(row) for row in pairs])
+    return report_map.block_map(stations, footprints, [_link(row) for row in pairs])
 
 
-def _link(row: PairRow) -> figures.Link:
+def _link(row: PairRow) -> report_map.Link:
     words = f"{row.verified:,} verified matches" if row.state == "verified" else f"{row.state}: {row.reason}"
-    return figures.Link(row.image_id0, row.image_id1, row.state, row.verified, f"{row.image_id0} – {row.image_id1}: {words}")
+    title = f"{row.image_id0} – {row.image_id1}: {words}"
+    return report_map.Link(row.image_id0, row.image_id1, row.state, row.verified, title)
 
 
 def _labels(names: Sequence[str]) -> list[str]:
@@ -252,7 +255,7 @@ def _labels(names: Sequence[str]) -> list[str]:
 
 
 def _worst_pairs(pairs: Sequence[PairRow]) -> list[PairRow]:
-    """At most MAX_TABLE_ROWS: refused pairs that promised most overlap first, then verified ones from few matches up."""
+    """At most MAX_TABLE_ROWS: refused pairs from large overlap down, then verified ones from few matches up."""
     refused = [row for row in pairs if row.state != "verified"]
     verified = sorted((row for row in pairs if row.state == "verified"), key=lambda row: row.verified)
     refused.sort(key=lambda row: (_STATE_RANK[row.state], -np.nan_to_num(row.overlap)))
@@ -289,15 +292,18 @@ def _previews(context: Context, pairs: Sequence[PairRow]) -> list[Preview]:
 def _preview(context: Context, row: PairRow) -> str:
     """Verified matches with their errors, or, of a refused pair, the matches that it came with."""
     workspace, ids = context.workspace, (row.image_id0, row.image_id1)
+    matches: Matches | None = None
     errors: FloatArray | None = None
     if row.state == "verified":
-        entry = read_verified_row(workspace.verified(ids[0]))[ids[1]]
-        matches, errors = entry.matches, entry.verdict.errors_px
+        path = workspace.verified(ids[0])
+        if (entry := read_verified_row(path).get(ids[1])) is not None:
+            matches, errors = entry.matches, entry.verdict.errors_px
     else:
-        raw = read_match_row(workspace.matches(ids[0])).get(ids[1])
-        if raw is None:
-            raise WorkspaceError(f"{workspace.matches(ids[0])} does not hold the pair; `aeromatch match` makes it again")
-        matches = raw.matches
+        path = workspace.matches(ids[0])
+        if (raw := read_match_row(path).get(ids[1])) is not None:
+            matches = raw.matches
+    if matches is None:
+        raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
     points = match_points(matches, *(read_keypoints(workspace.features(i))[0] for i in ids))
     sides = []
     for image_id, points_px in zip(ids, points, strict=True):

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -186,7 +187,7 @@ def _href(context: Context, image: Image) -> str:
 
 def stage_rows(workspace: Workspace) -> list[StageRow]:
     """Last run of every stage in the order of the chain; the shards of one stage are summed."""
-    groups: dict[tuple[str, bool], list[dict[str, object]]] = {}
+    groups: dict[tuple[str, bool], list[dict[str, Any]]] = {}
     for path in sorted(workspace.reports.glob("*.json")):
         sharded = re.fullmatch(r".+\.\d+-of-\d+", path.stem) is not None
         report = read_json(path)
@@ -202,20 +203,18 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         if name == "report":
             continue
         reports = groups[name, sharded]
-        seconds, *counts = (
-            sum(float(r[key]) for r in reports)  # type: ignore[arg-type]
-            for key in ("seconds", "items", "done", "skipped", "failed")
+        seconds = sum(float(report["seconds"]) for report in reports)
+        items, done, skipped, failed = (
+            sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
         )
         label = f"{name} ({len(reports)} shards)" if sharded else name
         facts = "" if sharded else _facts_words(reports[0]["facts"])
-        rows.append(StageRow(label, seconds, *(int(count) for count in counts), facts))
+        rows.append(StageRow(label, seconds, items, done, skipped, failed, facts))
     return rows
 
 
-def _facts_words(facts: object) -> str:
+def _facts_words(facts: Mapping[str, Any]) -> str:
     """The plain numbers and words among a stage's facts; what is nested has its own place on the page."""
-    if not isinstance(facts, dict):
-        return ""
     plain = {key: value for key, value in facts.items() if isinstance(value, int | float | str)}
     return ", ".join(f"{key.replace('_', ' ')} {_number(value)}" for key, value in plain.items())
 

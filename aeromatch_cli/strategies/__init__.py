@@ -32,7 +32,7 @@ class Strategy(BaseModel):
     only that enters the fingerprint, so that a change re-does exactly the stages that depend on it.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
 

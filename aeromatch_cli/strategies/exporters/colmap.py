@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
@@ -34,14 +35,11 @@ class Colmap(Strategy):
     """Writes database.db (cameras, rigs, frames, images, keypoints, matches, two-view geometries, pose priors),
     sparse/{cameras,images,points3D}.txt and world.json. Where an image name contains a space, which COLMAP cannot read
     from text, sparse holds the binary model as well.
-
-    raw_matches: also write the matches before filtering, so that COLMAP can verify them itself.
-    pose_priors: write the given positions with their covariance, for COLMAP's pose_prior_mapper.
     """
 
     name: Literal["colmap"] = "colmap"
-    raw_matches: bool = True
-    pose_priors: bool = True
+    raw_matches: bool = Field(True, description="Also the matches before filtering, for COLMAP to verify itself.")
+    pose_priors: bool = Field(True, description="The given positions with covariance, for its pose_prior_mapper.")
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ValueError on a match without keypoint."""

@@ -26,21 +26,23 @@ if TYPE_CHECKING:
 
 
 class LightGlue(Strategy):
-    """LightGlue with own weights (Lindenberger et al., ICCV 2023).
-
-    weights: path of a weights file, or its name in the weights folder (`aeromatch weights list`).
-    threshold: smallest score of a match. depth_confidence, width_confidence: early stopping and point pruning, -1 off.
-    max_keypoints: strongest descriptors kept per view; memory grows with its square (1.2 GB at 4096).
-    device: "auto" takes CUDA where there is one.
-    """
+    """LightGlue with own weights (Lindenberger et al., ICCV 2023)."""
 
     name: Literal["lightglue"] = "lightglue"
-    weights: str | None = None
-    threshold: float = Field(0.1, ge=0.0, le=1.0)
-    depth_confidence: float = Field(0.95, ge=-1.0, le=1.0)
-    width_confidence: float = Field(0.99, ge=-1.0, le=1.0)
-    max_keypoints: int = Field(4096, ge=1)
-    device: Literal["cpu", "auto"] = "cpu"
+    weights: str | None = Field(
+        None,
+        description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`).",
+        json_schema_extra={"path": "or name"},
+    )
+    threshold: float = Field(0.1, ge=0.0, le=1.0, description="Smallest score of a match.")
+    depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
+    width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
+    max_keypoints: int = Field(
+        4096,
+        ge=1,
+        description="Strongest descriptors kept per view; memory grows with its square (1.2 GB at 4096).",
+    )
+    device: Literal["cpu", "auto"] = Field("cpu", description="`auto` takes CUDA where there is one.")
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Paths of the files whose SHA-256 belongs to the fingerprint. Raises ConfigError without weights."""

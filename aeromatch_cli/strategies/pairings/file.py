@@ -22,7 +22,9 @@ class PairFile(Strategy):
     """
 
     name: Literal["file"] = "file"
-    path: str = Field(default="", description="Text file with two image names on each line.")
+    path: str = Field(
+        default="", description="Text file with two image names on each line.", json_schema_extra={"path": True}
+    )
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """The list itself: another content is another recipe."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import Block, BoolArray, FloatArray, IntArray, Pair
@@ -13,6 +12,10 @@ from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR, block_footpri
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.pairings.measure import footprint_polygons, measure_overlaps, measured_pairs, ordered
 from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
+from aeromatch_cli.strategies.pairings.screening import promising_pairs
+
+# Pairs intersected exactly for each that the cap can keep.
+_CANDIDATES_PER_NEIGHBOUR = 4
 
 
 class Overlap(Strategy):
@@ -46,7 +49,15 @@ class Overlap(Strategy):
             polygons = footprint_polygons(footprints)
             centers = np.array([block.poses[image_id].center_m for image_id in ids])
             heights = np.array([footprint.ground_z_m for footprint in footprints.values()])
-            candidates = _touching(polygons, self.min_overlap)
+            candidates = promising_pairs(
+                block,
+                footprints,
+                polygons,
+                min_overlap=self.min_overlap,
+                max_view_angle_deg=self.max_view_angle_deg,
+                max_distance_factor=self.max_distance_factor,
+                per_image=_CANDIDATES_PER_NEIGHBOUR * self.max_neighbours,
+            )
             shares, angles = measure_overlaps(polygons, centers, heights, candidates)
             good = (shares >= self.min_overlap) & (shares > 0.0) & (angles <= self.max_view_angle_deg)
             candidates, shares, angles = candidates[good], shares[good], angles[good]
@@ -60,20 +71,6 @@ class Overlap(Strategy):
         return sorted(
             [*chosen, *measured_pairs(block, fallback, footprints)], key=lambda pair: (pair.image_id0, pair.image_id1)
         )
-
-
-def _touching(polygons: NDArray[Any], min_overlap: float) -> IntArray:
-    """Pairs (P, 2), first < second, whose bounding boxes share enough area for the overlap to be possible."""
-    import shapely
-
-    pairs = shapely.STRtree(polygons).query(polygons)
-    pairs = pairs[:, pairs[0] < pairs[1]]
-    boxes, areas = shapely.bounds(polygons), shapely.area(polygons)
-    box0, box1 = boxes[pairs[0]], boxes[pairs[1]]
-    common = np.minimum(box0[:, 2:], box1[:, 2:]) - np.maximum(box0[:, :2], box1[:, :2])
-    possible = common.prod(axis=1) >= min_overlap * np.minimum(areas[pairs[0]], areas[pairs[1]])
-    pairs = pairs[:, possible]
-    return np.asarray(pairs[:, np.lexsort((pairs[1], pairs[0]))].T)
 
 
 def _within_cap(pairs: IntArray, shares: FloatArray, angles: FloatArray, count: int, cap: int) -> BoolArray:

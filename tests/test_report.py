@@ -1,0 +1,469 @@
+"""The report page: its numbers against the workspace it was made from, escaping, previews, maps, empty blocks."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+from PIL import ImageOps
+
+from aeromatch_cli.blocks.ground import ConstantGround
+from aeromatch_cli.config import Settings
+from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.formats import MatchEntry, VerifiedEntry, write_features, write_match_row, write_verified_row
+from aeromatch_cli.stages import report, report_figures, report_map
+from aeromatch_cli.stages.common import Context, StageReport
+from aeromatch_cli.stages.report_rows import ImageRow, PairRow, gather, stage_rows
+from aeromatch_cli.workspace import Workspace, write_atomically
+
+NASTY = '<img src=x onerror=alert(1)> & "ü b".png'
+WIDTH, HEIGHT = 160, 128
+VOID = {"meta", "input", "link", "br", "hr", "img"}
+LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+class Structure(HTMLParser):
+    """Checks that every tag is closed in order; keeps visible text, attributes and tags."""
+
+    def __init__(self) -> None:
+        super().__init__(convert_charrefs=True)
+        self.stack: list[str] = []
+        self.faults: list[str] = []
+        self.text: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.attributes += [(tag, key, value or "") for key, value in attrs]
+        if tag not in VOID:
+            self.stack.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.attributes += [(tag, key, value or "") for key, value in attrs]
+
+    def handle_endtag(self, tag):
+        if not self.stack or self.stack.pop() != tag:
+            self.faults.append(f"</{tag}> at {self.getpos()}")
+
+    def handle_data(self, data):
+        if self.stack and self.stack[-1] not in ("script", "style"):
+            self.text.append(data)
+
+    @classmethod
+    def of(cls, page: str) -> Structure:
+        parser = cls()
+        parser.feed(page)
+        parser.close()
+        assert not parser.faults
+        assert not parser.stack
+        return parser
+
+    def words(self) -> str:
+        return " ".join(" ".join(self.text).split())
+
+
+def features() -> Features:
+    """100 keypoints, each in the middle of its own cell of 16 x 16, row by row."""
+    index = np.arange(100)
+    points = np.stack([(index % 16 + 0.5) * WIDTH / 16 - 0.5, (index // 16 + 0.5) * HEIGHT / 16 - 0.5], axis=1)
+    count = len(points)
+    return Features(
+        keypoints_px=points.astype(np.float32),
+        sizes_px=np.ones(count, np.float32),
+        responses=np.ones(count, np.float32),
+        descriptors=np.zeros((count, 128), np.uint8),
+        descriptor_keypoint_idx=index.astype(np.int32),
+        view_idx=np.zeros(count, np.int32),
+        view_keypoints_px=points.astype(np.float32),
+        view_size_px=np.ones(count, np.float32),
+        view_orientation_deg=np.zeros(count, np.float32),
+        view_sizes_px=np.array([[WIDTH, HEIGHT]], np.int32),
+        view_angles_deg=np.zeros(1, np.float32),
+    )
+
+
+def matches(count: int) -> Matches:
+    indices = np.repeat(np.arange(count, dtype=np.int32)[:, None], 2, axis=1)
+    return Matches(indices, np.ones(count, np.float32), np.zeros((count, 2), np.int16))
+
+
+def entry(
+    image_id1: str, kept: int, matches_in: int, state: str, reason: str = "", error: float = 0.0
+) -> VerifiedEntry:
+    verdict = Verdict(
+        keep=np.ones(kept, bool),
+        state=state,  # type: ignore[arg-type]
+        reason=reason,
+        model_kind="E" if state == "verified" else "",
+        errors_px=np.full(kept, error, np.float32),
+        rejected={"poselib": matches_in - kept},
+    )
+    return VerifiedEntry(image_id1, "print", matches_in, matches(kept), verdict)
+
+
+def block(poses: dict[str, Pose]) -> Block:
+    names = {"a": "a.png", "b": "b.jpg", "c": NASTY, "d": "sub/d.png"}
+    images = tuple(
+        Image(image_id, name, WIDTH, HEIGHT, "cam", 6 if image_id == "b" else 1) for image_id, name in names.items()
+    )
+    camera = Camera("PINHOLE", WIDTH, HEIGHT, (200.0, 200.0, 79.5, 63.5))
+    origin, ground = (500000.0, 5000000.0, 0.0), ConstantGround(0.0)
+    return Block(images, {"cam": camera}, poses, "EPSG:32633", origin, ground, "given: 0 m", 0.5)
+
+
+def full_poses() -> dict[str, Pose]:
+    return {i: Pose(np.array([40.0 * k, 10.0 * k, 100.0]), LOOKING_DOWN, 1.0, 1.0) for k, i in enumerate("abcd")}
+
+
+def context(root: Path, poses: dict[str, Pose], pairs: tuple[Pair, ...]) -> Context:
+    (root / "images" / "sub").mkdir(parents=True)
+    settings = Settings.model_validate({"block": {"images": str(root / "images")}})
+    workspace = Workspace(root / "work")
+    workspace.create()
+    return Context(settings, workspace, Executor("serial"), block(poses), pairs, {}, poses)
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> Context:
+    """a-b 60 of 80 and b-c 20 of 25 verified, a-c rejected, c-d not verifiable, a-d without matches on file."""
+    pairs = (
+        Pair("a", "b", 0.61, 7.3, "overlap"),
+        Pair("a", "c", 0.32, 14.5, "overlap"),
+        Pair("a", "d", float("nan"), float("nan"), "name"),
+        Pair("b", "c", 0.55, 8.1, "overlap"),
+        Pair("c", "d", 0.57, 8.9, "overlap"),
+    )
+    result = context(tmp_path, full_poses(), pairs)
+    rng = np.random.default_rng(3)
+    for image in result.block.images:
+        write_atomically(result.workspace.features(image.image_id), lambda s: write_features(s, features(), "print"))
+        pixels = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        if image.image_id != "d":
+            PilImage.fromarray(pixels).save(result.image_path(image))
+    rows = {
+        "a": [entry("b", 60, 80, "verified", error=0.72), entry("c", 0, 12, "rejected", "8 inliers of 12 matches")],
+        "b": [entry("c", 20, 25, "verified", error=1.25)],
+        "c": [entry("d", 0, 4, "not verifiable", "4 matches, 15 needed")],
+    }
+    for image_id, entries in rows.items():
+        write_atomically(result.workspace.verified(image_id), lambda s, e=entries: write_verified_row(s, e))
+        raw = [MatchEntry(e.image_id1, "print", "nearest", matches(e.matches_in)) for e in entries]
+        write_atomically(result.workspace.matches(image_id), lambda s, r=raw: write_match_row(s, r))
+    first = StageReport("pairs", items=5, done=5)
+    first.facts = {"summary": ["flying height    100 m"], "warnings": ["altitudes look relative"], "images": 4}
+    first.write(result.workspace)
+    StageReport("extract", items=5, done=4, failures=[("broken.png", "cut <off> & empty")]).write(result.workspace)
+    judged = StageReport("filter", items=5, done=4)
+    judged.facts = {"rotation_contradicts_pose": {"c": 178.4}, "verified_matches": 80}
+    judged.write(result.workspace)
+    return result
+
+
+def page_of(result: Context) -> str:
+    report.run(result)
+    return result.workspace.report.read_text(encoding="utf-8")
+
+
+def row_with(page: str, table: str, *cells: str) -> list[str]:
+    """Texts of the cells of the one row of a table that begins with `cells`."""
+    body = page.split(f'id="{table}"')[1].split("</table>")[0]
+    found = []
+    for row in re.findall(r"<tr>(.*?)</tr>", body, re.S):
+        texts = [re.sub(r"<[^>]+>", "", cell).strip() for cell in re.findall(r"<td[^>]*>(.*?)</td>", row, re.S)]
+        if texts[: len(cells)] == list(cells):
+            found.append(texts)
+    assert len(found) == 1
+    return found[0]
+
+
+def test_rows_hold_the_numbers_of_the_workspace(full):
+    pairs, images = gather(full)
+    assert [(p.image_id0, p.image_id1, p.state, p.matches_in, p.verified) for p in pairs] == [
+        ("a", "b", "verified", 80, 60),
+        ("a", "c", "rejected", 12, 0),
+        ("a", "d", "not judged", 0, 0),
+        ("b", "c", "verified", 25, 20),
+        ("c", "d", "not verifiable", 4, 0),
+    ]
+    assert pairs[0].median_error_px == pytest.approx(0.72)
+    assert pairs[0].share == pytest.approx(0.75)
+    assert pairs[0].rejects == {"poselib": 20}
+    # b's verified points are the first 60 keypoints (with a) and the first 20 of the same (with c): 60 cells of 256.
+    assert [(i.pairs, i.verified_pairs, i.verified_matches, i.coverage) for i in images] == [
+        (3, 1, 60, 60 / 256),
+        (2, 2, 80, 60 / 256),
+        (3, 1, 20, 20 / 256),
+        (2, 0, 0, 0.0),
+    ]
+    assert [i.keypoints for i in images] == [100] * 4
+
+
+def test_page_shows_headline_tables_and_reasons(full):
+    page = page_of(full)
+    words = Structure.of(page).words()
+    for text in (
+        "4 images",
+        "4 with position, 4 with attitude",
+        "5 pairs compared",
+        "2 verified pairs",
+        "80 verified matches",
+        "2 unconnected groups",
+        "2 weakly tied images (< 50 matches)",
+        "1 failures",
+        "c: 178.4°",
+        "altitudes look relative",
+        "flying height 100 m",
+        "cut <off> & empty",
+        "1 pairs were not judged",
+        "EPSG:32633",
+        "given: 0 m",
+    ):
+        assert text in words, text
+    ab = row_with(page, "pair-table", "a", "b")
+    assert ab == ["a", "b", "overlap", "61", "7.3", "80", "60", "75", "0.72", "verified", "E", "", "poselib 20"]
+    ac = row_with(page, "pair-table", "a", "c")
+    assert ac[5:7] == ["12", "0"]
+    assert ac[9:12] == ["rejected", "", "8 inliers of 12 matches"]
+    assert row_with(page, "image-table", "d")[2:] == ["full", "100", "2", "0", "0", "0", "weakly tied."]
+    assert row_with(page, "stage-table", "extract")[3:7] == ["5", "4", "0", "1"]
+    assert "name: poselib" in words  # the settings
+
+
+def test_page_escapes_names_and_needs_no_network(full):
+    page = page_of(full)
+    structure = Structure.of(page)
+    assert NASTY in structure.words()
+    assert "<img" not in page
+    assert "onerror=alert(1)>" not in page
+    assert not re.search(r"https?://", page.replace("http://www.w3.org/2000/svg", ""))
+    for _, key, value in structure.attributes:
+        assert not key.startswith("on")
+        if key in ("src", "href"):
+            assert value.startswith(("data:image/jpeg;base64,", "#", "../../images/"))
+
+
+def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):
+    page = page_of(full)
+    headings = re.findall(r"<h3>(.*?)</h3>", page)
+    assert headings == ["Best verified pair: a – b", "Worst verified pair: b – c", "Rejected pair: a – c"]
+    assert page.count('class="preview"') == 3
+    full.image_path(full.block.images[0]).unlink()
+    page = page_of(full)
+    Structure.of(page)
+    assert page.count('class="preview"') == 1
+    assert page.count("no preview: cannot read image") == 2
+
+
+def test_preview_of_many_pairs_takes_the_median():
+    rows = [pair_row(i, "verified", matches=10 * i) for i in range(1, 10)]
+    chosen = report.chosen_previews(rows)
+    assert [(heading, row.verified) for heading, row in chosen] == [
+        ("Best verified pair", 90),
+        ("Median verified pair", 50),
+        ("Worst verified pair", 10),
+    ]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_turned_agrees_with_pillow_and_points_follow(orientation):
+    rng = np.random.default_rng(orientation)
+    pixels = rng.integers(0, 255, (7, 5), dtype=np.uint8)
+    picture = PilImage.fromarray(pixels)
+    picture.getexif()[274] = orientation
+    expected = np.asarray(ImageOps.exif_transpose(picture))
+    turned = report_figures.turned(pixels, orientation)
+    np.testing.assert_array_equal(turned, expected)
+    y, x = np.mgrid[0:7, 0:5]
+    points = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    moved = report_figures.turned_points(points, 5, 7, orientation).astype(int)
+    np.testing.assert_array_equal(turned[moved[:, 1], moved[:, 0]], pixels.ravel())
+
+
+@pytest.mark.parametrize("orientation", [1, 6, 8])
+def test_preview_draws_a_known_match_on_the_turned_picture(orientation):
+    """A red spot at stored (900, 240) of a 1200 x 800 raster: the line must end on it, wherever it is displayed."""
+    sides = []
+    for turn in (1, orientation):
+        pixels = np.full((800, 1200, 3), 90, np.uint8)
+        pixels[234:247, 894:907] = (255, 0, 0)
+        sides.append(report_figures.Side(pixels, turn, np.array([[900.0, 240.0]])))
+    svg = report_figures.preview(*sides, np.array([0.7]), "pair")
+    line = re.search(r'<path class="tie e1" d="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)"/>', svg)
+    assert line is not None
+    ends = np.array(line.groups(), float).reshape(2, 2)
+    pattern = r'<image href="data:image/jpeg;base64,([^"]+)" x="(\d+)" y="0" width="(\d+)" height="(\d+)"'
+    pictures = re.findall(pattern, svg)
+    for (data, left, width, height), end in zip(pictures, ends, strict=True):
+        shown = np.asarray(PilImage.open(io.BytesIO(base64.b64decode(data)))).astype(float)
+        assert shown.shape[:2] == (int(height), int(width))
+        ys, xs = np.nonzero(shown[..., 0] - shown[..., 1] > 80)
+        np.testing.assert_allclose(end, [xs.mean() + 0.5 + int(left), ys.mean() + 0.5], atol=0.4)
+    assert (int(pictures[1][2]) > int(pictures[1][3])) == (orientation == 1)
+
+
+def test_deep_pictures_are_stretched_for_display():
+    deep = np.linspace(1000, 4000, 600, dtype=np.uint16).reshape(20, 30)
+    for pixels in (deep, np.stack([deep] * 3, axis=-1)):
+        shown = report_figures.to_colour8(pixels)
+        assert shown.shape == pixels.shape
+        assert shown.dtype == np.uint8
+        assert shown.min() == 0
+        assert shown.max() == 255
+
+
+def test_map_is_true_to_scale_north_up_and_coloured_by_matches():
+    stations = [
+        report_map.Station("a", "a", "a", 0.0, 0.0),
+        report_map.Station("b", "b", "b", 100.0, 0.0, weak=True),
+        report_map.Station("c", "<c>", "c", 0.0, 50.0, suspect=True),
+    ]
+    links = [
+        report_map.Link("a", "b", "verified", 20, "weak tie"),
+        report_map.Link("a", "c", "verified", 4000, "strong tie"),
+        report_map.Link("b", "c", "rejected", 0, "<no>"),
+        report_map.Link("b", "unposed", "verified", 900, ""),
+    ]
+    square = np.array([[-60.0, -60.0], [60.0, -60.0], [60.0, 60.0], [-60.0, 60.0]])
+    figure = report_map.block_map(stations, [square], links)
+    circles = {
+        css: np.array([float(x), float(y)])
+        for css, x, y in re.findall(r'<circle class="(\w+)" cx="([\d.]+)" cy="([\d.]+)"', figure.svg)
+    }
+    east, north = circles["weak"] - circles["fine"], circles["suspect"] - circles["fine"]
+    assert east[0] > 0
+    assert abs(east[1]) < 0.11
+    assert abs(north[0]) < 0.11
+    assert -north[1] == pytest.approx(east[0] / 2, abs=0.2)
+    weak, strong = (re.search(rf'<g class="{css}"><path d="M([\d.]+) ([\d.]+)L', figure.svg) for css in ("k0", "k5"))
+    for line in (weak, strong):
+        assert line is not None
+        np.testing.assert_allclose([float(v) for v in line.groups()], circles["fine"], atol=0.11)
+    assert "&lt;no&gt;" in figure.svg
+    assert "&lt;c&gt;" in figure.svg
+    assert figure.legend[0][1].startswith("20")
+    assert ("refused", "rejected") in figure.legend
+    assert figure.remarks == ("1 pairs have an image without position and are not drawn.",)
+    Structure.of(figure.svg)
+
+
+def test_a_view_of_the_horizon_does_not_shrink_the_block():
+    stations = [report_map.Station(str(k), str(k), "", 20.0 * k, 0.0) for k in range(6)]
+    wide = np.array([[0.0, -1e5], [1e5, -1e5], [1e5, 1e5], [0.0, 1e5]])
+    near = np.array([[-20.0, -20.0], [120.0, -20.0], [120.0, 20.0], [-20.0, 20.0]])
+    svg = report_map.block_map(stations, [near, near, wide], []).svg
+    xs = [float(x) for x in re.findall(r'cx="([\d.]+)"', svg)]
+    assert max(xs) - min(xs) > 300
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"),
+    [([], ()), ([0], ()), ([40, 40], (40,)), ([15, 2000], (15, 50, 100, 200, 500, 1000)), ([30, 31], (30,))],
+)
+def test_match_classes_are_round_and_cover_the_range(counts, expected):
+    limits = report_map.match_classes(counts)
+    assert limits == expected
+    for count in counts:
+        assert 0 <= report_map.class_of(count, limits) < report_map.MAP_CLASSES
+
+
+def test_histogram_bars_count_every_value():
+    svg = report_figures.histogram([15, 15, 37, 420], "matches", "pairs")
+    titles = re.findall(r"<title>(.*?)</title>", svg)
+    assert sum(int(title.split(": ")[1].split()[0]) for title in titles) == 4
+    assert titles[0] == "0 to 19: 2 pairs"
+
+
+def test_evenly_chosen_keeps_ends_and_limit():
+    chosen = report_figures.evenly_chosen(1000, 150)
+    assert len(chosen) == 150
+    assert chosen[0] == 0
+    assert chosen[-1] == 999
+    assert set(np.diff(chosen)) <= {6, 7}
+    assert list(report_figures.evenly_chosen(3, 150)) == [0, 1, 2]
+
+
+def test_page_without_poses_features_or_verified_pairs(tmp_path):
+    empty = context(tmp_path, {}, (Pair("a", "b", float("nan"), float("nan"), "name"),))
+    words = Structure.of(page_of(empty)).words()
+    for text in (
+        "There is no map: no image has a position.",
+        "No pair is verified",
+        "There is nothing to show",
+        "No stage has left a report yet.",
+        "4 images have no position",
+    ):
+        assert text in words, text
+    assert row_with(page_of(empty), "image-table", "a")[3:] == ["", "1", "0", "0", "", "no features. weakly tied."]
+    filed = [row.label for row in stage_rows(empty.workspace)]
+    assert filed == []  # the report stage does not report about itself
+
+
+def test_page_of_positions_only_and_of_one_image(tmp_path):
+    poses = {i: replace(pose, world_rotation=None) for i, pose in full_poses().items()}
+    words = Structure.of(page_of(context(tmp_path / "positions", poses, ()))).words()
+    assert "4 images have no usable attitude" in words
+    assert "0 with attitude" in words
+    alone = context(tmp_path / "alone", {"a": full_poses()["a"]}, ())
+    alone = replace(alone, block=replace(alone.block, images=alone.block.images[:1]))
+    page = page_of(alone)
+    Structure.of(page)
+    assert page.count('<circle class="weak"') == 2  # the camera and the legend
+
+
+def test_shards_are_summed_per_stage(tmp_path):
+    one = context(tmp_path, {}, ())
+    for index in (1, 2):
+        path = one.workspace.stage_report("match", f"{index}-of-2")
+        write_atomically(
+            path,
+            lambda s: s.write(
+                b'{"stage": "match", "seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1, "facts": {},'
+                b' "failures": []}'
+            ),
+        )
+    (row,) = stage_rows(one.workspace)
+    assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 3.0, 20, 18, 2)
+
+
+def pair_row(index: int, state: str, matches: int, ids: tuple[str, str] = ("a", "b")) -> PairRow:
+    reason = "" if state == "verified" else "3 inliers of 40 matches, 15 needed"
+    verified = matches if state == "verified" else 0
+    known = (*ids, 0.5 + index * 1e-6, 12.0, "overlap", matches + 9, verified, 0.61)
+    return PairRow(*known, state, reason, "E", {"poselib": 9})
+
+
+def test_table_of_many_pairs_keeps_the_worst_of_both_kinds():
+    rows = [pair_row(i, "verified" if i % 2 else "rejected", matches=100 + i) for i in range(6000)]
+    shown = report._worst_pairs(rows)
+    assert len(shown) == report.MAX_TABLE_ROWS
+    assert [row.state for row in shown] == ["rejected"] * 1000 + ["verified"] * 1000
+    assert shown[0].overlap == max(row.overlap for row in rows if row.state == "rejected")
+    assert [row.verified for row in shown[1000:1003]] == [101, 103, 105]
+
+
+def test_large_block_stays_a_small_page(tmp_path):
+    ids = [f"flight_1_image_{k:05d}_jpg" for k in range(1000)]
+    base = context(tmp_path, {}, ())
+    images = tuple(Image(i, f"{i[:-4]}.jpg", WIDTH, HEIGHT, "cam") for i in ids)
+    centers = {i: np.array([20.0 * (k % 40), 20.0 * (k // 40), 100.0]) for k, i in enumerate(ids)}
+    poses = {i: Pose(center, LOOKING_DOWN, 1.0, 1.0) for i, center in centers.items()}
+    large = replace(base, block=replace(base.block, images=images, poses=poses), given_poses=poses)
+    pairs = [
+        pair_row(k, "verified" if step % 3 else "rejected", 20 + 37 * k % 900, (ids[k], ids[k + step]))
+        for k in range(1000)
+        for step in (1, 2, 3, 39, 40, 41, 80, 81, 120, 121)
+        if k + step < 1000
+    ]
+    rows = [ImageRow(i, f"{i[:-4]}.jpg", "", "full", 4000, 20, 14, 5000, 0.8) for i in ids]
+    page = report.render(large, pairs, rows)
+    Structure.of(page)
+    assert len(page.encode()) < 3_000_000
+    assert page.count("<tr>") < 3100
+    assert f"{len(pairs):,} rows" in page
