@@ -6,11 +6,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
+import math
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -18,9 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
-from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.errors import AeromatchError, ConfigError
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
@@ -28,7 +32,29 @@ if TYPE_CHECKING:
 EXIT_SOME_FAILED = 1
 EXIT_INTERRUPTED = 130
 
+
+class _Commands(TyperGroup):
+    """Gives wrong arguments a JSON line too, where --json asks for one: scripts read the last line whatever happens."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        stated = args[0] if args else options.get("args")
+        given = sys.argv[1:] if stated is None else list(stated)
+        try:
+            return super().main(*args, **options)
+        except SystemExit as stop:
+            # Commands leave by typer.Exit and have said it already; what else exits with 2 is the parser.
+            if (
+                stop.code == ConfigError.exit_code
+                and "--json" in given
+                and not isinstance(stop.__context__, typer.Exit)
+            ):
+                facts = {"error": "wrong arguments; stderr says which", "exit_code": stop.code}
+                typer.echo(json.dumps(facts))
+            raise
+
+
 app = typer.Typer(
+    cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -181,8 +207,6 @@ def top(
 
 
 def _parse_size(text: str) -> tuple[int, int]:
-    from aeromatch_cli.errors import ConfigError
-
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit()):
         raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT in pixels, for example 1000x750")
@@ -218,22 +242,34 @@ def _guard(call: Callable[[], Result], command: str, *, quiet: bool, as_json: bo
     except KeyboardInterrupt:
         typer.echo("interrupted; run the same command again to resume", err=True)
         facts |= {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
+    except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
+        typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
+        facts |= {"error": text, "exit_code": AeromatchError.exit_code}
     else:
         if not quiet:
             for line in result.lines:
                 typer.echo(line)
         facts |= result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
     if as_json:
-        typer.echo(json.dumps(facts, allow_nan=False))
+        typer.echo(json.dumps(_finite(facts), allow_nan=False))
     if facts["exit_code"]:
         raise typer.Exit(int(facts["exit_code"]))
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN: it becomes null."""
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextmanager
 def _logging(quiet: bool, log_file: Path | None) -> Iterator[None]:
     """Messages to stderr, and all of them, with time, to the log file."""
-    from aeromatch_cli.errors import ConfigError
-
     logger = logging.getLogger("aeromatch")
     logger.setLevel(logging.DEBUG)
     logger.propagate = False
@@ -251,8 +287,12 @@ def _logging(quiet: bool, log_file: Path | None) -> Iterator[None]:
         handlers.append(file)
     for handler in handlers:
         logger.addHandler(handler)
+    logging.raiseExceptions = False  # a log file on a full disk must not print tracebacks
     try:
         yield
+    except Exception:
+        logger.debug("stopped by", exc_info=True)
+        raise
     finally:
         for handler in handlers:
             logger.removeHandler(handler)
@@ -319,6 +359,9 @@ class TerminalProgress:
 
 def main() -> None:
     """Entry point of the `aeromatch` script."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name that the terminal's encoding lacks is no error
     app()
 
 

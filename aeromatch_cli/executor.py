@@ -89,6 +89,19 @@ def _thread_environment() -> Iterator[None]:
                 os.environ[name] = value
 
 
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """SIGINT waits until the block ends; processes started inside never see it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def guarded(function: Callable[[T], R], task: T) -> Outcome[R]:
     """Run one task; a user's error becomes its message, a defect its traceback's last line. Disk failures pass."""
     try:
@@ -129,6 +142,8 @@ class Executor:
             if cancel:
                 for worker in workers:
                     worker.terminate()
+                for worker in workers:
+                    worker.join(timeout=5.0)
             self._pool = None
         if self._client is not None:
             self._client.close()
@@ -201,8 +216,19 @@ class Executor:
                 self._pool = ProcessPoolExecutor(
                     self.jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_worker_start
                 )
-                # Spawning is lazy: make every worker now, while the environment says one thread.
-                wait([self._pool.submit(os.getpid) for _ in range(self.jobs)])
+                # Spawning is lazy: make every worker now, while the environment says one thread. They are born deaf
+                # to Ctrl-C: before their initializer has run they would print tracebacks.
+                with _interrupts_held():
+                    first = [self._pool.submit(os.getpid) for _ in range(self.jobs)]
+                try:
+                    for future in first:
+                        future.result()
+                except BrokenProcessPool:
+                    self._pool = None
+                    raise ConfigError(
+                        f"worker processes die at their start (too little memory for {self.jobs} jobs, or a script "
+                        "without `if __name__ == '__main__':`); use --executor serial"
+                    ) from None
         return self._pool
 
     def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:

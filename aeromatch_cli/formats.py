@@ -13,6 +13,8 @@ poses.csv       image_id, x, y, z (metres, world frame, projection centre), qw, 
                 the attitude is unknown), sigma_position_m, sigma_angle_deg
 pairs.csv       image_id0, image_id1 (id0 < id1), overlap (0-1), view_angle_deg, reason
 failures.csv    stage, item, reason
+distrusted.json images whose attitude contradicts the pictures: fingerprint of all that the judgement rests on, and of
+                the settings; images: image_id -> angle_deg, facts (fingerprint of the image and its pose)
 
 enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json facts of the strategy.
 simulated/<id>/views.json    fingerprint, scale (stored raster to the raster that the views were made from), views:
@@ -47,13 +49,14 @@ reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up
 from __future__ import annotations
 
 import csv
-import io
 import json
+import struct
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,59 +72,75 @@ from aeromatch_cli.data import (
     Pose,
     Verdict,
 )
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 from aeromatch_cli.geometry.rotations import from_quaternion, to_quaternion
 
+T = TypeVar("T")
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features))
+# What numpy and zipfile raise on contents that are no sound archive, or not the arrays that it should hold.
+_ARCHIVE_FAULTS = (
+    KeyError,
+    IndexError,
+    ValueError,
+    TypeError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    zipfile.BadZipFile,
+)
+
+
+@contextmanager
+def readable(path: Path, *faults: type[Exception]) -> Iterator[None]:
+    """Turn what reading a file of the workspace raises into BrokenFileError, or into WorkspaceError where the file
+    itself may be sound (permissions, a failing disk). faults: what broken contents raise.
+    """
+    try:
+        yield
+    except faults as error:
+        raise BrokenFileError(str(path), str(error) or type(error).__name__) from None
+    except FileNotFoundError as error:
+        raise BrokenFileError(str(path), error.strerror or "no such file") from None
+    except OSError as error:
+        raise WorkspaceError(f"cannot read {path}: {error.strerror or error}; check its permissions and disk") from None
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """CSV with every float at full precision; NaN and None become empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows([_cell(value) for value in row] for row in rows)
-    return stream.getvalue()
+    return "".join(",".join(map(_cell, row)) + "\n" for row in (header, *rows))
 
 
 def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return ""
-    return repr(float(value)) if isinstance(value, float) else str(value)
+    text = repr(float(value)) if isinstance(value, float) else str(value)
+    # csv.writer leaves a lone carriage return unquoted, and the reader would end the row there.
+    return '"' + text.replace('"', '""') + '"' if any(mark in text for mark in ',"\r\n') else text
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a workspace CSV. Raises WorkspaceError when it is missing or broken."""
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            return list(csv.DictReader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise WorkspaceError(f"cannot read {path}: {error}; run `aeromatch pairs` to have it made again") from None
+    """Rows of a workspace CSV. Raises BrokenFileError when it is missing or broken."""
+    with readable(path, ValueError, csv.Error), path.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream)
+        if reader.fieldnames is None:
+            raise ValueError("it is empty")
+        rows = list(reader)
+        if any(None in row or None in row.values() for row in rows):
+            raise ValueError("a row has not as many cells as the header")
+        return rows
 
 
 def images_text(images: Iterable[Image], fingerprints: Mapping[str, str]) -> str:
-    header = ("image_id", "name", "width_px", "height_px", "camera_id", "exif_orientation", "time", "fingerprint")
-    return csv_text(
-        header,
-        (
-            (
-                i.image_id,
-                i.name,
-                i.width_px,
-                i.height_px,
-                i.camera_id,
-                i.exif_orientation,
-                i.time,
-                fingerprints[i.image_id],
-            )
-            for i in images
-        ),
-    )
+    columns = ("image_id", "name", "width_px", "height_px", "camera_id", "exif_orientation", "time")
+    rows = ((*(getattr(image, name) for name in columns), fingerprints[image.image_id]) for image in images)
+    return csv_text((*columns, "fingerprint"), rows)
 
 
 def cameras_text(cameras: Mapping[str, Camera]) -> str:
     rows = (
-        (k, c.model, c.width_px, c.height_px, " ".join(repr(p) for p in c.params)) for k, c in sorted(cameras.items())
+        (k, c.model, c.width_px, c.height_px, " ".join(repr(float(p)) for p in c.params))
+        for k, c in sorted(cameras.items())
     )
     return csv_text(("camera_id", "model", "width_px", "height_px", "params"), rows)
 
@@ -140,53 +159,54 @@ def pairs_text(pairs: Iterable[Pair]) -> str:
     return csv_text(header, ((p.image_id0, p.image_id1, p.overlap, p.view_angle_deg, p.reason) for p in pairs))
 
 
+def _parsed(path: Path, parse: Callable[[Mapping[str, str]], T]) -> list[T]:
+    """Rows of a workspace CSV, parsed. Raises BrokenFileError also where a cell cannot be parsed."""
+    with readable(path, KeyError, ValueError, TypeError, AttributeError):
+        return [parse(row) for row in read_csv(path)]
+
+
 def read_images(path: Path) -> tuple[Image, ...]:
-    return tuple(
-        Image(
-            row["image_id"],
-            row["name"],
-            int(row["width_px"]),
-            int(row["height_px"]),
-            row["camera_id"],
-            int(row["exif_orientation"]),
-            row["time"],
-        )
-        for row in read_csv(path)
+    return tuple(_parsed(path, _image))
+
+
+def _image(row: Mapping[str, str]) -> Image:
+    return Image(
+        row["image_id"],
+        row["name"],
+        int(row["width_px"]),
+        int(row["height_px"]),
+        row["camera_id"],
+        int(row["exif_orientation"]),
+        row["time"],
     )
 
 
 def read_cameras(path: Path) -> dict[str, Camera]:
-    return {
-        row["camera_id"]: Camera(
-            row["model"],
-            int(row["width_px"]),
-            int(row["height_px"]),
-            tuple(float(value) for value in row["params"].split()),
-        )
-        for row in read_csv(path)
-    }
+    return dict(_parsed(path, _camera))
+
+
+def _camera(row: Mapping[str, str]) -> tuple[str, Camera]:
+    params = tuple(float(value) for value in row["params"].split())
+    return row["camera_id"], Camera(row["model"], int(row["width_px"]), int(row["height_px"]), params)
 
 
 def read_poses(path: Path) -> dict[str, Pose]:
-    poses = {}
-    for row in read_csv(path):
-        rotation = from_quaternion(*(float(row[k]) for k in ("qw", "qx", "qy", "qz"))) if row["qw"] else None
-        center = np.array([float(row[key]) for key in "xyz"])
-        poses[row["image_id"]] = Pose(center, rotation, float(row["sigma_position_m"]), float(row["sigma_angle_deg"]))
-    return poses
+    return dict(_parsed(path, _pose))
+
+
+def _pose(row: Mapping[str, str]) -> tuple[str, Pose]:
+    rotation = from_quaternion(*(float(row[k]) for k in ("qw", "qx", "qy", "qz"))) if row["qw"] else None
+    center = np.array([float(row[key]) for key in "xyz"])
+    return row["image_id"], Pose(center, rotation, float(row["sigma_position_m"]), float(row["sigma_angle_deg"]))
 
 
 def read_pairs(path: Path) -> list[Pair]:
-    return [
-        Pair(
-            row["image_id0"],
-            row["image_id1"],
-            float(row["overlap"] or "nan"),
-            float(row["view_angle_deg"] or "nan"),
-            row["reason"],
-        )
-        for row in read_csv(path)
-    ]
+    return _parsed(path, _pair)
+
+
+def _pair(row: Mapping[str, str]) -> Pair:
+    overlap, angle = float(row["overlap"] or "nan"), float(row["view_angle_deg"] or "nan")
+    return Pair(row["image_id0"], row["image_id1"], overlap, angle, row["reason"])
 
 
 # --- archives ---------------------------------------------------------------------------------------------------
@@ -198,7 +218,7 @@ def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> No
 
 
 def read_features(path: Path) -> Features:
-    """All arrays. Raises WorkspaceError when the file is missing or broken."""
+    """All arrays. Raises BrokenFileError when the file is missing or broken."""
     arrays = _load(path, _FEATURE_ARRAYS)
     return Features(**arrays)
 
@@ -218,11 +238,8 @@ def features_fingerprint(path: Path) -> str | None:
 
 
 def _load(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
+    with readable(path, *_ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,21 +266,23 @@ class VerifiedEntry:
 def write_match_row(stream: BinaryIO, entries: Sequence[MatchEntry]) -> None:
     np.savez(
         stream,
-        **_row_arrays(entries),
+        **_row_arrays(entries),  # type: ignore[arg-type]
         strategy=_strings([e.strategy for e in entries]),
         view_pairs=_joined([e.matches.view_pairs for e in entries], (0, 2), np.int16),
     )
 
 
 def read_match_row(path: Path) -> dict[str, MatchEntry]:
-    """Entries by image_id1; empty when the file is absent. Raises WorkspaceError when it is broken."""
+    """Entries by image_id1; empty when the file is absent. Raises BrokenFileError when it is broken."""
     if not path.exists():
         return {}
     row = _Row(path)
-    view_pairs, strategy = row["view_pairs"], row["strategy"]
-    return {
-        id1: MatchEntry(id1, fp, str(strategy[p]), row.matches(p, view_pairs)) for p, (id1, fp) in enumerate(row.keys())
-    }
+    with readable(path, *_ARCHIVE_FAULTS):
+        view_pairs, strategy = row["view_pairs"], row["strategy"]
+        return {
+            id1: MatchEntry(id1, fp, str(strategy[p]), row.matches(p, view_pairs))
+            for p, (id1, fp) in enumerate(row.keys())
+        }
 
 
 def write_verified_row(stream: BinaryIO, entries: Sequence[VerifiedEntry]) -> None:
@@ -274,7 +293,7 @@ def write_verified_row(stream: BinaryIO, entries: Sequence[VerifiedEntry]) -> No
     ]
     np.savez(
         stream,
-        **_row_arrays(entries),
+        **_row_arrays(entries),  # type: ignore[arg-type]
         errors_px=_joined(errors, (0,), np.float32),
         state=_strings([v.state for v in verdicts]),
         reason=_strings([v.reason for v in verdicts]),
@@ -287,26 +306,28 @@ def write_verified_row(stream: BinaryIO, entries: Sequence[VerifiedEntry]) -> No
 
 
 def read_verified_row(path: Path) -> dict[str, VerifiedEntry]:
-    """Entries by image_id1; empty when the file is absent. Raises WorkspaceError when it is broken."""
+    """Entries by image_id1; empty when the file is absent. Raises BrokenFileError when it is broken."""
     if not path.exists():
         return {}
     row = _Row(path)
-    entries = {}
-    for p, (id1, fp) in enumerate(row.keys()):
-        matches = row.matches(p, None)
-        rotation = row["rotations"][p]
-        verdict = Verdict(
-            keep=np.ones(len(matches.indices), dtype=bool),
-            state=str(row["state"][p]),  # type: ignore[arg-type]
-            reason=str(row["reason"][p]),
-            model_kind=str(row["model_kind"][p]),
-            model=row["models"][p],
-            errors_px=row["errors_px"][row.span(p)],
-            rejected=json.loads(str(row["rejected"][p])),
-            relative_rotation=None if np.isnan(rotation).any() else rotation,
-        )
-        entries[id1] = VerifiedEntry(id1, fp, int(row["matches_in"][p]), matches, verdict)
-    return entries
+    with readable(path, *_ARCHIVE_FAULTS):
+        return {id1: _verified_entry(row, p, id1, fp) for p, (id1, fp) in enumerate(row.keys())}
+
+
+def _verified_entry(row: _Row, p: int, image_id1: str, fingerprint: str) -> VerifiedEntry:
+    matches = row.matches(p, None)
+    rotation = row["rotations"][p]
+    verdict = Verdict(
+        keep=np.ones(len(matches.indices), dtype=bool),
+        state=str(row["state"][p]),  # type: ignore[arg-type]
+        reason=str(row["reason"][p]),
+        model_kind=str(row["model_kind"][p]),
+        model=row["models"][p],
+        errors_px=row["errors_px"][row.span(p)],
+        rejected=json.loads(str(row["rejected"][p])),
+        relative_rotation=None if np.isnan(rotation).any() else rotation,
+    )
+    return VerifiedEntry(image_id1, fingerprint, int(row["matches_in"][p]), matches, verdict)
 
 
 def row_fingerprints(path: Path) -> dict[str, str]:
@@ -324,12 +345,9 @@ class _Row:
     """A row archive, read once."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                self._arrays = {name: archive[name] for name in archive.files}
+        with readable(path, *_ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
+            self._arrays = {name: archive[name] for name in archive.files}
             self._offsets = self._arrays["offsets"]
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise WorkspaceError(f"cannot read {path}: {error}; delete it to have it made again") from None
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self._arrays[name]

@@ -34,7 +34,9 @@ def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
     if path.suffix.lower() in (".tif", ".tiff"):
         pixels = _read_tiff(path)
     else:
-        flag = cv2.IMREAD_UNCHANGED if colour else cv2.IMREAD_GRAYSCALE
+        # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
+        straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
+        flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
         pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels.ndim == 3:
             pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
@@ -45,8 +47,8 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     import cv2
 
     try:
-        data = np.fromfile(path, dtype=np.uint8)
-        pixels = cv2.imdecode(data, flags) if data.size else None
+        data = path.read_bytes()
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except (OSError, cv2.error) as error:
         raise ItemError(f"cannot read image {path}: {error}") from None
     if pixels is None:
@@ -56,11 +58,20 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def _is_complete_jpeg(data: NDArray[np.uint8]) -> bool:
-    """A cut JPEG decodes with a gray lower part and no error: the end marker tells. Other formats pass."""
-    if data[:2].tobytes() != b"\xff\xd8":
+def _is_complete_jpeg(data: bytes) -> bool:
+    """A cut JPEG decodes with a gray lower part and no error: the end marker tells. Other formats pass.
+
+    Only a marker behind the header counts (a thumbnail in the header has its own), and it need not be the file's
+    last bytes (some cameras append data).
+    """
+    if data[:2] != b"\xff\xd8":
         return True
-    return b"\xff\xd9" in data[-65536:].tobytes()
+    place = 2
+    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
+        # A segment's length counts its own two bytes; 0xff may be repeated as padding.
+        padding = data[place + 1 : place + 2] == b"\xff"
+        place += 1 if padding else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return data.find(b"\xff\xd9", place) >= 0
 
 
 def _read_tiff(path: Path) -> NDArray[Any]:
@@ -85,7 +96,8 @@ def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     import cv2
 
     if pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels.astype(np.float32) if pixels.dtype.kind != "u" else pixels, cv2.COLOR_RGB2GRAY)
+        known = pixels.dtype in (np.uint8, np.uint16)  # those that OpenCV converts; exact in float32 for all others
+        pixels = cv2.cvtColor(pixels if known else pixels.astype(np.float32), cv2.COLOR_RGB2GRAY)
     if pixels.dtype == np.uint8:
         return np.asarray(pixels)
     values = pixels.astype(np.float32)
@@ -130,13 +142,18 @@ def mask_path(masks: str, name: str) -> Path | None:
 
 
 def shrink(pixels: NDArray[Any], scale: float) -> NDArray[Any]:
-    """The picture reduced by `scale` <= 1 with an area filter; sizes are rounded."""
+    """The picture reduced by `scale` <= 1 with an area filter: source pixel x lies at (x + 0.5) scale - 0.5.
+
+    The size is rounded, the scale is not: a picture stretched to whole pixels would be off by up to a pixel.
+    """
     import cv2
 
     if scale >= 1.0:
         return pixels
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    if round(min(pixels.shape[:2]) * scale) < 1:
+        size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def shrink_camera(camera: Camera, scale: float) -> Camera:
@@ -188,8 +205,7 @@ def render_view(
     scale = _typical_scale(camera, view, inside)
     if scale < _ALIASING_SCALE:
         pixels = shrink(pixels, scale)
-        ratio_x, ratio_y = pixels.shape[1] / camera.width_px, pixels.shape[0] / camera.height_px
-        map_x, map_y = (map_x + 0.5) * ratio_x - 0.5, (map_y + 0.5) * ratio_y - 0.5
+        map_x, map_y = (map_x + 0.5) * scale - 0.5, (map_y + 0.5) * scale - 0.5
     map_x, map_y = map_x.astype(np.float32), map_y.astype(np.float32)
     picture = cv2.remap(pixels, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     picture[~inside] = 0
@@ -215,7 +231,7 @@ def view_maps(camera: Camera, view: View) -> tuple[FloatArray, FloatArray]:
     source = distort(camera, apply_homography(view.undistorted_from_view, nodes))
     grid = source.reshape(rows, columns, 2).astype(np.float32)
     full = cv2.resize(grid, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    part = np.nan_to_num(full[step : step + view.height_px, step : step + view.width_px], nan=-1e6)
+    part: FloatArray = np.nan_to_num(full[step : step + view.height_px, step : step + view.width_px], nan=-1e6)
     return part[..., 0], part[..., 1]
 
 

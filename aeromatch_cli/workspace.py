@@ -19,7 +19,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aeromatch_cli.errors import BrokenFileError, WorkspaceError
+from aeromatch_cli.errors import ConfigError, WorkspaceError
+from aeromatch_cli.formats import readable
 from aeromatch_cli.strategies import Strategy
 
 FORMAT_VERSION = 1
@@ -160,7 +161,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
                 write(stream)
             temporary.replace(path)
         except BaseException:
-            temporary.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
             raise
 
 
@@ -184,21 +186,6 @@ def read_json(path: Path) -> dict[str, Any]:
         if not isinstance(value, dict):
             raise ValueError("it holds no JSON object")
     return value
-
-
-@contextlib.contextmanager
-def readable(path: Path, *faults: type[Exception]) -> Iterator[None]:
-    """Turn what reading a file of the workspace raises into BrokenFileError, or into WorkspaceError where the file
-    itself may be sound (permissions, a failing disk). faults: what broken contents raise.
-    """
-    try:
-        yield
-    except faults as error:
-        raise BrokenFileError(str(path), str(error) or type(error).__name__) from None
-    except FileNotFoundError as error:
-        raise BrokenFileError(str(path), error.strerror) from None
-    except OSError as error:
-        raise WorkspaceError(f"cannot read {path}: {error.strerror or error}; check its permissions and disk") from None
 
 
 def remove_stale_temporaries(root: Path) -> None:
@@ -240,9 +227,12 @@ def _plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 (hex) of a whole file, for weights; read again only when the file has changed."""
-    status = path.stat()
-    return _file_digest(path, status.st_size, status.st_mtime_ns)
+    """SHA-256 (hex) of a file that a strategy names; read again only when it has changed. Raises ConfigError."""
+    try:
+        status = path.stat()
+        return _file_digest(path, status.st_size, status.st_mtime_ns)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}, which the configuration names: {error.strerror}") from None
 
 
 @lru_cache(maxsize=64)

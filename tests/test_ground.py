@@ -251,7 +251,8 @@ def test_too_few_points_are_refused() -> None:
     assert "too few matches" in nothing.reason
     random = auto_ground(pairs, poses, cameras(poses), Matcher(poses, wrong=1.0))
     assert random.z_m is None
-    assert auto_ground([], poses, cameras(poses), Matcher(poses)).z_m is None
+    none = auto_ground([], poses, cameras(poses), Matcher(poses))
+    assert (none.z_m, none.reason) == (None, "no adjacent images with attitude")
 
 
 def test_wrong_angle_convention_is_refused() -> None:

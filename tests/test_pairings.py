@@ -256,6 +256,24 @@ def test_missing_pair_list() -> None:
         PairFile(path="absent.txt")(block({"a": None}))
 
 
+@pytest.mark.parametrize("tilts_deg", [(0.0,), (0.0, 40.0, -40.0)], ids=["nadir", "oblique"])
+def test_screening_loses_no_pair_that_the_cap_keeps(tilts_deg: tuple[float, ...], monkeypatch: Any) -> None:
+    rng = np.random.default_rng(4)
+    poses: dict[str, Pose | None] = {}
+    for number in range(240 // len(tilts_deg)):
+        for camera, tilt in enumerate(tilts_deg):
+            rotation = from_omega_phi_kappa(tilt + rng.normal(0, 2), rng.normal(0, 2), rng.uniform(-180, 180))
+            poses[f"i{number:03d}{camera}"] = pose(*rng.uniform(0.0, 120.0, 2), rotation, rng.uniform(90.0, 130.0))
+    flight, strategy = block(poses), Overlap(max_neighbours=12)
+    screened = strategy(flight)
+    monkeypatch.setattr("aeromatch_cli.strategies.pairings.overlap._CANDIDATES_PER_NEIGHBOUR", 1000)
+    exact = strategy(flight)
+    assert len(exact) > 1200
+    common = set(keys(exact)) & set(keys(screened))
+    assert len(common) >= 0.995 * len(exact)
+    assert len(screened) <= 1.005 * len(exact)
+
+
 def test_two_thousand_images_in_seconds() -> None:
     rng = np.random.default_rng(1)
     poses: dict[str, Pose | None] = {}

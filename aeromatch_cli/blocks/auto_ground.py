@@ -91,6 +91,8 @@ def auto_ground(
     result is the weighted mean of the pairs that agree. Refused: too few points, matches that contradict the poses,
     heights above the cameras, pairs that contradict each other.
     """
+    if not pairs:
+        return GroundEstimate(None, "no adjacent images with attitude")
     attempts = [
         pair_height(poses[id0], poses[id1], cameras[id0], cameras[id1], *match_pair(id0, id1)) for id0, id1 in pairs
     ]

@@ -83,6 +83,7 @@ def read_block_inputs(
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
     read_facts: FactsReader = read_facts_serially,
+    exclude: Sequence[Path] = (),
 ) -> BlockInputs:
     """Reads everything that is known of a block, except its ground.
 
@@ -90,7 +91,8 @@ def read_block_inputs(
     camera of its own for every folder). crs: a code, "local" or "auto". angles: what yaw, pitch, roll mean; "auto":
     by the tags' origin in EXIF (DJI gimbal, Camera:* nadir), gimbal in a pose list. sigmas: of a pose that states
     none. known_frame: of an earlier run in the same workspace, kept so that a growing block does not move.
-    read_facts: maps `exif.exif_or_reason` over paths, in order; give a parallel one for large blocks.
+    read_facts: maps `exif.exif_or_reason` over paths, in order; give a parallel one for large blocks. exclude: folders
+    whose pictures are no images of the block (masks, a workspace).
 
     Raises ConfigError for a bad argument, pose list or camera file, InputError where no image is left.
     """
@@ -99,7 +101,7 @@ def read_block_inputs(
     # Lists first: they are quick, and a mistake in them should not cost a walk over 10,000 files.
     pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
     camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
-    names, scan_failures = scan_images(images_dir)
+    names, scan_failures = scan_images(images_dir, exclude)
     warnings, failures = _report_scan(scan_failures)
     outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
     failures += [ReadFailure(name, STAGE, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
@@ -267,7 +269,7 @@ def _count(names: Sequence[str], total: Mapping[str, object]) -> str:
 
 
 def _stated_ground(camera_file: CameraFile | None, frame: WorldFrame) -> float | None:
-    """World height that the camera file states; a height belongs to its frame: with another CRS its datum may differ."""
+    """World height that the camera file states, None in another frame than the block's: its datum may differ."""
     if camera_file is None or camera_file.ground_z_m is None:
         return None
     if camera_file.crs is not None and checked_crs(camera_file.crs) != frame.crs:

@@ -31,11 +31,12 @@ class ScanFailure:
     image_lost: bool
 
 
-def scan_images(folder: Path) -> tuple[list[str], list[ScanFailure]]:
+def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], list[ScanFailure]]:
     """Relative names (forward slashes, sorted) of the images below a folder, and what was passed over and why.
 
     Folders are searched at any depth, links included; hidden files and folders are skipped. A suffix in any case
-    counts: jpg, jpeg, png, tif, tiff. Raises ConfigError where the folder is missing or cannot be read.
+    counts: jpg, jpeg, png, tif, tiff. exclude: folders that are not searched, such as masks; nor is any folder that is
+    a workspace of this program. Raises ConfigError where the folder is missing or cannot be read.
     """
     if not folder.is_dir():
         what = "is not a folder" if folder.exists() else "does not exist"
@@ -51,13 +52,16 @@ def scan_images(folder: Path) -> tuple[list[str], list[ScanFailure]]:
         name = Path(error.filename).relative_to(folder).as_posix() if error.filename else ""
         failures.append(ScanFailure(name, f"folder cannot be read ({error.strerror}): check its permissions", True))
 
-    visited: set[str] = set()
+    visited = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
     for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(parent)
-        if real in visited:  # a link that leads back up
+        if real in visited:  # excluded, or a link that leads back up
             subfolders.clear()
             continue
         visited.add(real)
+        if parent != str(folder) and {"block.json", "images.csv", "pairs.csv"} <= set(files):  # a workspace
+            subfolders.clear()
+            continue
         subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
         for name in subfolders:
             if Path(name).suffix.lower() in SUFFIXES:

@@ -2,7 +2,8 @@
 
 The world origin, the ground height and the common ground sampling distance are fixed when a workspace is made, as
 image ids are: images that come later must not change the views of all others. They are fixed anew when the settings
-that they come from change, or when an image that they were computed from changes or goes.
+that they come from change, or when images that they were computed from have changed or gone and they would now come
+out clearly different: one corrected pose must not re-do the block, a corrected pose list must.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from aeromatch_cli.blocks.ground import ConstantGround, open_dem
 from aeromatch_cli.blocks.read import BlockInputs, read_block_inputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, FloatArray, Ground, Image, Pair, PairGeometry, Pose
-from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
-from aeromatch_cli.images import read_pixels, shrink
+from aeromatch_cli.images import mask_path, read_pixels, shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.matchers.nearest import Nearest
@@ -38,6 +39,9 @@ log = logging.getLogger("aeromatch")
 _GROUND_SEEDS = 5
 _GROUND_SIZE_PX = 1200
 _GROUND_KEYPOINTS = 2000
+# What was fixed holds until it is off by this share of the ground sampling distance, or of the flying height.
+_GSD_TOLERANCE = 0.1
+_GROUND_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +60,20 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
     """Read the inputs and resolve the ground. Raises ConfigError or InputError where nothing can be started."""
     if not settings.block.images:
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
+    _check_folders(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
-    inputs, prints = _read_inputs(settings, executor, before)
+    inputs, prints = _read_inputs(settings, workspace, executor, before)
     basis = {i.image_id: _basis_print(inputs, i, prints[i.image_id]) for i in inputs.images}
     wanted = fingerprint(settings.block.ground, settings.block.crs, inputs.crs, inputs.ground_hint_z_m)
-    kept = before.get("ground_fingerprint") == wanted and all(
-        basis.get(image_id) == value for image_id, value in before.get("basis", {}).items()
-    )
-    warnings = list(inputs.warnings)
-    ground, source = _stored_ground(before) if kept else (None, "")
+    kept = before.get("ground_fingerprint") == wanted
+    same = all(basis.get(image_id) == value for image_id, value in before.get("basis", {}).items())
+    warnings = [*inputs.warnings, *_mask_warnings(settings, inputs.images)]
+    ground, source = _stored_ground(before) if kept and same else (None, "")
     if ground is None:
         ground, source, remarks = _resolve_ground(settings, inputs, executor)
         warnings += remarks
+    if kept and not same:
+        ground, source = _nearly_stored(before, ground, source, inputs)
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,
@@ -78,7 +84,9 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
         ground_source=source,
         gsd_m=None,
     )
-    gsd_m = before["gsd_m"] if kept else common_gsd_m(block_footprints(block))
+    gsd_m = before["gsd_m"] if kept and same else common_gsd_m(block_footprints(block))
+    if kept and not same and gsd_m and before["gsd_m"] and abs(gsd_m / before["gsd_m"] - 1.0) < _GSD_TOLERANCE:
+        gsd_m = before["gsd_m"]
     record = {
         "format_version": FORMAT_VERSION,
         "crs": inputs.crs,
@@ -87,7 +95,7 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
         "ground_z_m": ground.z_m if isinstance(ground, ConstantGround) else None,
         "gsd_m": gsd_m,
         "ground_fingerprint": wanted,
-        "basis": before["basis"] if kept else basis,
+        "basis": before["basis"] if kept and same else basis,
     }
     return Assembled(
         block=replace(block, gsd_m=gsd_m),
@@ -99,8 +107,40 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
     )
 
 
+def _check_folders(settings: Settings, workspace: Workspace) -> None:
+    given = settings.block
+    if given.masks and not Path(given.masks).exists():
+        raise ConfigError(f"masks {given.masks} do not exist: give a folder of masks, or one mask, with --masks")
+    if Path(given.images).resolve() == workspace.root.resolve():
+        raise ConfigError(
+            f"the workspace is the images folder {given.images}: its pictures would be taken for images; "
+            "choose another --workspace"
+        )
+
+
+def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
+    masks = settings.block.masks
+    if not masks or any(mask_path(masks, image.name) for image in images):
+        return []
+    name = images[0].name
+    return [f"no mask in {masks} belongs to an image: the mask of {name} would be {name}.png"]
+
+
+def _nearly_stored(
+    before: Mapping[str, Any], ground: Ground | None, source: str, inputs: BlockInputs
+) -> tuple[Ground | None, str]:
+    """The stored height where the new one is the same up to a small share of the flying height."""
+    stored, stored_source = _stored_ground(before)
+    if not isinstance(ground, ConstantGround) or not isinstance(stored, ConstantGround) or not inputs.poses:
+        return ground, source
+    height_m = float(np.median([pose.center_m[2] for pose in inputs.poses.values()])) - stored.z_m
+    if abs(ground.z_m - stored.z_m) > _GROUND_TOLERANCE * abs(height_m):
+        return ground, source
+    return stored, stored_source
+
+
 def _read_inputs(
-    settings: Settings, executor: Executor, before: Mapping[str, Any]
+    settings: Settings, workspace: Workspace, executor: Executor, before: Mapping[str, Any]
 ) -> tuple[BlockInputs, dict[str, str]]:
     """Inputs, and the fingerprint of every image by image_id."""
     prints: dict[Path, str] = {}
@@ -130,12 +170,16 @@ def _read_inputs(
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame,
         read_facts=read_facts,
+        exclude=[workspace.root, *([Path(given.masks)] if given.masks else [])],
     )
     return inputs, {image.image_id: prints[Path(given.images) / image.name] for image in inputs.images}
 
 
 def _read_header(path: Path) -> tuple[ExifFacts | str, str]:
-    return exif_or_reason(path), image_fingerprint(path)
+    try:
+        return exif_or_reason(path), image_fingerprint(path)
+    except OSError as error:
+        raise ItemError(f"cannot be read ({error.strerror or error}): was it moved or deleted?") from None
 
 
 def _basis_print(inputs: BlockInputs, image: Image, image_print: str) -> str:
@@ -209,7 +253,8 @@ def _match_reduced(task: _GroundTask) -> tuple[FloatArray, FloatArray]:
         features.append(Sift(keypoints=_GROUND_KEYPOINTS)(camera, [ViewPixels(view, shrink(gray, scale), None)]))
         scales.append(scale)
     pair = Pair("0", "1", float("nan"), float("nan"), "ground")
-    matches = Nearest()(*features, PairGeometry(pair, *task.cameras, None, None, None))
+    geometry = PairGeometry(pair, task.cameras[0], task.cameras[1], None, None, None)
+    matches = Nearest()(features[0], features[1], geometry)
     points = [
         (f.keypoints_px[matches.indices[:, side]].astype(np.float64) + 0.5) / scale - 0.5
         for side, (f, scale) in enumerate(zip(features, scales, strict=True))

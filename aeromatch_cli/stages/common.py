@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,9 @@ from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_ha
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger("aeromatch")
+
+# Stages whose items are images or pairs; the others name files or exporters.
+ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,12 @@ class Context:
 
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """What strategies with these `needs` read of one image's geometry."""
+        known = _geometry_fingerprints(self, needs)
+        if image_id not in known:
+            known[image_id] = self._geometry_fingerprint(image_id, needs)
+        return known[image_id]
+
+    def _geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         pose = self.pose(image_id)
         parts: dict[str, Any] = {}
         if "camera" in needs:
@@ -124,9 +134,19 @@ def _image_index(block: Block) -> Mapping[str, Image]:
     return {image.image_id: image for image in block.images}
 
 
+@lru_cache(maxsize=8)
+def _geometry_fingerprints(context: Context, needs: frozenset[str]) -> dict[str, str]:
+    """Filled by `Context.geometry_fingerprint`: an image is asked for once per pair."""
+    del context, needs
+    return {}
+
+
 @dataclass
 class StageReport:
-    """What one stage did; becomes reports/<stage>.json."""
+    """What one stage did; becomes reports/<stage>.json.
+
+    items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters.
+    """
 
     stage: str
     seconds: float = 0.0
@@ -139,7 +159,10 @@ class StageReport:
     started: float = field(default_factory=time.perf_counter)
 
     def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
-        """Close the clock, write the report and gather failures.csv from all stages."""
+        """Close the clock, write the report and gather failures.csv from all stages.
+
+        A stage that found everything up to date leaves the report of the run that made it, with its timing.
+        """
         self.seconds = round(time.perf_counter() - self.started, 3)
         value = {
             "stage": self.stage,
@@ -152,22 +175,76 @@ class StageReport:
             "facts": self.facts,
             "failures": [list(failure) for failure in self.failures],
         }
-        write_json(context_workspace.stage_report(self.stage, shard.label if shard else ""), value)
+        path = context_workspace.stage_report(self.stage, shard.label if shard else "")
+        if not self._says_nothing_new(path):
+            write_json(path, value)
         gather_failures(context_workspace)
         for item, reason in self.failures:
             log.warning("%s: %s: %s", self.stage, item, reason)
         return self
 
+    def _says_nothing_new(self, path: Path) -> bool:
+        if self.done or self.failures or not path.is_file():
+            return False
+        old = read_json(path)
+        # Without facts of its own the stage only counts what it makes: those on file still hold.
+        self.facts = self.facts or old.get("facts", {})
+        return not old.get("failures") and (old.get("fingerprint"), old.get("facts")) == (self.fingerprint, self.facts)
+
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
-    """failures.csv anew from every stage's report; returns its rows."""
+    """failures.csv anew from the reports of all stages; returns its rows (stage, item, reason).
+
+    What a later report of the same stage covers (the whole block, or a shard that owns the item) supersedes what an
+    earlier one says of that item.
+    """
+    by_stage: dict[str, list[Path]] = {}
+    for path in workspace.reports.glob("*.json"):
+        by_stage.setdefault(path.stem.partition(".")[0], []).append(path)
     rows: set[tuple[str, str, str]] = set()
-    for path in sorted(workspace.reports.glob("*.json")):
-        report = read_json(path)
-        rows.update((report["stage"], item, reason) for item, reason in report["failures"])
+    for stage, paths in by_stage.items():
+        later: list[Shard | None] = []
+        for path in sorted(paths, key=lambda path: (-path.stat().st_mtime_ns, path.name)):
+            for item, reason in read_json(path).get("failures", []):
+                if not any(shard is None or shard.owns(owner(item)) for shard in later):
+                    rows.add((stage, item, reason))
+            label = path.stem.partition(".")[2]
+            later.append(Shard.parse(label.replace("-of-", "/")) if label else None)
     ordered = sorted(rows)
     write_text(workspace.failures, csv_text(("stage", "item", "reason"), ordered))
     return ordered
+
+
+def owner(item: str) -> str:
+    """The image by which a failed item is sharded: itself, or the first of a pair "id0 id1"."""
+    return item.partition(" ")[0]
+
+
+def forget_absent(context: Context) -> None:
+    """Drop failures of images and pairs that are no longer part of the block from earlier reports."""
+    images = {image.image_id for image in context.block.images}
+    pairs = {f"{pair.image_id0} {pair.image_id1}" for pair in context.pairs}
+    for path in sorted(context.workspace.reports.glob("*.json")):
+        report = read_json(path)
+        if report.get("stage") not in ITEM_STAGES:
+            continue
+        kept = [row for row in report["failures"] if row[0] in images or row[0] in pairs]
+        if len(kept) < len(report["failures"]):
+            stamp = path.stat().st_mtime_ns
+            write_json(path, {**report, "failed": len(kept), "failures": kept})
+            os.utime(path, ns=(stamp, stamp))
+
+
+def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[tuple[str, str]]:
+    """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes, unless their images or
+    they themselves are known to have failed before."""
+    failed = {item for stage, item, _ in gather_failures(context.workspace) if stage in ITEM_STAGES}
+    rows: dict[str, int] = {}
+    for pair in pairs:
+        if failed.isdisjoint((pair.image_id0, pair.image_id1, f"{pair.image_id0} {pair.image_id1}")):
+            rows[pair.image_id0] = rows.get(pair.image_id0, 0) + 1
+    text = f"missing, or made with other settings or inputs: run `aeromatch {command}` first"
+    return [(image_id, f"results of {command} for {count} pair(s): {text}") for image_id, count in rows.items()]
 
 
 def run_stage(
@@ -187,12 +264,3 @@ def run_stage(
             values.append(outcome.value)
     report.done += len(values)
     return values
-
-
-def distrust_fingerprint(context: Context) -> str:
-    """What the list of contradicting images depends on: everything that decides verified rotations, but not itself."""
-    settings = context.settings
-    poses = [(i, p.center_m, p.world_rotation) for i, p in sorted(context.given_poses.items())]
-    images = sorted(context.image_fingerprints.items())
-    parts = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match, settings.filter)
-    return fingerprint(parts, poses, images, settings.block.max_size_px, settings.seed)

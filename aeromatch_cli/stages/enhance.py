@@ -147,14 +147,18 @@ def run(context: Context) -> StageReport:
     """Write enhanced/<id>.png for every image of the shard that is not up to date."""
     report = StageReport("enhance")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    todo = [task for task in tasks if context.overwrite or not is_done(task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     run_stage(context, report, _run_task, todo, [task.image_id for task in todo])
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
 
-def _is_done(task: EnhanceTask) -> bool:
+def is_done(task: EnhanceTask) -> bool:
+    """Whether the picture on file is the one that the task would make."""
     facts = task.workspace.enhanced(task.image_id, ".json")
     picture = task.workspace.enhanced(task.image_id, ".png")
-    return picture.is_file() and facts.is_file() and read_json(facts).get("fingerprint") == task.fingerprint
+    if not (picture.is_file() and facts.is_file()):
+        return False
+    found = read_json(facts)
+    return found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.formats import MatchEntry, read_keypoints, read_match_row
-from aeromatch_cli.stages.common import Context, StageReport, run_stage
-from aeromatch_cli.stages.filter import verified_pairs
+from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
+from aeromatch_cli.stages.filter import outdated_pairs, pair_fingerprint, verified_pairs
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents
-from aeromatch_cli.workspace import fingerprint, read_json
+from aeromatch_cli.workspace import fingerprint, read_json, translated_os_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,18 +32,22 @@ def run(context: Context) -> StageReport:
     """Write export/<name>/ for every exporter whose folder is not up to date."""
     report = StageReport("export")
     block = context.block
-    pairs = [(p.image_id0, p.image_id1, e.fingerprint) for p, e in verified_pairs(context)]
+    outdated = outdated_pairs(context)
+    absent = {(pair.image_id0, pair.image_id1) for pair in outdated}
+    pairs = [p for p in context.pairs if (p.image_id0, p.image_id1) not in absent]
     if not pairs:
         raise InputError(
-            "nothing to export: no pair has been matched and filtered; see failures.csv and `aeromatch check`"
+            "nothing to export: no pair is matched and filtered with the present settings and inputs; "
+            "run `aeromatch filter` first (`aeromatch run` does everything), and see failures.csv"
         )
+    context = replace(context, pairs=tuple(pairs))
     contents = [
         block.images,
         sorted(block.cameras.items()),
         sorted(block.poses.items()),
         block.crs,
         block.origin_m,
-        pairs,
+        [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in pairs],
     ]
     wanted = fingerprint(context.settings.export, contents)
     report.items, report.fingerprint = len(context.settings.export), wanted
@@ -50,24 +55,38 @@ def run(context: Context) -> StageReport:
     last = context.workspace.stage_report("export")
     if (
         not context.overwrite
-        and all(folder.is_dir() for folder in folders)
         and last.is_file()
         and (found := read_json(last)).get("fingerprint") == wanted
-        and not found.get("failures")
+        and _complete(folders, found["facts"])
     ):
         report.skipped = report.items
         report.facts = found["facts"]
+        report.failures = unexplained(context, outdated, "filter")
         return report.write(context.workspace)
+    # A killed export must not be vouched for by the report of an earlier one.
+    with translated_os_errors(last):
+        last.unlink(missing_ok=True)
     tasks = [ExportTask(e, context, f) for e, f in zip(context.settings.export, folders, strict=True)]
     names = [exporter.name for exporter in context.settings.export]
-    report.facts = dict(zip(names, run_stage(context, report, _run_task, tasks, names), strict=False))
+    done = run_stage(context, report, _run_task, tasks, names)
+    report.facts = {str(facts["name"]): facts for facts in done}
+    report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)
 
 
-def _run_task(task: ExportTask) -> dict[str, object]:
+def _complete(folders: list[Path], facts: Mapping[str, Any]) -> bool:
+    """Whether every file that the exporters wrote is still there."""
+    return all(
+        folder.name in facts and all((folder / name).is_file() for name in facts[folder.name]["files"])
+        for folder in folders
+    )
+
+
+def _run_task(task: ExportTask) -> dict[str, Any]:
     contents = _contents(task.context)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
-    return {key: str(value) if key == "folder" else value for key, value in asdict(summary).items() if key != "files"}
+    files = [path.relative_to(task.folder).as_posix() for path in summary.files]
+    return {"name": task.folder.name, **asdict(summary), "files": files}
 
 
 def _contents(context: Context) -> ExportContents:
@@ -86,5 +105,8 @@ def _pairs(context: Context) -> Iterator[PairContents]:
     for pair, entry in verified_pairs(context):
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_match_row(context.workspace.matches(pair.image_id0))
-        raw = row[pair.image_id1].matches
+        found = row.get(pair.image_id1)
+        if found is None:  # the row was rewritten under another configuration while this one ran
+            raise BrokenFileError(str(context.workspace.matches(pair.image_id0)), f"no entry {pair.image_id1}")
+        raw = found.matches
         yield PairContents(pair, raw.indices, entry.matches.indices, entry.verdict.model_kind, entry.verdict.model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Image
@@ -68,28 +68,51 @@ def _in_stored_frame(features: Features, scale: float) -> Features:
     )
 
 
-def run(context: Context, images: Iterable[Image] | None = None) -> StageReport:
-    """Write features for the images of the shard (or the given ones) that are not up to date."""
-    report = StageReport("extract")
-    tasks = [make_task(context, image) for image in (context.images() if images is None else images)]
-    todo = [task for task in tasks if context.overwrite or features_fingerprint(task.path) != task.fingerprint]
-    report.items, report.skipped = len(tasks), len(tasks) - len(todo)
+@lru_cache(maxsize=4)
+def _tasks(context: Context) -> dict[str, ExtractTask]:
+    """Filled by `task_of`."""
+    del context
+    return {}
+
+
+def task_of(context: Context, image_id: str) -> ExtractTask:
+    """The task of one image, made once per command."""
+    known = _tasks(context)
+    if image_id not in known:
+        known[image_id] = make_task(context, context.image_by_id[image_id])
+    return known[image_id]
+
+
+def run(context: Context, image_ids: Iterable[str] | None = None, before: StageReport | None = None) -> StageReport:
+    """Write features for the images of the shard (or the given ones) that are not up to date.
+
+    before: report of images that this command has already been through; they are left out and the counts are added.
+    """
+    report = before or StageReport("extract")
+    chosen = [image.image_id for image in context.images()] if image_ids is None else sorted(set(image_ids))
+    tasks = [task_of(context, image_id) for image_id in chosen]
+    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    report.items += len(tasks)
+    report.skipped += len(tasks) - len(todo)
     counts = run_stage(context, report, run_task, todo, [task.image_id for task in todo])
-    report.facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
-    report.fingerprint = fingerprint([task.fingerprint for task in tasks])
+    facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
+    if counts:
+        report.facts = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
+    report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
 
-def ensure(context: Context, image_ids: Iterable[str]) -> dict[str, str]:
-    """Make missing features of these images; returns image_id -> fingerprint of those that have them now."""
-    by_id = context.image_by_id
-    tasks = {image_id: make_task(context, by_id[image_id]) for image_id in sorted(set(image_ids))}
-    missing = [i for i, task in tasks.items() if features_fingerprint(task.path) != task.fingerprint]
-    if missing:
-        run(replace(context, overwrite=False), [by_id[i] for i in missing])
-    have = partial(_has_features, tasks)
-    return {i: task.fingerprint for i, task in tasks.items() if i not in missing or have(i)}
+def _is_done(task: ExtractTask) -> bool:
+    if features_fingerprint(task.path) != task.fingerprint:
+        return False
+    return not task.keep_images or (enhance.is_done(task.views.source) and simulate.is_done(task.views))
 
 
-def _has_features(tasks: dict[str, ExtractTask], image_id: str) -> bool:
-    return features_fingerprint(tasks[image_id].path) == tasks[image_id].fingerprint
+def current(context: Context, image_ids: Iterable[str]) -> set[str]:
+    """Those of the images whose features on file are the ones that the present settings and inputs give."""
+    found = set()
+    for image_id in set(image_ids):
+        task = task_of(context, image_id)
+        if features_fingerprint(task.path) == task.fingerprint:
+            found.add(image_id)
+    return found

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Matches, Pair, PairGeometry
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.executor import guarded
 from aeromatch_cli.formats import (
     MatchEntry,
     VerifiedEntry,
@@ -22,11 +23,11 @@ from aeromatch_cli.formats import (
     row_fingerprints,
     write_verified_row,
 )
-from aeromatch_cli.stages.common import Context, StageReport, distrust_fingerprint, run_stage
-from aeromatch_cli.stages.rotations import contradicting_images
+from aeromatch_cli.stages import distrust, extract, match
+from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters import apply_chain
-from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically, write_json
+from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
 
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
 WEAK_MATCHES = 50
@@ -40,6 +41,10 @@ class PairTask:
     fingerprint: str
     seed: int
 
+    @property
+    def image_id1(self) -> str:
+        return self.geometry.pair.image_id1
+
 
 @dataclass(frozen=True, eq=False)
 class FilterTask:
@@ -52,41 +57,68 @@ class FilterTask:
     overwrite: bool
 
 
-def make_tasks(context: Context) -> list[FilterTask]:
-    """One task per row of the shard; only pairs that have been matched."""
+@dataclass(frozen=True)
+class RowResult:
+    """done: pairs judged now. failures: ("id0 id1", reason)."""
+
+    done: int
+    failures: tuple[tuple[str, str], ...]
+
+
+def pair_seed(context: Context, pair: Pair) -> int:
+    """The same for a pair whatever else is in the block."""
+    return stable_hash(f"{context.settings.seed} {pair.image_id0} {pair.image_id1}") % (1 << 31)
+
+
+def pair_fingerprint(context: Context, pair: Pair) -> str:
+    """What the verdict on a pair must carry: the chain, the matches, the geometry that the chain reads, the seed."""
     chain = context.settings.filter
     needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
-    tasks = []
-    for image_id0, pairs in context.rows().items():
+    sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
+    return fingerprint(chain, match.pair_fingerprint(context, pair), sides, pair_seed(context, pair))
+
+
+def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
+    """One task per row of the shard, and the pairs whose matches or features are not up to date: those have none.
+
+    Larger rows first, so that none runs last.
+    """
+    rows = context.rows()
+    features = extract.current(context, {i for r in rows.values() for p in r for i in (p.image_id0, p.image_id1)})
+    tasks, missing = [], []
+    for image_id0, pairs in rows.items():
         matched = row_fingerprints(context.workspace.matches(image_id0))
         row = []
         for pair in pairs:
-            if pair.image_id1 not in matched:
-                continue
-            seed = stable_hash(f"{context.settings.seed} {pair.image_id0} {pair.image_id1}") % (1 << 31)
-            sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
-            own = fingerprint(chain, matched[pair.image_id1], sides, seed)
-            row.append(PairTask(context.geometry(pair), own, seed))
-        if row:
-            tasks.append(FilterTask(image_id0, tuple(row), chain, context.workspace, context.overwrite))
-    return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
+            known = {pair.image_id0, pair.image_id1} <= features
+            if known and matched.get(pair.image_id1) == match.pair_fingerprint(context, pair):
+                own = pair_fingerprint(context, pair)
+                row.append(PairTask(context.geometry(pair), own, pair_seed(context, pair)))
+            else:
+                missing.append(pair)
+        tasks.append(FilterTask(image_id0, tuple(row), context.settings.filter, context.workspace, context.overwrite))
+    return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0)), missing
 
 
-def run_task(task: FilterTask) -> int:
-    """Judge what is not up to date in one row; returns the pairs judged."""
+def run_task(task: FilterTask) -> RowResult:
+    """Judge what is not up to date in one row; one failing pair does not stop the others."""
     path = task.workspace.verified(task.image_id0)
     old = {} if task.overwrite else _usable_row(path)
     row = read_match_row(task.workspace.matches(task.image_id0))
-    entries, judged = [], 0
+    entries, failures, judged = [], [], 0
     for pair in task.pairs:
-        image_id1 = pair.geometry.pair.image_id1
+        image_id1 = pair.image_id1
         entry = old.get(image_id1)
         if entry is None or entry.fingerprint != pair.fingerprint:
-            entry = _judge(task, pair, row[image_id1])
+            outcome = guarded(lambda one: _judge(task, one, row[one.image_id1]), pair)
+            if outcome.value is None:
+                failures.append((f"{task.image_id0} {image_id1}", outcome.error))
+                continue
+            entry = outcome.value
             judged += 1
         entries.append(entry)
     write_atomically(path, lambda stream: write_verified_row(stream, entries))
-    return judged
+    return RowResult(judged, tuple(failures))
 
 
 def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry:
@@ -138,34 +170,49 @@ def _keypoints(path: Path) -> FloatArray:
 def _usable_row(path: Path) -> dict[str, VerifiedEntry]:
     try:
         return read_verified_row(path)
-    except WorkspaceError:
+    except BrokenFileError:
         return {}
 
 
 def run(context: Context) -> StageReport:
     """Write verified/<id0>.npz for every row of the shard, then sum up what the block now is."""
     report = StageReport("filter")
-    tasks = make_tasks(context)
-    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    tasks, missing = make_tasks(context)
+    on_file = {task.image_id0: row_fingerprints(context.workspace.verified(task.image_id0)) for task in tasks}
+    todo = [task for task in tasks if context.overwrite or not _is_done(task, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
-    run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
-    report.skipped = report.items - sum(len(task.pairs) for task in todo)
-    report.done = report.items - report.skipped - len(report.failures)
+    results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
+    report.failures.extend(failure for result in results for failure in result.failures)
+    report.failures.extend(unexplained(context, missing, "match"))
+    report.done = sum(result.done for result in results)
+    report.skipped = 0 if context.overwrite else sum(_kept(task, on_file[task.image_id0]) for task in tasks)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     report.facts = summarise(context)
     if context.shard is None:
-        contradicting = contradicting_images(context.given_poses, _rotations(context))
-        report.facts["rotation_contradicts_pose"] = contradicting
-        write_json(
-            context.workspace.distrusted,
-            {"fingerprint": distrust_fingerprint(context), "angles_deg": contradicting},
-        )
+        report.facts["rotation_contradicts_pose"] = distrust.judge(context, _rotations(context))
     return report.write(context.workspace, context.shard)
 
 
-def _is_done(task: FilterTask) -> bool:
-    wanted = {pair.geometry.pair.image_id1: pair.fingerprint for pair in task.pairs}
-    return row_fingerprints(task.workspace.verified(task.image_id0)) == wanted
+def _is_done(task: FilterTask, on_file: dict[str, str]) -> bool:
+    """Exactly the wanted pairs, each up to date: verdicts that no longer hold leave the file."""
+    return on_file == {pair.image_id1: pair.fingerprint for pair in task.pairs}
+
+
+def _kept(task: FilterTask, on_file: dict[str, str]) -> int:
+    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in task.pairs)
+
+
+def outdated_pairs(context: Context) -> list[Pair]:
+    """Pairs whose verdict, or the features that it points into, is not what present settings and inputs give."""
+    features = extract.current(context, {i for p in context.pairs for i in (p.image_id0, p.image_id1)})
+    outdated = []
+    for image_id0, pairs in context.rows().items():
+        judged = row_fingerprints(context.workspace.verified(image_id0))
+        for pair in pairs:
+            known = {pair.image_id0, pair.image_id1} <= features
+            if not known or judged.get(pair.image_id1) != pair_fingerprint(context, pair):
+                outdated.append(pair)
+    return outdated
 
 
 def verified_pairs(context: Context) -> Iterator[tuple[Pair, VerifiedEntry]]:

@@ -7,7 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Pair, PairGeometry
-from aeromatch_cli.errors import ItemError, WorkspaceError
+from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.executor import guarded
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
@@ -38,42 +39,61 @@ class MatchTask:
     overwrite: bool
 
 
-def pair_fingerprint(context: Context, pair: Pair, features: dict[str, str]) -> str:
-    """Fingerprint of one pair's matches: matcher, both images' features, and their geometry."""
+@dataclass(frozen=True)
+class RowResult:
+    """done: pairs matched now. found: matches in them. failures: ("id0 id1", reason)."""
+
+    done: int
+    found: int
+    failures: tuple[tuple[str, str], ...]
+
+
+def pair_fingerprint(context: Context, pair: Pair) -> str:
+    """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
     matcher = context.settings.match
-    sides = [(features[i], context.geometry_fingerprint(i, matcher.needs)) for i in (pair.image_id0, pair.image_id1)]
+    sides = [
+        (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.needs))
+        for i in (pair.image_id0, pair.image_id1)
+    ]
     return fingerprint(matcher, sides)
 
 
-def make_tasks(context: Context, features: dict[str, str]) -> list[MatchTask]:
+def images_of_rows(context: Context) -> set[str]:
+    """Every image whose features the rows of this shard need, and the images of the shard itself."""
+    paired = {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
+    return paired | {image.image_id for image in context.images()}
+
+
+def make_tasks(context: Context) -> list[MatchTask]:
     """One task per row of the shard, pairs without features left out. Larger rows first, so that none runs last."""
+    features = extract.current(context, images_of_rows(context))
     tasks = []
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
-        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p, features)) for p in usable)
+        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p)) for p in usable)
         if row:
             tasks.append(MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite))
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
 
-def run_task(task: MatchTask) -> tuple[int, list[tuple[str, str]]]:
-    """Match what is not up to date in one row; returns the matches found and the failed pairs with reasons."""
+def run_task(task: MatchTask) -> RowResult:
+    """Match what is not up to date in one row; one failing pair does not stop the others."""
     path = task.workspace.matches(task.image_id0)
     old = {} if task.overwrite else _usable_row(path)
-    entries, failures, found = [], [], 0
+    entries, failures, made = [], [], []
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
     for pair in task.pairs:
         entry = old.get(pair.image_id1)
         if entry is None or entry.fingerprint != pair.fingerprint:
-            try:
-                entry = _match_pair(task, pair, features0)
-            except ItemError as error:
-                failures.append((f"{task.image_id0} {pair.image_id1}", str(error)))
+            outcome = guarded(lambda one: _match_pair(task, one, features0), pair)
+            if outcome.value is None:
+                failures.append((f"{task.image_id0} {pair.image_id1}", outcome.error))
                 continue
-            found += len(entry.matches.indices)
+            entry = outcome.value
+            made.append(len(entry.matches.indices))
         entries.append(entry)
     write_atomically(path, lambda stream: write_match_row(stream, entries))
-    return found, failures
+    return RowResult(len(made), sum(made), tuple(failures))
 
 
 def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
@@ -86,7 +106,7 @@ def _usable_row(path: Path) -> dict[str, MatchEntry]:
     """The row as far as it can be read: a broken file is made again."""
     try:
         return read_match_row(path)
-    except WorkspaceError:
+    except BrokenFileError:
         return {}
 
 
@@ -102,23 +122,25 @@ def _features(path: Path, stamp: int) -> Features:
 
 
 def run(context: Context) -> StageReport:
-    """Write matches/<id0>.npz for every row of the shard; features that are missing are made first."""
-    wanted = {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
-    features = extract.ensure(context, wanted)
+    """Write matches/<id0>.npz for every row of the shard, from the features that are up to date."""
     report = StageReport("match")
-    tasks = make_tasks(context, features)
-    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    tasks = make_tasks(context)
+    on_file = {task.image_id0: row_fingerprints(context.workspace.matches(task.image_id0)) for task in tasks}
+    todo = [task for task in tasks if context.overwrite or not _is_done(task, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
-    report.skipped = report.items - sum(len(task.pairs) for task in todo)
     results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
-    for _, failures in results:
-        report.failures.extend(failures)
-    report.done = report.items - report.skipped - len(report.failures)
-    report.facts = {"matches": sum(found for found, _ in results)}
+    report.failures.extend(failure for result in results for failure in result.failures)
+    report.done = sum(result.done for result in results)
+    report.skipped = 0 if context.overwrite else sum(_kept(task, on_file[task.image_id0]) for task in tasks)
+    report.facts = {"matches": sum(result.found for result in results)} if report.done else {}
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     return report.write(context.workspace, context.shard)
 
 
-def _is_done(task: MatchTask) -> bool:
-    wanted = {pair.image_id1: pair.fingerprint for pair in task.pairs}
-    return row_fingerprints(task.workspace.matches(task.image_id0)) == wanted
+def _is_done(task: MatchTask, on_file: dict[str, str]) -> bool:
+    """Exactly the wanted pairs, each up to date: pairs that are no longer wanted leave the file."""
+    return on_file == {pair.image_id1: pair.fingerprint for pair in task.pairs}
+
+
+def _kept(task: MatchTask, on_file: dict[str, str]) -> int:
+    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in task.pairs)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from dataclasses import replace
 from pathlib import Path
 
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import Settings, dump
-from aeromatch_cli.data import Block, Pair, Pose
+from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.stages.assemble import Assembled, assemble
-from aeromatch_cli.stages.common import Context, Shard, StageReport, distrust_fingerprint
-from aeromatch_cli.workspace import Workspace, fingerprint, read_json, write_json, write_text
+from aeromatch_cli.stages.common import Context, Shard, StageReport, forget_absent
+from aeromatch_cli.stages.distrust import without_distrusted
+from aeromatch_cli.workspace import Workspace, file_digest, fingerprint, read_json, write_json, write_text
 
 log = logging.getLogger("aeromatch")
 
@@ -34,7 +36,9 @@ def prepare(
     """
     report = StageReport("pairs")
     workspace = Workspace(Path(settings.workspace).absolute())
-    if not dry:
+    if dry:
+        workspace.check_version()
+    else:
         workspace.create()
     assembled = assemble(settings, workspace, executor)
     context = Context(
@@ -52,24 +56,25 @@ def prepare(
     context = without_distrusted(context)
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
-    report.items = report.done = len(pairs or ())
-    report.skipped = len(pairs or ())
-    if pairs is None:
+    if pairs is not None:
+        report.items = report.skipped = len(pairs)
+    else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-        report.skipped = 0
     summary = summarise(assembled.block, pairs)
     report.facts = {
         "summary": list(summary.lines()),
         "warnings": [*assembled.warnings, *summary.warnings],
         "images": len(assembled.block.images),
         "distrusted": sorted(_turned(context)),
+        "pairs_sha256": hashlib.sha256(pairs_text(pairs).encode("utf-8")).hexdigest(),
     }
     report.failures = list(assembled.failures)
     report.fingerprint = wanted
     context = replace(context, pairs=tuple(pairs))
     if not dry:
         _write(context, assembled, pairs)
+        forget_absent(context)
         report.write(workspace)
     for warning in report.facts["warnings"]:
         log.warning("warning: %s", warning)
@@ -79,24 +84,6 @@ def prepare(
             "(the warnings above), or use --set pairs=exhaustive"
         )
     return context, report
-
-
-def without_distrusted(context: Context) -> Context:
-    """The context in which images whose attitude contradicts the pictures keep only their position.
-
-    The list was made by the filter stage; it holds as long as nothing that it depends on has changed.
-    """
-    path = context.workspace.distrusted
-    if context.overwrite or not path.is_file():
-        return context
-    found = read_json(path)
-    if found.get("fingerprint") != distrust_fingerprint(context):
-        return context
-    wrong = found["angles_deg"]
-    poses: dict[str, Pose] = {
-        i: replace(pose, world_rotation=None) if i in wrong else pose for i, pose in context.given_poses.items()
-    }
-    return replace(context, block=replace(context.block, poses=poses))
 
 
 def _turned(context: Context) -> set[str]:
@@ -116,8 +103,12 @@ def _fingerprint(context: Context) -> str:
 
 
 def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
-    report = workspace.stage_report("pairs")
-    if not (report.is_file() and workspace.pairs.is_file()) or read_json(report).get("fingerprint") != wanted:
+    """The pairs on file, if the report that vouches for them is about exactly this file."""
+    path = workspace.stage_report("pairs")
+    if not (path.is_file() and workspace.pairs.is_file()):
+        return None
+    report = read_json(path)
+    if report.get("fingerprint") != wanted or report["facts"].get("pairs_sha256") != file_digest(workspace.pairs):
         return None
     return read_pairs(workspace.pairs)
 

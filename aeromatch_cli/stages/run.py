@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.errors import ConfigError, InputError
+from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
-from aeromatch_cli.stages.common import Context, Shard, StageReport
+from aeromatch_cli.stages.common import Context, Shard, StageReport, gather_failures, owner
+from aeromatch_cli.stages.distrust import without_distrusted
+from aeromatch_cli.workspace import read_json, translated_os_errors
 
 log = logging.getLogger("aeromatch")
 
@@ -20,15 +22,16 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
     "enhance": enhance.run,
     "simulate": simulate.run,
     "extract": extract.run,
-    "match": match.run,
     "filter": filter.run,
     "export": export.run,
     "report": report.run,
 }
 # Stages whose items are independent: these can be cut into shards, the others need everything.
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
+# What a command rests on: everything before it in this chain.
+_CHAIN = ("pairs", "extract", "match", "filter", "export", "report")
 # How often attitudes may be distrusted and their images done again; each pass can only add images.
-_MAX_PASSES = 3
+_MAX_PASSES = 10
 
 
 @dataclass(frozen=True)
@@ -53,23 +56,47 @@ def execute(
     if part and command not in (*SHARDED, "run", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
-        context, first = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
-        if command == "check":
-            return _check(context, first)
-        reports = [first]
-        if command == "run":
-            reports += _run_all(context)
-        elif command != "pairs":
-            reports.append(STAGES[command](context))
+        repaired: set[str] = set()
+        while True:
+            try:
+                return _attempt(command, settings, executor, part, overwrite)
+            except BrokenFileError as error:
+                if command == "check" or error.path in repaired:
+                    raise
+                repaired.add(error.path)
+                overwrite = False  # what this command has done already is up to date
+                log.warning("warning: %s was damaged (%s): it is made again", error.path, error.reason)
+                with translated_os_errors(Path(error.path)):
+                    Path(error.path).unlink(missing_ok=True)
+
+
+def _attempt(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
+    context, first = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
+    if command == "check":
+        return _check(context, first)
+    reports = [first]
+    if command == "run":
+        done, context = _run_all(context)
+        reports += done
+    elif command == "match":
+        features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
+        reports += [features, match.run(context)]
+    elif command != "pairs":
+        reports.append(STAGES[command](context))
+    if command == "filter" and not reports[-1].items and reports[-1].failures:
+        raise InputError(
+            "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
+            "(`aeromatch run` does everything)"
+        )
     return _result(command, context, reports)
 
 
-def _run_all(context: Context) -> list[StageReport]:
+def _run_all(context: Context) -> tuple[list[StageReport], Context]:
     """extract, match, filter, and again for images whose attitude turns out wrong; then export and report."""
     reports: list[StageReport] = []
     for _ in range(_MAX_PASSES):
-        reports = [extract.run(context), match.run(context), filter.run(context)]
-        trusted = pairs.without_distrusted(replace(context, overwrite=False))
+        reports = _to_filter(context)
+        trusted = without_distrusted(replace(context, overwrite=False))
         if context.shard is not None or _attitudes(trusted) == _attitudes(context):
             break
         log.info("attitudes of some images contradict the pictures; these images are done again without")
@@ -78,8 +105,32 @@ def _run_all(context: Context) -> list[StageReport]:
         if not reports[-1].facts["verified_matches"]:
             reports.append(report.run(context))
             raise InputError(f"no pair could be verified; {context.workspace.report} and failures.csv say why")
-        reports += [export.run(context), report.run(context)]
-    return reports
+        reports.append(export.run(context))
+        reports.append(_page_on_file(context) or report.run(context))
+    return reports, context
+
+
+def _page_on_file(context: Context) -> StageReport | None:
+    """The page's report, where the page is younger than everything that it tells of."""
+    workspace = context.workspace
+    own = workspace.stage_report("report")
+    if context.overwrite or not (workspace.report.is_file() and own.is_file()):
+        return None
+    told = [path for path in workspace.reports.glob("*.json") if path != own]
+    told += [workspace.config, workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]
+    made = workspace.report.stat().st_mtime_ns
+    if any(path.stat().st_mtime_ns >= made for path in told):
+        return None
+    return StageReport("report", items=1, skipped=1, facts=read_json(own)["facts"])
+
+
+def _to_filter(context: Context) -> list[StageReport]:
+    """Of a shard, images of other shards come after its own: by then another machine may have done them."""
+    features = extract.run(context)
+    if context.shard is not None:
+        others = match.images_of_rows(context) - {image.image_id for image in context.images()}
+        features = extract.run(replace(context, overwrite=False), others, features)
+    return [features, match.run(context), filter.run(context)]
 
 
 def _attitudes(context: Context) -> set[str]:
@@ -87,7 +138,7 @@ def _attitudes(context: Context) -> set[str]:
 
 
 def _result(command: str, context: Context, reports: list[StageReport]) -> Result:
-    failures = tuple((r.stage, item, reason) for r in reports for item, reason in r.failures)
+    failures = _standing_failures(command, context, reports)
     lines = list(reports[0].facts["summary"])
     for stage in reports:
         lines.append(
@@ -119,6 +170,16 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
         "failures": len(failures),
     }
     return Result(tuple(lines), facts, failures)
+
+
+def _standing_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
+    """What failed now, and what failed in the stages before this command and still stands."""
+    failures = {(r.stage, item, reason) for r in reports for item, reason in r.failures}
+    before = _CHAIN if command == "run" else _CHAIN[: _CHAIN.index(command)] if command in _CHAIN else ()
+    for stage, item, reason in gather_failures(context.workspace):
+        if stage in before and context.owns(owner(item)):
+            failures.add((stage, item, reason))
+    return tuple(sorted(failures))
 
 
 def _filter_lines(stage: StageReport) -> list[str]:

@@ -94,16 +94,20 @@ def run(context: Context) -> StageReport:
     """Write simulated/<id>/ for every image of the shard that is not up to date."""
     report = StageReport("simulate")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.overwrite or not _is_done(task)]
+    todo = [task for task in tasks if context.overwrite or not is_done(task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     run_stage(context, report, _run_task, todo, [task.source.image_id for task in todo])
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
 
-def _is_done(task: SimulateTask) -> bool:
-    path = task.source.workspace.views(task.source.image_id)
+def is_done(task: SimulateTask) -> bool:
+    """Whether the pictures on file are those that the task would make."""
+    workspace, image_id = task.source.workspace, task.source.image_id
+    path = workspace.views(image_id)
     if not path.is_file():
         return False
     found = read_json(path)
-    return found.get("fingerprint") == task.fingerprint and bool(found.get("pictures"))
+    if found.get("fingerprint") != task.fingerprint or not found.get("pictures"):
+        return False
+    return all(workspace.view(image_id, view["name"]).is_file() for view in found["views"])

@@ -15,7 +15,7 @@ from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
 from aeromatch_cli.strategies.pairings.screening import promising_pairs
 
 # Pairs intersected exactly for each that the cap can keep.
-_CANDIDATES_PER_NEIGHBOUR = 4
+_CANDIDATES_PER_NEIGHBOUR = 3
 
 
 class Overlap(Strategy):

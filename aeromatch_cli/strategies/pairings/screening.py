@@ -20,6 +20,7 @@ from aeromatch_cli.geometry.footprints import Footprint, border_rays, view_angle
 _RINGS = ((0.5, 0.40), (0.85, 0.51))
 _POINTS_PER_RING = 8
 _IMAGES_AT_ONCE = 64
+_SECTORS, _PER_SECTOR = 8, 2
 # The estimated view angle is taken at the middle of a few points: allow it to be off by this much.
 _ANGLE_SLACK_DEG = 20.0
 
@@ -54,7 +55,7 @@ def promising_pairs(
     """Pairs (P, 2) of footprint indices, first < second, sorted, that may overlap enough.
 
     Complete where no image has more than `per_image` neighbours whose bounding boxes share enough area; else the
-    `per_image` best estimated overlaps of either image.
+    `per_image` best estimated overlaps of either image, and the best two towards each of 8 directions.
     """
     import shapely
 
@@ -95,14 +96,21 @@ def _looks(
         reach.append(max_distance_factor * (float(pose.center_m[2]) - footprint.ground_z_m))
     ring_weights = [np.full(_POINTS_PER_RING, area / _POINTS_PER_RING) for _, area in _RINGS]
     weights = np.concatenate([[1.0 - sum(area for _, area in _RINGS)], *ring_weights])
-    single = [np.asarray(values, dtype=np.float32) for values in (samples, weights, centers, rotations, bounds, reach)]
-    return _Looks(*single, areas_m2)
+    return _Looks(
+        samples_m=np.array(samples, dtype=np.float32),
+        weights=weights.astype(np.float32),
+        centers_m=np.array(centers, dtype=np.float32),
+        rotations=np.array(rotations, dtype=np.float32),
+        bounds=np.array(bounds, dtype=np.float32),
+        reach_m=np.array(reach, dtype=np.float32),
+        areas_m2=areas_m2,
+    )
 
 
 def _best_estimated(
     looks: _Looks, first: IntArray, second: IntArray, max_view_angle_deg: float, per_image: int
 ) -> IntArray:
-    """Indices of the pairs that their first image ranks among its `per_image` best by estimate."""
+    """Indices of the pairs that their first image ranks among its best by estimate, see `promising_pairs`."""
     swap = looks.areas_m2[second] < looks.areas_m2[first]
     small, other = np.where(swap, second, first), np.where(swap, first, second)
     points = looks.samples_m[small]
@@ -122,6 +130,16 @@ def _best_estimated(
     possible = np.flatnonzero(lost | (angles <= max_view_angle_deg))
     tie = np.where(lost, apart, angles)[possible]
     order = possible[np.lexsort((second[possible], tie, -np.round(shares[possible], 6), first[possible]))]
-    groups = first[order]
-    rank = np.arange(len(order)) - np.searchsorted(groups, groups)
-    return np.asarray(order[rank < per_image])
+    # The best towards each side as well: dense strips must not lose the strips beside them.
+    offset = looks.samples_m[second[order], 0] - looks.samples_m[first[order], 0]
+    sector = np.floor(np.arctan2(offset[:, 1], offset[:, 0]) * (_SECTORS / (2.0 * np.pi))).astype(np.int64) % _SECTORS
+    best = _rank_in_group(first[order]) < per_image
+    return np.asarray(order[best | (_rank_in_group(first[order] * _SECTORS + sector) < _PER_SECTOR)])
+
+
+def _rank_in_group(groups: IntArray) -> IntArray:
+    """Place (N,) of each element among those of its group, in the order given."""
+    order = np.argsort(groups, kind="stable")
+    rank = np.empty(len(groups), dtype=np.int64)
+    rank[order] = np.arange(len(groups)) - np.searchsorted(groups[order], groups[order])
+    return rank

@@ -1,0 +1,69 @@
+"""Which images' attitudes are not used because their pictures contradict them: judged by filter, kept between runs.
+
+A judgement on an image holds as long as nothing changes that can be laid at its door: the image, its given pose and
+the settings. Images that come later do not revoke it by themselves; matches that vindicate the image do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from aeromatch_cli.data import FloatArray, Pose
+from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.rotations import contradicting_images
+from aeromatch_cli.workspace import fingerprint, read_json, write_json
+
+Rotations = Sequence[tuple[str, str, FloatArray, int]]
+
+
+def without_distrusted(context: Context) -> Context:
+    """The context in which images whose attitude contradicts the pictures keep only their position."""
+    wrong = _standing(context, _on_file(context))
+    poses: dict[str, Pose] = {
+        i: replace(pose, world_rotation=None) if i in wrong else pose for i, pose in context.given_poses.items()
+    }
+    return replace(context, block=replace(context.block, poses=poses)) if wrong else context
+
+
+def judge(context: Context, rotations: Rotations) -> dict[str, float]:
+    """image_id -> degrees for every image whose attitude is not to be used; written to distrusted.json.
+
+    rotations: (id0, id1, cam1_from_cam0, matches) of the verified pairs. An image that was distrusted before stays so
+    in an unchanged block, whatever is found without its attitude: otherwise runs could swing between two results.
+    """
+    found, before = contradicting_images(context.given_poses, rotations), _on_file(context)
+    evidence = fingerprint(_settings(context), [(i, _facts(context, i)) for i in sorted(context.given_poses)])
+    seen = {image_id for id0, id1, _, _ in rotations for image_id in (id0, id1)}
+    unchanged = before.get("fingerprint") == evidence
+    kept = {i: a for i, a in _standing(context, before).items() if unchanged or i not in seen}
+    angles = dict(sorted({**found, **kept}.items()))
+    images = {i: {"angle_deg": angle, "facts": _facts(context, i)} for i, angle in angles.items()}
+    record = {"fingerprint": evidence, "settings": _settings(context), "images": images}
+    write_json(context.workspace.distrusted, record)
+    return angles
+
+
+def _on_file(context: Context) -> dict[str, Any]:
+    path = context.workspace.distrusted
+    return read_json(path) if path.is_file() and not context.overwrite else {}
+
+
+def _standing(context: Context, record: dict[str, Any]) -> dict[str, float]:
+    """image_id -> degrees of the judgements that still hold."""
+    if not record or record.get("settings") != _settings(context):
+        return {}
+    images = {i: entry for i, entry in record["images"].items() if i in context.given_poses}
+    return {i: entry["angle_deg"] for i, entry in images.items() if entry["facts"] == _facts(context, i)}
+
+
+def _settings(context: Context) -> str:
+    settings = context.settings
+    parts = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match, settings.filter)
+    return fingerprint(parts, settings.block.max_size_px, settings.seed)
+
+
+def _facts(context: Context, image_id: str) -> str:
+    pose = context.given_poses[image_id]
+    return fingerprint(context.image_fingerprints[image_id], pose.center_m, pose.world_rotation)

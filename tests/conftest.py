@@ -1,0 +1,179 @@
+"""Shared by the tests of whole commands: a small rendered block, and a way to run commands on it."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from aeromatch_cli.cli import app
+from aeromatch_cli.synthetic import render_block
+
+IMAGES, WIDTH, HEIGHT = 5, 320, 240
+# Quick settings: few keypoints, one process.
+QUICK = ("--jobs", "1", "--set", "extract.keypoints=400")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a shell sees of one command. facts: the JSON line of --json, else empty."""
+
+    code: int
+    stdout: str
+    stderr: str
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def counts(self, stage: str) -> tuple[int, int, int]:
+        """(done, skipped, failed) of a stage."""
+        found = self.facts["stages"][stage]
+        return found["done"], found["skipped"], found["failed"]
+
+    def done(self) -> dict[str, int]:
+        """Stage -> what it made now, stages that made nothing left out."""
+        return {name: stage["done"] for name, stage in self.facts["stages"].items() if stage["done"]}
+
+
+def invoke(*arguments: object) -> Outcome:
+    """Run a command in this process; every line of a traceback is a failure of the test."""
+    given = [str(argument) for argument in arguments]
+    result = CliRunner().invoke(app, given)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert "Traceback" not in result.stderr
+    assert "defect" not in result.stderr
+    facts = json.loads(result.stdout.splitlines()[-1]) if "--json" in given else {}
+    if facts:
+        assert facts["exit_code"] == result.exit_code
+    return Outcome(result.exit_code, result.stdout, result.stderr, facts)
+
+
+@dataclass(frozen=True)
+class Site:
+    """A block that a test may change, and a workspace."""
+
+    root: Path
+
+    @property
+    def images(self) -> Path:
+        return self.root / "images"
+
+    @property
+    def poses(self) -> Path:
+        return self.root / "poses.csv"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    def options(self, *more: object) -> list[object]:
+        block = ["--images", self.images, "--poses", self.poses, "--cameras", self.root / "block.json"]
+        return [*block, "--workspace", self.work, *QUICK, *more]
+
+    def __call__(self, command: str, *more: object) -> Outcome:
+        return invoke(command, "baseline", *self.options("--json", *more))
+
+    def names(self) -> list[str]:
+        return sorted(path.name for path in self.images.iterdir())
+
+    def image(self, index: int) -> Path:
+        return self.images / self.names()[index]
+
+    def rewrite_poses(self, change: Callable[[list[dict[str, str]]], Iterable[dict[str, str]]]) -> None:
+        with self.poses.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        changed = list(change(rows))
+        with self.poses.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(changed)
+
+    def failures(self) -> list[tuple[str, str]]:
+        """(stage, item) of failures.csv."""
+        with (self.work / "failures.csv").open(newline="") as stream:
+            return [(row["stage"], row["item"]) for row in csv.DictReader(stream)]
+
+    def another_workspace(self, name: str) -> Path:
+        return self.root / name
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five overlapping images with poses; tests copy it and leave this one alone."""
+    folder = tmp_path_factory.mktemp("rendered")
+    render_block(folder, "town", seed=3, width_px=WIDTH, height_px=HEIGHT, images=IMAGES)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site on which `run` has been through once; tests copy it."""
+    site = _copied(rendered, tmp_path_factory.mktemp("finished"))
+    assert site("run").code == 0
+    return site.root
+
+
+@pytest.fixture
+def site(rendered: Path, tmp_path: Path) -> Site:
+    """A fresh copy of the block, without workspace."""
+    return _copied(rendered, tmp_path)
+
+
+@pytest.fixture
+def done_site(finished: Path, tmp_path: Path) -> Site:
+    """A copy of the block whose workspace is complete."""
+    shutil.copytree(finished, tmp_path / "site")  # modification times come along: images count as unchanged
+    site = Site(tmp_path / "site")
+    assert site("run").done() == {"report": 1}  # config.yaml names the workspace, and that has moved
+    return site
+
+
+def _copied(rendered: Path, folder: Path) -> Site:
+    shutil.copytree(rendered / "images", folder / "images")
+    for name in ("poses.csv", "block.json"):
+        shutil.copy2(rendered / name, folder / name)
+    return Site(folder)
+
+
+# --- comparing workspaces -----------------------------------------------------------------------------------------
+
+# The page tells the time at which it was made.
+_NOT_COMPARED = ("report/index.html", "reports/report.json")
+
+
+def contents(work: Path) -> dict[str, Any]:
+    """Every file of a workspace by relative name, as something that two equal workspaces have in common."""
+    found: dict[str, Any] = {}
+    for path in sorted(work.rglob("*")):
+        name = path.relative_to(work).as_posix()
+        if path.is_file() and name not in _NOT_COMPARED:
+            found[name] = _content(path, work)
+    return found
+
+
+def _content(path: Path, work: Path) -> Any:
+    if path.suffix == ".npz":
+        with np.load(path) as archive:
+            return {name: (archive[name].dtype.str, archive[name].tobytes()) for name in archive.files}
+    if path.suffix == ".db":
+        return _tables(path)
+    text = path.read_bytes().replace(str(work).encode(), b"WORK")
+    if path.parent.name == "reports":
+        report = json.loads(text)
+        # How it came about differs between a run and its resumption; what it is about does not.
+        return {key: report[key] for key in ("stage", "items", "failed", "fingerprint", "failures")}
+    return hashlib.sha256(text).hexdigest()
+
+
+def _tables(path: Path) -> dict[str, list[Any]]:
+    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as database:
+        names = [row[0] for row in database.execute("select name from sqlite_master where type = 'table'")]
+        return {name: sorted(database.execute(f"select * from {name}").fetchall(), key=repr) for name in names}

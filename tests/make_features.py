@@ -1,0 +1,27 @@
+"""Features of the right shapes and types, for tests that store or match them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from aeromatch_cli.data import Features
+
+
+def random_features(count: int, *, seed: int = 0, side_px: int = 5472) -> Features:
+    """Features with `count` keypoints, one descriptor each, spread over a large image."""
+    rng = np.random.default_rng(seed)
+    points = (rng.random((count, 2)) * side_px).astype(np.float32)
+    sizes = rng.uniform(2, 40, count).astype(np.float32)
+    return Features(
+        keypoints_px=points,
+        sizes_px=sizes,
+        responses=rng.random(count).astype(np.float32),
+        descriptors=rng.integers(0, 256, (count, 128), dtype=np.uint8),
+        descriptor_keypoint_idx=np.arange(count, dtype=np.int32),
+        view_idx=np.zeros(count, np.int32),
+        view_keypoints_px=points.copy(),
+        view_size_px=sizes.copy(),
+        view_orientation_deg=rng.uniform(-180, 180, count).astype(np.float32),
+        view_sizes_px=np.array([[side_px, side_px]], np.int32),
+        view_angles_deg=np.zeros(1, np.float32),
+    )
