@@ -233,7 +233,7 @@ def features_fingerprint(path: Path) -> str | None:
     """Fingerprint recorded in a feature file, None when the file is absent or broken."""
     try:
         return str(_load(path, ("fingerprint",))["fingerprint"])
-    except WorkspaceError:
+    except BrokenFileError:
         return None
 
 
@@ -336,9 +336,10 @@ def row_fingerprints(path: Path) -> dict[str, str]:
         return {}
     try:
         arrays = _load(path, ("image_id1", "fingerprint"))
-    except WorkspaceError:
+        with readable(path, *_ARCHIVE_FAULTS):
+            return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
+    except BrokenFileError:
         return {}
-    return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
 
 
 class _Row:

@@ -174,6 +174,6 @@ def _content(path: Path, work: Path) -> Any:
 
 
 def _tables(path: Path) -> dict[str, list[Any]]:
-    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as database:
+    with sqlite3.connect(f"file:{path}?immutable=1", uri=True) as database:
         names = [row[0] for row in database.execute("select name from sqlite_master where type = 'table'")]
         return {name: sorted(database.execute(f"select * from {name}").fetchall(), key=repr) for name in names}

@@ -9,9 +9,403 @@ import pytest
 from make_images import write_image
 from numpy.typing import NDArray
 from PIL import Image as Picture
-from scipy.spatial.transform import Rotation
 
-from aeromatch_cli.data import Camera, Pose, View
+from aeromatch_cli.data import Camera, FloatArray, Pose, View
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.geometry.cameras import undistort
-from aeromatch_cli.geometry.rotations import compose_nadir  # noqa: F401
+from aeromatch_cli.geometry.cameras import distort, normalise, project, undistort
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.geometry.warps import undistorted_from_ground
+from aeromatch_cli.images import (
+    below_horizon,
+    mask_path,
+    read_mask,
+    read_pixels,
+    render_view,
+    sees_sky,
+    shrink,
+    shrink_camera,
+    to_gray8,
+    view_maps,
+    write_png,
+)
+from aeromatch_cli.strategies.simulators.ground import GroundView
+
+PINHOLE = Camera("PINHOLE", 640, 480, (700.0, 700.0, 319.5, 239.5))
+LENS = Camera("OPENCV", 640, 480, (560.0, 555.0, 323.2, 231.1, -0.08, 0.03, 1e-3, -5e-4))
+GROUND_Z = 12.0
+
+
+def pattern(height: int = 30, width: int = 40) -> NDArray[np.uint8]:
+    """No symmetry: turned, mirrored or with other colour order it is another picture."""
+    y, x = np.mgrid[:height, :width]
+    return np.stack([6 * x, 8 * y, 3 * x + 4 * y], axis=2).astype(np.uint8)
+
+
+def encode_jpeg(pixels: NDArray[np.uint8], **options: object) -> bytes:
+    stream = io.BytesIO()
+    Picture.fromarray(pixels).save(stream, format="JPEG", quality=95, subsampling=0, **options)
+    return stream.getvalue()
+
+
+def write_tiff(path: Path, bands: NDArray[np.generic]) -> Path:
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        count, height, width = bands.shape
+        with rasterio.open(
+            path, "w", driver="GTiff", count=count, height=height, width=width, dtype=bands.dtype
+        ) as sink:
+            sink.write(bands)
+    return path
+
+
+# --- reading --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize("colour", [True, False])
+def test_orientation_never_changes_pixels(tmp_path: Path, suffix: str, colour: bool) -> None:
+    found = []
+    for orientation in (1, 3, 6, 8):
+        tags = Picture.Exif()
+        tags[0x0112] = orientation
+        path = tmp_path / f"{orientation}.{suffix}"
+        Picture.fromarray(pattern()).save(path, exif=tags)
+        found.append(read_pixels(path, colour=colour))
+    assert found[0].shape[:2] == (30, 40)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+def test_colours_come_in_rgb_order(tmp_path: Path) -> None:
+    Picture.fromarray(pattern()).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=True), pattern())
+    (tmp_path / "a.jpg").write_bytes(encode_jpeg(np.full((16, 16, 3), (200, 100, 20), np.uint8)))
+    assert np.abs(read_pixels(tmp_path / "a.jpg", colour=True).mean(axis=(0, 1)) - (200, 100, 20)).max() < 2
+    write_tiff(tmp_path / "a.tif", np.moveaxis(pattern(), 2, 0))
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.tif", colour=True), pattern())
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
+def test_gray_is_the_luma_of_the_colours(tmp_path: Path, name: str) -> None:
+    colours = np.full((16, 16, 3), (200, 100, 20), np.uint8)
+    if name.endswith("tif"):
+        write_tiff(tmp_path / name, np.moveaxis(colours, 2, 0))
+    else:
+        Picture.fromarray(colours).save(tmp_path / name, quality=100)
+    gray = read_pixels(tmp_path / name, colour=False)
+    assert (gray.dtype, gray.shape) == (np.uint8, (16, 16))
+    assert abs(float(gray.mean()) - (0.299 * 200 + 0.587 * 100 + 0.114 * 20)) < 1.5
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_16_bits_are_stretched_not_cast(tmp_path: Path, suffix: str) -> None:
+    """A 12-bit ramp 300..1299: percentile 0.5 is 304.995, 99.5 is 1294.005; the value in the middle becomes 127.5."""
+    ramp = np.arange(300, 1300, dtype=np.uint16).reshape(20, 50)
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "tif":
+        write_tiff(path, ramp[None])
+    else:
+        cv2.imwrite(str(path), ramp)
+    gray = read_pixels(path, colour=False)
+    expected = np.clip(np.rint((ramp - 304.995) * 255.0 / (1294.005 - 304.995)), 0, 255)
+    assert np.abs(gray.astype(int) - expected).max() <= 1
+    assert (gray.min(), gray.max()) == (0, 255)
+    assert read_pixels(path, colour=True).dtype == np.uint16
+    np.testing.assert_array_equal(read_pixels(path, colour=True), ramp)
+
+
+def test_stretch_ignores_nodata_and_outliers() -> None:
+    values = np.full((100, 100), 1000.0, np.float32)
+    values[:, 50:] = 2000.0
+    values[0, :40] = 0.0
+    values[1, :3] = (np.nan, np.inf, 1e9)
+    gray = to_gray8(values)
+    assert (gray[50, 10], gray[50, 90]) == (0, 255)
+    assert gray[0, 0] == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.uint32, np.float32, np.float64])
+def test_every_depth_becomes_gray(dtype: type) -> None:
+    colours = pattern().astype(dtype) * 100
+    assert to_gray8(colours).dtype == np.uint8
+    assert to_gray8(np.full((4, 4), 7, dtype)).max() <= 255
+    assert to_gray8(np.zeros((4, 4), dtype)).max() == 0
+
+
+def test_bands_beyond_three_are_left_out(tmp_path: Path) -> None:
+    bands = np.concatenate([np.moveaxis(pattern(), 2, 0), np.full((1, 30, 40), 255, np.uint8)])
+    np.testing.assert_array_equal(read_pixels(write_tiff(tmp_path / "4.tif", bands), colour=True), pattern())
+    two = read_pixels(write_tiff(tmp_path / "2.tif", bands[:2]), colour=True)
+    np.testing.assert_array_equal(two, pattern()[..., 0])
+    Picture.fromarray(np.dstack([pattern(), np.full((30, 40), 9, np.uint8)])).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=True), pattern())
+
+
+def test_gray_files_stay_gray(tmp_path: Path) -> None:
+    gray = pattern()[..., 0]
+    Picture.fromarray(gray).save(tmp_path / "a.png")
+    for colour in (True, False):
+        np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=colour), gray)
+
+
+def test_cut_jpegs_are_refused_wherever_they_are_cut(tmp_path: Path) -> None:
+    """Also with a thumbnail in the header, which has an end marker of its own."""
+    rng = np.random.default_rng(0)
+    thumbnail = encode_jpeg(pattern())
+    noise = rng.integers(0, 256, (200, 200, 3), dtype=np.uint8)
+    whole = encode_jpeg(noise, exif=b"Exif\x00\x00" + thumbnail)
+    assert whole.count(b"\xff\xd9") == 2
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole)
+    assert read_pixels(path, colour=False).shape == (200, 200)
+    for share in (0.3, 0.6, 0.9, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(ItemError, match=r"cut off|cannot decode"):
+            read_pixels(path, colour=False)
+
+
+def test_jpegs_with_data_behind_their_end_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(encode_jpeg(pattern()) + bytes(200_000))
+    assert read_pixels(path, colour=False).shape == (30, 40)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif"])
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff\xe0", b"no picture at all" * 50, None])
+def test_what_is_no_picture_is_an_item_error(tmp_path: Path, name: str, data: bytes | None) -> None:
+    path = tmp_path / name
+    if data is None:
+        path.mkdir()
+    else:
+        path.write_bytes(data)
+    with pytest.raises(ItemError, match=name.replace(".", r"\.")):
+        read_pixels(path, colour=False)
+    with pytest.raises(ItemError, match="gone"):
+        read_pixels(tmp_path / f"gone{path.suffix}", colour=True)
+
+
+def test_a_cut_tiff_is_an_item_error(tmp_path: Path) -> None:
+    path = write_image(tmp_path / "a.tif", (400, 300))
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(ItemError):
+        read_pixels(path, colour=False)
+
+
+@pytest.mark.parametrize("pixels", [pattern(), pattern()[..., 0], pattern().astype(np.uint16) * 257])
+def test_png_round_trip(tmp_path: Path, pixels: NDArray[np.generic]) -> None:
+    with (tmp_path / "a.png").open("wb") as stream:
+        write_png(stream, pixels)
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=True), pixels)
+
+
+# --- masks ----------------------------------------------------------------------------------------------------------
+
+
+def test_mask_names(tmp_path: Path) -> None:
+    for name in ("a/1.jpg.png", "a/2.png", "b/1.jpg.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    masks = str(tmp_path)
+    assert mask_path(masks, "a/1.jpg") == tmp_path / "a/1.jpg.png"
+    assert mask_path(masks, "b/1.jpg") == tmp_path / "b/1.jpg.png"
+    assert mask_path(masks, "a/2.jpg") == tmp_path / "a/2.png"
+    assert mask_path(masks, "1.jpg") is None
+    assert mask_path("", "a/1.jpg") is None
+    one = str(tmp_path / "a/2.png")
+    assert mask_path(one, "a/1.jpg") == mask_path(one, "z.tif") == tmp_path / "a/2.png"
+
+
+def test_masks_of_another_size_are_fitted(tmp_path: Path) -> None:
+    mask = np.zeros((2, 4), np.uint8)
+    mask[0, :2] = 255
+    mask[1, 3] = 1
+    Picture.fromarray(mask).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png", 4, 2), mask > 0)
+    found = read_mask(tmp_path / "m.png", 40, 20)
+    np.testing.assert_array_equal(found, np.kron(mask > 0, np.ones((10, 10), bool)))
+    (tmp_path / "bad.png").write_bytes(b"x")
+    with pytest.raises(ItemError, match="bad"):
+        read_mask(tmp_path / "bad.png", 4, 2)
+
+
+def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:
+    from aeromatch_cli.stages.enhance import _without_nodata
+
+    pixels = np.full((60, 80), 100, np.uint8)
+    pixels[20:30, 20:30] = 0
+    assert _without_nodata(pixels) is None
+    pixels[:, :10] = 0
+    valid = _without_nodata(pixels)
+    assert valid is not None
+    expected = np.ones((60, 80), bool)
+    expected[:, :10] = False
+    np.testing.assert_array_equal(valid, expected)
+
+
+# --- sky ------------------------------------------------------------------------------------------------------------
+
+
+def test_sky_begins_at_the_horizon_row() -> None:
+    """Axis 10 degrees below the horizon: the horizon is f tan 10 deg above the principal point."""
+    attitude = from_omega_phi_kappa(80.0, 0.0, 0.0)
+    horizon = 239.5 - 700.0 * np.tan(np.radians(10.0))  # row 116.07
+    mask = below_horizon(PINHOLE, attitude)
+    assert mask.shape == (480, 640)
+    assert not mask[: int(np.floor(horizon))].any()
+    assert mask[int(np.ceil(horizon)) :].all()
+    pose = Pose(np.zeros(3), attitude, 1.0, 1.0)
+    assert sees_sky(PINHOLE, pose)
+    assert not sees_sky(PINHOLE, Pose(np.zeros(3), from_omega_phi_kappa(60.0, 0.0, 0.0), 1.0, 1.0))
+    assert not sees_sky(PINHOLE, Pose(np.zeros(3), None, 1.0, 1.0))
+    assert not sees_sky(PINHOLE, None)
+
+
+def test_sky_agrees_with_every_single_ray() -> None:
+    attitude = from_omega_phi_kappa(75.0, 12.0, 33.0)
+    rows, columns = np.mgrid[:480:7, :640:7]
+    rays = normalise(LENS, np.stack([columns.ravel(), rows.ravel()], axis=1))
+    up = (np.column_stack([rays, np.ones(len(rays))]) @ attitude)[:, 2]
+    mask = below_horizon(LENS, attitude)[rows.ravel(), columns.ravel()]
+    clear = np.abs(up) > 2e-4  # a fifth of a pixel on either side of the horizon is left to rounding
+    np.testing.assert_array_equal(mask[clear], up[clear] < 0)
+    assert 0.05 < mask.mean() < 0.95
+
+
+# --- shrinking ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "scale"), [(101, 67, 0.5), (100, 66, 0.36550), (640, 427, 0.3), (99, 99, 0.99)]
+)
+def test_shrinking_keeps_half_pixels_exact(width: int, height: int, scale: float) -> None:
+    """A ramp tells for every reduced pixel which source place it shows: (x + 0.5) / scale - 0.5, to the last row."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    small_x, small_y = shrink(x, scale), shrink(y, scale)
+    camera = shrink_camera(Camera("PINHOLE", width, height, (500.0, 500.0, 40.0, 30.0)), scale)
+    assert small_x.shape == (camera.height_px, camera.width_px)
+    # The area filter itself is off by up to 0.04 px; the last pixel may hang over the edge.
+    rows, columns = np.mgrid[: camera.height_px - 1, : camera.width_px - 1]
+    np.testing.assert_allclose(small_x[:-1, :-1], (columns + 0.5) / scale - 0.5, atol=0.04)
+    np.testing.assert_allclose(small_y[:-1, :-1], (rows + 0.5) / scale - 0.5, atol=0.04)
+    np.testing.assert_allclose(camera.params, (500 * scale, 500 * scale, 40.5 * scale - 0.5, 30.5 * scale - 0.5))
+
+
+def test_nothing_is_shrunk_at_full_scale_or_below_one_pixel() -> None:
+    pixels = pattern()
+    assert shrink(pixels, 1.0) is pixels
+    assert shrink_camera(PINHOLE, 1.0) is PINHOLE
+    assert shrink(pixels, 1e-4).shape == (1, 1, 3)
+
+
+# --- views ----------------------------------------------------------------------------------------------------------
+
+
+def texture(xy_m: FloatArray) -> FloatArray:
+    """A smooth ground, gray 28-228; no wave is shorter than 12 m."""
+    x, y = xy_m[..., 0], xy_m[..., 1]
+    return 128 + 50 * np.cos(0.45 * x + 0.15 * y) + 50 * np.sin(-0.2 * x + 0.4 * y + 1.0)
+
+
+def photograph(camera: Camera, pose: Pose) -> NDArray[np.uint8]:
+    """The texture on the plane z = GROUND_Z as the camera sees it, ray by ray."""
+    assert pose.world_rotation is not None
+    rows, columns = np.mgrid[: camera.height_px, : camera.width_px]
+    uv = normalise(camera, np.stack([columns.ravel(), rows.ravel()], axis=1))
+    rays = np.column_stack([uv, np.ones(len(uv))]) @ pose.world_rotation
+    reach = (GROUND_Z - pose.center_m[2]) / rays[:, 2]
+    ground = pose.center_m[:2] + reach[:, None] * rays[:, :2]
+    return np.rint(texture(ground)).astype(np.uint8).reshape(camera.height_px, camera.width_px)
+
+
+def ground_of(camera: Camera, pose: Pose, view: View) -> FloatArray:
+    """World places (H, W, 2) of a view's pixels."""
+    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    world = np.linalg.inv(undistorted_from_ground(camera, pose, GROUND_Z)) @ view.undistorted_from_view
+    points = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    return apply_homography(world / world[2, 2], points).reshape(view.height_px, view.width_px, 2)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, -15.0, 130.0), (40.0, 0.0, -60.0)])
+def test_the_ground_view_shows_the_ground(camera: Camera, angles: tuple[float, float, float]) -> None:
+    pose = Pose(np.array([300.0, 200.0, 112.0]), from_omega_phi_kappa(*angles), 1.0, 1.0)
+    (view,) = GroundView()(camera, pose, GROUND_Z, 0.2)
+    picture, seen = render_view(photograph(camera, pose), None, camera, view)
+    assert seen is not None
+    assert seen.mean() > 0.3
+    truth = texture(ground_of(camera, pose, view))
+    difference = np.abs(picture.astype(float) - truth)[seen]
+    # Rounding twice and linear interpolation between pixels; far ground in a steep view is blurred by its own scale.
+    assert np.median(difference) < 0.6
+    assert np.quantile(difference, 0.99) < 2.5
+    assert not picture[~seen].any()
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS], ids=["pinhole", "lens"])
+def test_view_maps_are_within_a_fiftieth_of_a_pixel(camera: Camera) -> None:
+    pose = Pose(np.array([300.0, 200.0, 112.0]), from_omega_phi_kappa(35.0, -10.0, 60.0), 1.0, 1.0)
+    (view,) = GroundView()(camera, pose, GROUND_Z, 0.15)
+    map_x, map_y = view_maps(camera, view)
+    assert map_x.shape == (view.height_px, view.width_px)
+    rows, columns = np.mgrid[: view.height_px, : view.width_px]
+    points = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    exact = distort(camera, apply_homography(view.undistorted_from_view, points)).reshape(*map_x.shape, 2)
+    inside = (exact >= 0).all(axis=2) & (exact <= (camera.width_px - 1, camera.height_px - 1)).all(axis=2)
+    assert inside.mean() > 0.2
+    assert np.abs(map_x - exact[..., 0])[inside].max() < 0.02
+    assert np.abs(map_y - exact[..., 1])[inside].max() < 0.02
+    # The exact map itself: a ground point lies in the view where the photograph has it.
+    assert pose.world_rotation is not None
+    some = np.column_stack([ground_of(camera, pose, view)[inside][::997], np.full(inside.sum(), GROUND_Z)[::997]])
+    np.testing.assert_allclose(
+        project(camera, pose.world_rotation, pose.center_m, some), exact[inside][::997], atol=1e-6
+    )
+
+
+def test_a_reduced_view_does_not_alias() -> None:
+    """Stripes of one pixel seen at a fifth of the scale are gray, not a moire of black and white."""
+    stripes = np.zeros((480, 640), np.uint8)
+    stripes[:, ::2] = 255
+    view = View("x", 128, 96, np.diag([5.0, 5.0, 1.0]), False, 0.0)
+    picture, _ = render_view(stripes, None, PINHOLE, view)
+    assert np.abs(picture[2:-2, 2:-2].astype(float) - 127.5).max() < 30
+    plain = stripes[::5, ::5]
+    assert plain.std() > 100  # what a view without filter would show
+
+
+def test_a_reduced_view_stays_in_place() -> None:
+    _, x = np.mgrid[:480, :640].astype(np.float32)
+    shift = np.array([[4.0, 0.0, 13.0], [0.0, 4.0, 7.0], [0.0, 0.0, 1.0]])
+    picture, seen = render_view(x, None, PINHOLE, View("x", 150, 110, shift, False, 0.0))
+    columns = np.broadcast_to(np.arange(150), (110, 150))
+    assert seen is not None
+    inner = seen & (columns > 1) & (columns < 148)
+    assert np.abs(picture - (4.0 * columns + 13.0))[inner].max() < 0.05
+
+
+def test_masks_are_warped_with_the_picture() -> None:
+    valid = np.ones((480, 640), bool)
+    valid[:, :320] = False
+    shift = np.array([[1.0, 0.0, 100.0], [0.0, 1.0, 50.0], [0.0, 0.0, 1.0]])
+    _, seen = render_view(np.full((480, 640), 9, np.uint8), valid, PINHOLE, View("x", 600, 400, shift, False, 0.0))
+    assert seen is not None
+    expected = np.zeros((400, 600), bool)
+    expected[:, 220:540] = True
+    np.testing.assert_array_equal(seen, expected)
+
+
+def test_the_source_view_is_the_source() -> None:
+    pixels = pattern()
+    view = View("source", 40, 30, np.eye(3), True, 0.0)
+    assert render_view(pixels, None, PINHOLE, view) == (pixels, None)
+
+
+def test_undistort_is_the_inverse_used_here() -> None:
+    points = np.array([[0.0, 0.0], [639.0, 479.0], [320.0, 10.0]])
+    np.testing.assert_allclose(distort(LENS, undistort(LENS, points)), points, atol=1e-9)

@@ -68,15 +68,16 @@ def test_the_size_is_the_blobs_diameter():
 @pytest.mark.parametrize("budget", [1, 100, 777])
 def test_the_budget_is_exact(budget):
     features = extract(texture(400, 300), keypoints=budget)
-    assert features.keypoints_px.shape == (budget, 2)
-    assert len(features.descriptors) >= budget
-    assert np.array_equal(np.unique(features.descriptor_keypoint_idx), np.arange(budget))
+    assert features.descriptors.shape == (budget, 128)
+    keypoints = len(features.keypoints_px)
+    assert 0.6 * budget <= keypoints <= budget
+    assert np.array_equal(np.unique(features.descriptor_keypoint_idx), np.arange(keypoints))
 
 
 def test_fewer_only_where_fewer_exist():
     gray = texture(200, 150)
     everything = extract(gray, keypoints=10**6)
-    assert len(extract(gray, keypoints=len(everything.keypoints_px) + 1).keypoints_px) == len(everything.keypoints_px)
+    assert len(extract(gray, keypoints=len(everything.descriptors) + 1).descriptors) == len(everything.descriptors)
     assert len(np.unique(everything.keypoints_px, axis=0)) > 0.9 * len(everything.keypoints_px)
 
 
@@ -135,8 +136,11 @@ def test_even_selection_by_hand():
     points = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [11.0, 1.0], [12.0, 2.0]])
     strengths = np.array([5.0, 9.0, 7.0, 1.0, 2.0])
     # Two cells of 10 x 10 px; the first round gives 1 and 4, the second the stronger of 2 and 3.
-    assert even_selection(points, strengths, 20, 10, 2, 1).tolist() == [1, 4]
-    assert even_selection(points, strengths, 20, 10, 3, 2).tolist() == [1, 2, 4]
+    single = np.ones(5, np.int64)
+    assert even_selection(points, strengths, single, (20, 10), 2, 1).tolist() == [1, 4]
+    assert even_selection(points, strengths, single, (20, 10), 3, 2).tolist() == [1, 2, 4]
+    # Point 1 has two descriptors: the budget of three is spent with the first round.
+    assert even_selection(points, strengths, np.array([1, 2, 1, 1, 1]), (20, 10), 3, 2).tolist() == [1, 4]
 
 
 def test_tiles_share_out_every_pixel_once_and_are_bounded():

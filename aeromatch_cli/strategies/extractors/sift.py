@@ -34,8 +34,8 @@ class Sift(Strategy):
     keypoints: int = Field(
         4000,
         ge=1,
-        description="Points per image over all its views: exactly so many, fewer only where fewer exist. "
-        "A point with several orientations counts once.",
+        description="Descriptors per image over all its views: exactly so many, fewer only where fewer exist. "
+        "As in OpenCV and COLMAP, a point with two orientations counts twice.",
     )
     contrast_threshold: float = Field(0.01, gt=0.0, description="Smallest contrast, divided by octave_layers inside.")
     edge_threshold: float = Field(10.0, gt=1.0, description="Largest ratio of the two curvatures.")
@@ -54,10 +54,10 @@ class Sift(Strategy):
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
         points = raw.take(standing)
         strengths = self._strengths(points)
-        chosen = even_selection(
-            points.source_px, strengths, camera.width_px, camera.height_px, self.keypoints, self.per_cell
-        )
-        return _features(raw, keypoint_idx, points.take(chosen), chosen, views)
+        costs = np.bincount(keypoint_idx, minlength=len(standing))
+        size_px = (camera.width_px, camera.height_px)
+        chosen = even_selection(points.source_px, strengths, costs, size_px, self.keypoints, self.per_cell)
+        return _features(raw, keypoint_idx, points.take(chosen), chosen, self.keypoints, views)
 
     def _strengths(self, points: _Raw) -> FloatArray:
         if self.selection == "scale":
@@ -171,14 +171,19 @@ def _in_source(camera: Camera, view: ViewPixels, raw: _Raw) -> _Raw:
 
 
 def _features(
-    raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, views: Sequence[ViewPixels]
+    raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, budget: int, views: Sequence[ViewPixels]
 ) -> Features:
-    """The chosen keypoints and all their descriptors, those of one keypoint side by side."""
+    """The chosen keypoints and their descriptors, those of one keypoint side by side.
+
+    Descriptors beyond the budget are second ones, dropped from the end of the list: no keypoint loses its first.
+    """
     number = np.full(int(keypoint_idx.max(initial=-1)) + 1, -1, np.int64)
     number[chosen] = np.arange(len(chosen))
     numbers = number[keypoint_idx]
     order = np.argsort(numbers, kind="stable")
     order = order[numbers[order] >= 0]
+    further = np.flatnonzero(numbers[order][1:] == numbers[order][:-1]) + 1
+    order = np.delete(order, further[len(further) - max(0, len(order) - budget) :])
     described = raw.take(order)
     return Features(
         keypoints_px=points.source_px.astype(np.float32),
