@@ -116,7 +116,9 @@ class Settings(_Section):
         MATCHERS["nearest"](), description="Which features of two images belong together."
     )
     filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(_chain)] = Field(  # type: ignore[valid-type]
-        (FILTERS["poselib"](),), description="Which matches are kept: a chain, each sees what those before it left."
+        (FILTERS["poselib"](),),
+        min_length=1,  # without a filter no pair is ever verified
+        description="Which matches are kept: a chain, each sees what those before it left.",
     )
     export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(_chain)] = Field(  # type: ignore[valid-type]
         (EXPORTERS["colmap"](),), description="For which programs the result is written: a list."

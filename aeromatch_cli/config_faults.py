@@ -17,6 +17,7 @@ _PHRASES = {
     "model_type": "must hold settings (key: value)",
     "model_attributes_type": "must be a strategy's name, or its settings (key: value)",
     "tuple_type": "must be a list, or names joined by +",
+    "too_short": "must name at least one strategy",
     "string_type": "must be text; put it in quotes",
     "string_too_short": "must not be empty",
     "invalid_key": "keys must be text",

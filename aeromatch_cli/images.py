@@ -5,6 +5,7 @@ The only file that knows OpenCV's BGR and rasterio's band order.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,11 @@ _GRID_STEP_PX = 8
 _GRID_ERROR_PX = 0.015
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
+# A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
+# announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
+_JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
+_JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
+_END_OF_IMAGE = 0xD9
 
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
@@ -54,25 +60,30 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         raise ItemError(f"cannot read image {path}: {error}") from None
     if pixels is None:
         raise ItemError(f"cannot decode image {path}: the file is corrupt or no picture; replace or remove it")
-    if not _is_complete_jpeg(data):
-        raise ItemError(f"image {path} is cut off: its JPEG data ends early; copy it again or remove it")
+    if fault := _jpeg_fault(data):
+        raise ItemError(f"image {path} is {fault}")
     return np.asarray(pixels)
 
 
-def _is_complete_jpeg(data: bytes) -> bool:
-    """A cut JPEG decodes with a gray lower part and no error: the end marker tells. Other formats pass.
+def _jpeg_fault(data: bytes) -> str:
+    """What is wrong with a JPEG's structure, "" for nothing; other formats pass.
 
-    Only a marker behind the header counts (a thumbnail in the header has its own), and it need not be the file's
-    last bytes (some cameras append data).
+    The decoder makes a picture of a cut or overwritten file without an error: gray, or noise, from there on. So the
+    segments are walked here. The end marker must come, though not as the file's last bytes (some cameras append data),
+    and compressed data must hold no marker but restarts. Markers inside segments (a thumbnail) do not count.
     """
     if data[:2] != b"\xff\xd8":
-        return True
+        return ""
     place = 2
-    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
-        # A segment's length counts its own two bytes; 0xff may be repeated as padding.
-        padding = data[place + 1 : place + 2] == b"\xff"
-        place += 1 if padding else 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return data.find(b"\xff\xd9", place) >= 0
+    while found := _JPEG_MARKER.search(data, place):
+        marker, place = found[1][0], found.end()
+        if marker == _END_OF_IMAGE:
+            return ""
+        if marker not in _JPEG_SEGMENTS:
+            return "corrupt: its compressed data is damaged; copy it again or remove it"
+        # A segment's length counts its own two bytes.
+        place += int.from_bytes(data[place : place + 2], "big")
+    return "cut off: its JPEG data ends early; copy it again or remove it"
 
 
 def _read_tiff(path: Path) -> NDArray[Any]:
@@ -240,7 +251,7 @@ def view_maps(camera: Camera, view: View) -> tuple[FloatArray, FloatArray]:
 
 
 def _interpolation_error_px(grid: FloatArray, camera: Camera) -> float:
-    """Largest error of linear interpolation between nodes (R, C, 2) that fall into the raster: second differences / 8."""
+    """Largest error of linear interpolation between nodes (R, C, 2) inside the raster: second differences / 8."""
     with np.errstate(invalid="ignore"):
         inside = ((grid >= -1.0) & (grid <= (camera.width_px, camera.height_px))).all(axis=2)
     bend = np.zeros(grid.shape)

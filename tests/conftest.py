@@ -49,7 +49,7 @@ def invoke(*arguments: object) -> Outcome:
     result = CliRunner().invoke(app, given)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     assert "Traceback" not in result.stderr
-    assert "defect" not in result.stderr
+    assert "this is a defect" not in result.stderr
     facts = json.loads(result.stdout.splitlines()[-1]) if "--json" in given else {}
     if facts:
         assert facts["exit_code"] == result.exit_code

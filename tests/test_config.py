@@ -107,6 +107,8 @@ def test_every_preset_loads(name: str) -> None:
         ("block=3", "block: must hold settings"),
         ("block.images.x=3", "block.images: must be text"),
         ("export=colmap+colmap", "each exporter at most once"),
+        ("filter=none", "filter: must name at least one strategy"),
+        ("filter=[]", "filter: must name at least one strategy"),
         ("a", "write key.sub=value"),
         ("=3", "write key.sub=value"),
         ("extract..keypoints=3", "write key.sub=value"),
@@ -184,7 +186,7 @@ def test_overrides_reach_strategies_and_chains() -> None:
     assert found.filter[0] == FAMILIES["filter"]["pose"]()
     assert found.block.sigma_angle_deg == 1.0
     assert load("baseline", ["filter=[pose, {name: poselib, min_inliers: 20}]"]).filter[1].min_inliers == 20
-    assert load("baseline", ["filter=none"]).filter == ()
+    assert load("baseline", ["export=none"]).export == ()
 
 
 @pytest.mark.parametrize("switch", ["match=lightglue", "match.name=lightglue", "match={name: lightglue}"])

@@ -105,9 +105,7 @@ def kept_pairs(before: dict[tuple[str, str], str], after: dict[tuple[str, str], 
 
 def test_a_setting_of_pairs_keeps_the_matches_of_pairs_that_stay(done_site):
     before = pair_prints(done_site)
-    overlaps = sorted(
-        float(line.split(",")[2]) for line in (done_site.work / "pairs.csv").read_text().splitlines()[1:]
-    )
+    overlaps = sorted(float(line.split(",")[2]) for line in (done_site.work / "pairs.csv").read_text().splitlines()[1:])
     limit = (overlaps[2] + overlaps[3]) / 2
     fewer = done_site("run", "--set", f"pairs.min_overlap={limit}", "--set", "pairs.fallback_neighbours=1")
     assert fewer.counts("pairs")[0] == PAIRS - 3

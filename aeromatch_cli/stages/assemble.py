@@ -39,6 +39,8 @@ log = logging.getLogger("aeromatch")
 _GROUND_SEEDS = 5
 _GROUND_SIZE_PX = 1200
 _GROUND_KEYPOINTS = 2000
+# A height that could not be found is not looked for again before the images, poses or settings change.
+_UNKNOWN = "unknown"
 # What was fixed holds until it is off by this share of the ground sampling distance, or of the flying height.
 _GSD_TOLERANCE = 0.1
 _GROUND_TOLERANCE = 0.05
@@ -69,9 +71,11 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
     same = all(basis.get(image_id) == value for image_id, value in before.get("basis", {}).items())
     warnings = [*inputs.warnings, *_mask_warnings(settings, inputs.images)]
     ground, source = _stored_ground(before) if kept and same else (None, "")
-    if ground is None:
+    if ground is None and not source.startswith(_UNKNOWN):
         ground, source, remarks = _resolve_ground(settings, inputs, executor)
         warnings += remarks
+    if source.startswith(_UNKNOWN) and inputs.poses:
+        warnings.append(f"the ground height is {source}; no ground views, no overlap; give --ground METRES or a DEM")
     if kept and not same:
         ground, source = _nearly_stored(before, ground, source, inputs)
     block = Block(
@@ -213,10 +217,7 @@ def _resolve_ground(
         return ConstantGround(estimate_z_m), reason, ()
     if inputs.ground_hint_z_m is not None:
         return ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source, ()
-    if not inputs.poses:
-        return None, "unknown: no poses", ()
-    remark = f"the ground height is unknown ({reason}): no ground views, no overlap; give --ground METRES or a DEM"
-    return None, "unknown", (remark,)
+    return None, f"{_UNKNOWN}: {reason if inputs.poses else 'no poses'}", ()
 
 
 @dataclass(frozen=True, eq=False)

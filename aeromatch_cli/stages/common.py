@@ -236,9 +236,12 @@ def forget_absent(context: Context) -> None:
 
 
 def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[tuple[str, str]]:
-    """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes, unless their images or
-    they themselves are known to have failed before."""
-    failed = {item for stage, item, _ in gather_failures(context.workspace) if stage in ITEM_STAGES}
+    """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes.
+
+    Pairs that have failed there or before, themselves or by one of their images, are explained already.
+    """
+    before = ITEM_STAGES[: ITEM_STAGES.index(command) + 1]
+    failed = {item for stage, item, _ in gather_failures(context.workspace) if stage in before}
     rows: dict[str, int] = {}
     for pair in pairs:
         if failed.isdisjoint((pair.image_id0, pair.image_id1, f"{pair.image_id0} {pair.image_id1}")):

@@ -14,7 +14,7 @@ from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
 from aeromatch_cli.stages.common import Context, Shard, StageReport, gather_failures, owner
 from aeromatch_cli.stages.distrust import without_distrusted
-from aeromatch_cli.workspace import read_json, translated_os_errors
+from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
 
@@ -55,19 +55,30 @@ def execute(
     part = Shard.parse(shard) if shard else None
     if part and command not in (*SHARDED, "run", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
-    with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
-        repaired: set[str] = set()
-        while True:
-            try:
-                return _attempt(command, settings, executor, part, overwrite)
-            except BrokenFileError as error:
-                if command == "check" or error.path in repaired:
-                    raise
-                repaired.add(error.path)
-                overwrite = False  # what this command has done already is up to date
-                log.warning("warning: %s was damaged (%s): it is made again", error.path, error.reason)
-                with translated_os_errors(Path(error.path)):
-                    Path(error.path).unlink(missing_ok=True)
+    try:
+        with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
+            return _repairing(command, settings, executor, part, overwrite)
+    except BaseException:
+        # Workers are stopped in the middle of what they write.
+        if command != "check":
+            remove_stale_temporaries(Path(settings.workspace))
+        raise
+
+
+def _repairing(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
+    """Attempts until no damaged file is met; each one is deleted, so that the next attempt makes it again."""
+    repaired: set[str] = set()
+    while True:
+        try:
+            return _attempt(command, settings, executor, part, overwrite)
+        except BrokenFileError as error:
+            if command == "check" or error.path in repaired:
+                raise
+            repaired.add(error.path)
+            overwrite = False  # what this command has done already is up to date
+            log.warning("warning: %s was damaged (%s): it is made again", error.path, error.reason)
+            with translated_os_errors(Path(error.path)):
+                Path(error.path).unlink(missing_ok=True)
 
 
 def _attempt(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
@@ -76,8 +87,7 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
         return _check(context, first)
     reports = [first]
     if command == "run":
-        done, context = _run_all(context)
-        reports += done
+        reports, context = _run_all(context, first)
     elif command == "match":
         features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
@@ -91,7 +101,7 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
     return _result(command, context, reports)
 
 
-def _run_all(context: Context) -> tuple[list[StageReport], Context]:
+def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], Context]:
     """extract, match, filter, and again for images whose attitude turns out wrong; then export and report."""
     reports: list[StageReport] = []
     for _ in range(_MAX_PASSES):
@@ -100,7 +110,8 @@ def _run_all(context: Context) -> tuple[list[StageReport], Context]:
         if context.shard is not None or _attitudes(trusted) == _attitudes(context):
             break
         log.info("attitudes of some images contradict the pictures; these images are done again without")
-        context, _ = pairs.prepare(context.settings, context.executor, shard=context.shard)
+        context, first = pairs.prepare(context.settings, context.executor, shard=context.shard)
+    reports = [first, *reports]
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
             reports.append(report.run(context))

@@ -49,6 +49,7 @@ class Sift(Strategy):
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
+        # Detect, select, describe: describing every point of a forest costs more than detecting it.
         found = [_in_source(camera, view, self._detect(view, index)) for index, view in enumerate(views)]
         raw = _concatenate(found)
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
@@ -57,7 +58,9 @@ class Sift(Strategy):
         costs = np.bincount(keypoint_idx, minlength=len(standing))
         size_px = (camera.width_px, camera.height_px)
         chosen = even_selection(points.source_px, strengths, costs, size_px, self.keypoints, self.per_cell)
-        return _features(raw, keypoint_idx, points.take(chosen), chosen, self.keypoints, views)
+        described, numbers = _within_budget(raw, keypoint_idx, chosen, self.keypoints)
+        descriptors = self._describe(described, views)
+        return _features(points.take(chosen), described, numbers, descriptors, views)
 
     def _strengths(self, points: _Raw) -> FloatArray:
         if self.selection == "scale":
@@ -66,10 +69,10 @@ class Sift(Strategy):
             return points.responses
         return points.responses * points.source_sizes_px**2
 
-    def _detect(self, view: ViewPixels, view_idx: int) -> _Raw:
+    def _detector(self) -> Any:
         import cv2
 
-        detector = cv2.SIFT.create(
+        return cv2.SIFT.create(
             nfeatures=0,
             nOctaveLayers=self.octave_layers,
             contrastThreshold=self.contrast_threshold,
@@ -78,17 +81,28 @@ class Sift(Strategy):
             descriptorType=cv2.CV_8U,
             enable_precise_upscale=True,  # without it every keypoint is off by a quarter pixel
         )
-        height, width = view.gray.shape
-        parts = [
-            _detect_tile(detector, view, tile, view_idx)
-            for tile in tiles(width, height, _TILE_AREA_PX, _TILE_MARGIN_PX)
-        ]
+
+    def _detect(self, view: ViewPixels, view_idx: int) -> _Raw:
+        detector = self._detector()
+        parts = [_detect_tile(detector, view, tile, view_idx) for tile in _tiles(view)]
         return _away_from_mask(_concatenate(parts), view.valid)
+
+    def _describe(self, raw: _Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
+        """RootSIFT bytes (N, 128) of the features, each from the tile that found it."""
+        detector = self._detector()
+        descriptors = np.zeros((len(raw.view_idx), _DESCRIPTOR_LENGTH), np.uint8)
+        for view_idx, view in enumerate(views):
+            of_view = np.flatnonzero(raw.view_idx == view_idx)
+            for tile in _tiles(view):
+                owned = of_view[tile.owns(raw.points_px[of_view])]
+                if len(owned):
+                    descriptors[owned] = root_sift(_describe_tile(detector, view, tile, raw.take(owned)))
+        return descriptors
 
 
 @dataclass(frozen=True, eq=False)
 class _Raw:
-    """N described features: source_px (N, 2) float64, the rest as in data.Features."""
+    """N detected features: source_px (N, 2) float64, octaves (N,) OpenCV's packed octave, the rest as in Features."""
 
     source_px: FloatArray
     source_sizes_px: FloatArray
@@ -96,7 +110,7 @@ class _Raw:
     sizes_px: FloatArray
     orientations_deg: FloatArray
     responses: FloatArray
-    descriptors: NDArray[Any]
+    octaves: IntArray
     view_idx: IntArray
 
     def take(self, which: IntArray | BoolArray) -> _Raw:
@@ -110,14 +124,13 @@ def _concatenate(parts: list[_Raw]) -> _Raw:
 def _detect_tile(detector: Any, view: ViewPixels, tile: Tile, view_idx: int) -> _Raw:
     window = (slice(tile.y0, tile.y1), slice(tile.x0, tile.x1))
     seen = view.valid is None or bool(view.valid[window].any())
-    keypoints, descriptors = detector.detectAndCompute(view.gray[window], None) if seen else ((), None)
-    if descriptors is None:
-        descriptors = np.zeros((0, _DESCRIPTOR_LENGTH), np.uint8)
-    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
+    keypoints = detector.detect(view.gray[window], None) if seen else ()
+    table = np.array([(*k.pt, k.size, k.angle, k.response, k.octave) for k in keypoints], np.float64).reshape(-1, 6)
     points = (table[:, :2] + [tile.x0, tile.y0]).astype(np.float32)
     # A fixed order, whatever the detector's: by place, then size; orientations of a point stay side by side.
     order = np.lexsort((table[:, 3], table[:, 2], points[:, 0], points[:, 1]))
     order = order[tile.owns(points[order])]
+    octaves = table[order, 5].astype(np.int32)
     table = table[order].astype(np.float32)
     return _Raw(
         source_px=points[order].astype(np.float64),
@@ -126,9 +139,28 @@ def _detect_tile(detector: Any, view: ViewPixels, tile: Tile, view_idx: int) -> 
         sizes_px=table[:, 2],
         orientations_deg=table[:, 3],
         responses=table[:, 4],
-        descriptors=descriptors[order],
+        octaves=octaves,
         view_idx=np.full(len(order), view_idx, np.int32),
     )
+
+
+def _describe_tile(detector: Any, view: ViewPixels, tile: Tile, raw: _Raw) -> NDArray[np.uint8]:
+    """SIFT bytes (N, 128) of features of one tile, in their order."""
+    import cv2
+
+    window = view.gray[tile.y0 : tile.y1, tile.x0 : tile.x1]
+    places = raw.points_px - np.array([tile.x0, tile.y0], np.float32)
+    rows = zip(places.tolist(), raw.sizes_px, raw.orientations_deg, raw.responses, raw.octaves, strict=True)
+    keypoints = [cv2.KeyPoint(x, y, float(s), float(a), float(r), int(o)) for (x, y), s, a, r, o in rows]
+    kept, descriptors = detector.compute(window, keypoints)
+    if len(kept) != len(keypoints):
+        raise RuntimeError(f"OpenCV described {len(kept)} of {len(keypoints)} keypoints")
+    return np.asarray(descriptors, dtype=np.uint8)
+
+
+def _tiles(view: ViewPixels) -> list[Tile]:
+    height, width = view.gray.shape
+    return list(tiles(width, height, _TILE_AREA_PX, _TILE_MARGIN_PX))
 
 
 def root_sift(descriptors: NDArray[Any]) -> NDArray[np.uint8]:
@@ -170,12 +202,10 @@ def _in_source(camera: Camera, view: ViewPixels, raw: _Raw) -> _Raw:
     return moved.take(inside)
 
 
-def _features(
-    raw: _Raw, keypoint_idx: IntArray, points: _Raw, chosen: IntArray, budget: int, views: Sequence[ViewPixels]
-) -> Features:
-    """The chosen keypoints and their descriptors, those of one keypoint side by side.
+def _within_budget(raw: _Raw, keypoint_idx: IntArray, chosen: IntArray, budget: int) -> tuple[_Raw, IntArray]:
+    """Features (D,) of the chosen keypoints, those of one keypoint side by side, and the keypoint of each.
 
-    Descriptors beyond the budget are second ones, dropped from the end of the list: no keypoint loses its first.
+    What exceeds the budget are second features, dropped from the end of the list: no keypoint loses its first.
     """
     number = np.full(int(keypoint_idx.max(initial=-1)) + 1, -1, np.int64)
     number[chosen] = np.arange(len(chosen))
@@ -184,13 +214,18 @@ def _features(
     order = order[numbers[order] >= 0]
     further = np.flatnonzero(numbers[order][1:] == numbers[order][:-1]) + 1
     order = np.delete(order, further[len(further) - max(0, len(order) - budget) :])
-    described = raw.take(order)
+    return raw.take(order), numbers[order].astype(np.int32)
+
+
+def _features(
+    points: _Raw, described: _Raw, numbers: IntArray, descriptors: NDArray[np.uint8], views: Sequence[ViewPixels]
+) -> Features:
     return Features(
         keypoints_px=points.source_px.astype(np.float32),
         sizes_px=points.source_sizes_px,
         responses=points.responses,
-        descriptors=root_sift(described.descriptors),
-        descriptor_keypoint_idx=numbers[order].astype(np.int32),
+        descriptors=descriptors,
+        descriptor_keypoint_idx=numbers,
         view_idx=described.view_idx,
         view_keypoints_px=described.points_px,
         view_size_px=described.sizes_px,

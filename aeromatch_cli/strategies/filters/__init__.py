@@ -6,4 +6,4 @@ from aeromatch_cli.strategies.filters.chain import apply_chain as apply_chain
 from aeromatch_cli.strategies.filters.pose import PoseBand
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
-FILTERS = {"poselib": Poselib, "pose": PoseBand}
+FILTERS: dict[str, type[Poselib] | type[PoseBand]] = {"poselib": Poselib, "pose": PoseBand}

@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
+from aeromatch_cli.executor import Executor, Outcome, available_cores
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to do with a number: square | fail | defect | memory | disk | die | die-once."""
+
+    number: int
+    action: str = "square"
+    marks: str = ""
+
+
+def work(task: Task) -> int:
+    if task.marks:
+        with Path(task.marks, str(task.number)).open("a") as stream:
+            stream.write("x")
+    if task.action == "fail":
+        raise ItemError(f"image {task.number} is corrupt")
+    if task.action == "defect":
+        raise IndexError("an unforeseen thing")
+    if task.action == "memory":
+        raise MemoryError
+    if task.action == "disk":
+        raise WorkspaceError("disk full")
+    if task.action == "die" or (task.action == "die-once" and len(Path(task.marks, str(task.number)).read_text()) == 1):
+        os._exit(1)
+    time.sleep(0.002 * (task.number % 3))
+    return task.number**2
+
+
+def threads(_: int) -> tuple[int, str]:
+    import cv2
+
+    return cv2.getNumThreads(), os.environ.get("OMP_NUM_THREADS", "")
+
+
+@dataclass
+class Counter:
+    """A progress that remembers what it was told."""
+
+    told: list[str] = field(default_factory=list)
+
+    def start(self, label: str, total: int) -> None:
+        self.told.append(f"{label} {total}")
+
+    def advance(self) -> None:
+        self.told.append("+")
+
+    def stop(self) -> None:
+        self.told.append("end")
+
+
+@pytest.fixture(scope="module")
+def pool():
+    """One pool of two workers for all tests that leave it alive."""
+    with Executor("processes", 2) as executor:
+        yield executor
+
+
+def test_results_come_in_task_order_whatever_the_executor(pool: Executor) -> None:
+    tasks = [Task(number) for number in range(20)]
+    serial = Executor("serial").run(work, tasks, "x")
+    assert serial == pool.run(work, tasks, "x") == [Outcome(number**2) for number in range(20)]
+
+
+def test_one_failing_task_leaves_the_others(pool: Executor) -> None:
+    tasks = [Task(1), Task(2, "fail"), Task(3, "defect"), Task(4, "memory"), Task(5)]
+    for executor in (Executor("serial"), pool):
+        found = executor.run(work, tasks, "x")
+        assert [one.value for one in found] == [1, None, None, None, 25]
+        assert found[1].error == "image 2 is corrupt"
+        assert found[2].error.startswith("unexpected IndexError at test_executor.py:")
+        assert found[2].error.endswith("an unforeseen thing")
+        assert "out of memory" in found[3].error
+
+
+def test_a_worker_that_dies_is_blamed_and_the_rest_is_done(tmp_path: Path) -> None:
+    tasks = [Task(number, "die" if number in (3, 9) else "square", str(tmp_path)) for number in range(12)]
+    progress = Counter()
+    with Executor("processes", 2, progress) as executor:
+        found = executor.run(work, tasks, "extract")
+        again = executor.run(work, [Task(1), Task(2)], "match")
+    assert [one.value for one in found] == [None if number in (3, 9) else number**2 for number in range(12)]
+    for number in (3, 9):
+        assert "worker process died" in found[number].error
+        assert len((tmp_path / str(number)).read_text()) == 2  # in flight with others, then alone
+    assert [one.value for one in again] == [1, 4]
+    assert progress.told.count("+") == 14
+    assert progress.told[0] == "extract 12"
+    assert progress.told[-1] == "end"
+
+
+def test_a_task_that_dies_once_is_done_in_the_end(tmp_path: Path) -> None:
+    tasks = [Task(number, "die-once" if number == 2 else "square", str(tmp_path)) for number in range(5)]
+    with Executor("processes", 2) as executor:
+        assert [one.value for one in executor.run(work, tasks, "x")] == [0, 1, 4, 9, 16]
+
+
+@pytest.mark.parametrize("kind", ["serial", "processes"])
+def test_a_full_disk_stops_everything(tmp_path: Path, kind: str) -> None:
+    tasks = [Task(0, "disk"), *(Task(number, marks=str(tmp_path)) for number in range(1, 400))]
+    with pytest.raises(WorkspaceError, match="disk full"), Executor(kind, 2) as executor:
+        executor.run(work, tasks, "x")
+    assert len(list(tmp_path.iterdir())) < 100
+
+
+def test_workers_use_one_thread(pool: Executor) -> None:
+    before = os.environ.get("OMP_NUM_THREADS")
+    assert {one.value for one in pool.run(threads, range(4), "x")} == {(1, "1")}
+    assert os.environ.get("OMP_NUM_THREADS") == before
+
+
+def test_no_tasks_are_no_work(pool: Executor) -> None:
+    assert Executor("serial").run(work, [], "x") == pool.run(work, [], "x") == []
+
+
+def test_dask_without_the_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match="cluster"):
+        Executor("dask").run(work, [Task(1)], "x")
+
+
+def test_cores_are_those_of_this_process() -> None:
+    assert 1 <= available_cores() <= (os.cpu_count() or 1)
+
+
+SCRIPT = """
+import os, sys, time
+from pathlib import Path
+from aeromatch_cli.executor import Executor
+def slow(folder):
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(60)
+{guard}
+    with Executor("processes", 2) as executor:
+        executor.run(slow, [sys.argv[1]] * 4, "x")
+"""
+
+
+def _alive(pid: int) -> bool:
+    """Running, and no zombie that nobody has waited for."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_ctrl_c_leaves_no_worker_behind(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(SCRIPT.format(guard="if __name__ == '__main__':"))
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    process = subprocess.Popen([sys.executable, str(script), str(marks)], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 20
+    while len(list(marks.iterdir())) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    workers = [int(path.name) for path in marks.iterdir()]
+    assert len(workers) == 2
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=10)
+    assert process.returncode != 0
+    assert "KeyboardInterrupt" in messages
+    deadline = time.monotonic() + 5
+    while any(map(_alive, workers)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(_alive, workers))
+
+
+def test_workers_that_cannot_start_are_an_error_and_no_endless_loop(tmp_path: Path) -> None:
+    """A script without main guard is run again by every worker, which multiprocessing refuses."""
+    script = tmp_path / "run.py"
+    script.write_text(SCRIPT.format(guard="if True:"))
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path)], capture_output=True, text=True, timeout=30, check=False
+    )
+    assert done.returncode != 0
+    assert "use --executor serial" in done.stderr

@@ -1,0 +1,77 @@
+"""Start-up: parsing a command line imports nothing heavy, and help answers at once."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+HEAVY = {
+    *("cv2", "torch", "kornia", "scipy", "matplotlib", "rasterio", "pyproj", "shapely", "poselib", "pycolmap", "PIL"),
+    *("jinja2", "embreex", "safetensors", "distributed"),
+}
+
+
+def imported_by(statement: str) -> set[str]:
+    code = f"import sys\n{statement}\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in done.stdout.split()}
+
+
+def test_the_command_line_imports_nothing_heavy() -> None:
+    found = imported_by("import aeromatch_cli.cli")
+    assert not found & {*HEAVY, "numpy", "pydantic", "yaml", "rich"}
+
+
+def test_configuration_and_stages_import_nothing_heavy() -> None:
+    """Reading a configuration, and refusing a wrong one, costs numpy and pydantic only."""
+    assert not imported_by("from aeromatch_cli.config import load; load('baseline')") & HEAVY
+    assert not imported_by("import aeromatch_cli.stages.run") & HEAVY
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["run", "--help"]])
+def test_help_answers_in_half_a_second(arguments: list[str]) -> None:
+    """Best of several: the machine may be busy. Through the installed script where there is one."""
+    script = Path(sys.executable).with_name("aeromatch")
+    command = [str(script)] if script.exists() else [sys.executable, "-m", "aeromatch_cli.cli"]
+    seconds = []
+    for _ in range(5):
+        started = time.perf_counter()
+        done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+        seconds.append(time.perf_counter() - started)
+        assert done.returncode == 0
+        assert done.stdout.strip()
+        if len(seconds) >= 3 and min(seconds) < 0.5:
+            break
+    assert min(seconds) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["run", "baselin"], "did you mean 'baseline'?"),
+        (["run", "nowhere.yaml"], "cannot read configuration nowhere.yaml"),
+        (["pairs", "baseline", "--set", "extract.keypointz=1"], "extract.keypointz: unknown key; did you mean"),
+        (["check", "baseline", "--set", "nonsense"], "write key.sub=value"),
+        (["run", "baseline", "--executor", "threads"], "run.executor: must be 'serial', 'processes' or 'dask'"),
+        (["run", "baseline", "--set", "pairs=file", "--set", "pairs.path=gone.txt", "--images", "."], "gone.txt"),
+    ],
+)
+def test_wrong_configurations_leave_with_code_2_and_no_traceback(
+    tmp_path: Path, arguments: list[str], expected: str
+) -> None:
+    from make_images import write_image
+
+    write_image(tmp_path / "a.jpg")
+    write_image(tmp_path / "b.jpg")
+    command = [sys.executable, "-m", "aeromatch_cli.cli", *arguments]
+    if arguments[0] != "check":
+        command += ["--workspace", str(tmp_path / "work")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
