@@ -11,6 +11,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -71,7 +72,16 @@ def single_threaded() -> None:
 def _worker_start() -> None:
     # Ctrl-C is the parent's to handle: workers would only print tracebacks.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A parent that is killed can tell no one: its workers would wait for tasks for ever.
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
     single_threaded()
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextlib.contextmanager
@@ -138,12 +148,15 @@ class Executor:
     def close(self, *, cancel: bool = False) -> None:
         if self._pool is not None:
             workers = list((getattr(self._pool, "_processes", None) or {}).values())
+            manager = getattr(self._pool, "_executor_manager_thread", None)
             self._pool.shutdown(wait=not cancel, cancel_futures=True)
             if cancel:
                 for worker in workers:
                     worker.terminate()
                 for worker in workers:
                     worker.join(timeout=5.0)
+                if manager is not None:  # else it closes its pipe while the interpreter's exit writes to it
+                    manager.join(timeout=5.0)
             self._pool = None
         if self._client is not None:
             self._client.close()

@@ -190,10 +190,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def remove_stale_temporaries(root: Path) -> None:
     """Delete what a killed process of this machine left behind; files of live processes stay."""
-    for path in root.rglob(".*.tmp"):
+    # os.walk passes over folders that another process removes meanwhile; Path.rglob raises.
+    names = (Path(parent) / name for parent, _, files in os.walk(root) for name in files if name.endswith(".tmp"))
+    for path in names:
         parts = path.name.rsplit(".", 4)
         # In a container a restarted run has the process id of the killed one: no file of its own exists yet.
-        ours = len(parts) == 5 and parts[1] == _host() and parts[2].isdigit()
+        ours = len(parts) == 5 and path.name.startswith(".") and parts[1] == _host() and parts[2].isdigit()
         if ours and (int(parts[2]) == os.getpid() or not _alive(int(parts[2]))):
             with contextlib.suppress(OSError):
                 path.unlink()

@@ -138,7 +138,8 @@ def test_unreadable_folder_and_subfolder(site, monkeypatch):
     walk = os.walk
 
     def refusing(top, onerror=None, **options):
-        onerror(PermissionError(errno.EACCES, "Permission denied", str(Path(top) / "closed")))
+        if onerror:
+            onerror(PermissionError(errno.EACCES, "Permission denied", str(Path(top) / "closed")))
         return walk(top, onerror=onerror, **options)
 
     monkeypatch.setattr(scan.os, "walk", refusing)

@@ -170,6 +170,28 @@ def test_an_edited_pose_redoes_one_image(done_site):
     assert outcome.counts("match") == (IMAGES - 1, PAIRS - IMAGES + 1, 0)
 
 
+def test_a_distrusted_attitude_stays_distrusted_until_it_changes(done_site):
+    def turn(rows):
+        return [{**row, "kappa_deg": str((float(row["kappa_deg"]) + 360) % 360 - 180)} if i == 1 else row
+                for i, row in enumerate(rows)]  # fmt: skip
+
+    image_id = done_site.names()[1].replace(".", "_")
+    done_site.rewrite_poses(turn)
+    outcome = done_site("run")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["filter"]["facts"]["rotation_contradicts_pose"] == {
+        image_id: pytest.approx(180, abs=8)
+    }
+    assert outcome.facts["stages"]["pairs"]["facts"]["distrusted"] == [image_id]
+    assert done_site("run").done() == {}
+    os.utime(done_site.image(3), (1_700_000_000, 1_700_000_000))  # another image changes: the judgement stands
+    assert done_site("run").counts("extract") == (1, IMAGES - 1, 0)
+    done_site.rewrite_poses(turn)
+    outcome = done_site("run")
+    assert outcome.facts["stages"]["filter"]["facts"]["rotation_contradicts_pose"] == {}
+    assert outcome.counts("extract") == (1, IMAGES - 1, 0)
+
+
 def test_replaced_masks_redo_the_images_that_they_mask(done_site):
     import cv2
 
@@ -273,7 +295,7 @@ def wait_for_files(process: subprocess.Popen[str], work: Path, count: int) -> No
     """Until the workspace holds `count` files, or the process has ended by itself."""
     deadline = time.monotonic() + 60
     while process.poll() is None and time.monotonic() < deadline:
-        if sum(1 for path in work.rglob("*") if path.is_file()) >= count:
+        if sum(len(files) for _, _, files in os.walk(work)) >= count:
             return
         time.sleep(0.002)
 
@@ -316,6 +338,40 @@ def living(group: int) -> list[str]:
     return found
 
 
+def nothing_lives(group: int) -> bool:
+    deadline = time.monotonic() + 10
+    while living(group) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not living(group)
+
+
+def test_workers_do_not_outlive_a_killed_parent(done_site):
+    work = done_site.root / "orphans"
+    process = start(done_site, work)
+    wait_for_files(process, work, 10)
+    process.kill()
+    process.communicate(timeout=30)  # ends when the last worker has closed the pipes
+    assert nothing_lives(process.pid)
+
+
+def test_sigterm_is_heard_while_pycolmap_is_loaded():
+    """Importing pycolmap installs a handler of its own."""
+    code = (
+        "import os, signal\n"
+        "from aeromatch_cli.cli import _terminated_like_interrupt\n"
+        "from aeromatch_cli.strategies.exporters.colmap import _import_pycolmap\n"
+        "with _terminated_like_interrupt():\n"
+        "    _import_pycolmap()\n"
+        "    try:\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "        signal.pause()\n"
+        "    except KeyboardInterrupt:\n"
+        "        print('heard')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "heard\n", done.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_leaves_with_130_and_resumes(done_site, number):
     work = done_site.root / "stopped"
@@ -328,9 +384,6 @@ def test_interrupted_run_leaves_with_130_and_resumes(done_site, number):
     assert "run the same command again" in stderr
     assert "Traceback" not in stderr
     assert stdout.splitlines()[-1].endswith('"exit_code": 130}')
-    deadline = time.monotonic() + 10
-    while living(process.pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert living(process.pid) == []  # no worker is left behind
+    assert nothing_lives(process.pid)  # no worker is left behind
     assert done_site("run", "--workspace", work).code == 0
     same(work, done_site.work)

@@ -51,7 +51,8 @@ class BlockInputs:
     images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose in the world (crs - origin_m);
     images without position are absent. ground_hint_z_m: world height of the ground as the input states it, or None;
     ground_hint_source: where it came from, in words, "" for None; ground_is_stated: the user's camera file says so,
-    rather than a barometer. guessed_cameras: camera ids whose focal length is a guess. warnings: for a person, in order of reading.
+    rather than a barometer. guessed_cameras: camera ids whose focal length is a guess. warnings: for a person, in
+    order of reading.
     """
 
     images: tuple[Image, ...]

@@ -25,8 +25,8 @@ from aeromatch_cli.formats import (
 )
 from aeromatch_cli.stages import distrust, extract, match
 from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
-from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters import apply_chain
+from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
 
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
@@ -52,7 +52,7 @@ class FilterTask:
 
     image_id0: str
     pairs: tuple[PairTask, ...]
-    chain: tuple[Strategy, ...]
+    chain: tuple[Filter, ...]
     workspace: Workspace
     overwrite: bool
 

@@ -9,6 +9,8 @@ world.json.
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,8 +124,12 @@ class _Ids:
 def _import_pycolmap() -> ModuleType:
     # pycolmap 4.2.1 aborts the process when its own zlib is initialised before Python's.
     zlib.compress(b"")
+    # Importing it replaces the handler of SIGTERM by one that prints a stack and dies: no clean-up, no resume message.
+    before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     return pycolmap
 
 
