@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.rotations import rotation_z
-from aeromatch_cli.stages.rotations import LARGEST_DIFFERENCE_DEG, contradicting_images
+from aeromatch_cli.stages.rotations import LARGEST_DIFFERENCE_DEG, LEAST_MATCHES, contradicting_images
 
 RelativeRotation = tuple[str, str, FloatArray, int]
 
@@ -140,3 +140,10 @@ def test_order_of_pairs_does_not_matter() -> None:
     given = poses(turned(truth, ["i01", "i02"]))
     shuffled = [pairs[index] for index in np.random.default_rng(3).permutation(len(pairs))]
     assert contradicting_images(given, pairs) == contradicting_images(given, shuffled)
+
+
+def test_few_matches_accuse_nobody() -> None:
+    truth = attitudes(NAMES)
+    given = poses(turned(truth, ["i07"]))
+    assert contradicting_images(given, measured(truth, strip(NAMES), matches=LEAST_MATCHES - 1)) == {}
+    assert list(contradicting_images(given, measured(truth, strip(NAMES), matches=LEAST_MATCHES))) == ["i07"]

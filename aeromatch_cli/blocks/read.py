@@ -104,9 +104,8 @@ def read_block_inputs(
     camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
     names, scan_failures = scan_images(images_dir, exclude)
     warnings, failures = _report_scan(scan_failures)
-    outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
-    failures += [ReadFailure(name, STAGE, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
-    facts = {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}
+    facts, unreadable = _read_headers(images_dir, names, read_facts)
+    failures += unreadable
     rows: dict[str, PoseRow] = {}
     if pose_list is not None:
         rows, remarks = _matched(pose_list, names, f"pose list {poses}")
@@ -126,9 +125,9 @@ def read_block_inputs(
     if outside:
         warnings.append(f"{_count(outside, facts)} lie outside the area of {frame.crs} and are treated as unposed")
     stated_z_m = _stated_ground(camera_file, frame)
-    hint_z_m, hint_source = _relative_ground(named_poses, facts)
+    hint = _relative_ground(named_poses, facts)
     if stated_z_m is not None:
-        hint_z_m, hint_source = stated_z_m, f"ground height of {Path(cameras).name}"
+        hint = stated_z_m, f"ground height of {Path(cameras).name}"
     ids = image_ids(facts)
     images = [_image(name, ids[name], fact, assignment.camera_ids[name]) for name, fact in facts.items()]
     return BlockInputs(
@@ -137,13 +136,21 @@ def read_block_inputs(
         poses={ids[name]: pose for name, pose in named_poses.items()},
         crs=frame.crs,
         origin_m=frame.origin_m,
-        ground_hint_z_m=hint_z_m,
-        ground_hint_source=hint_source,
+        ground_hint_z_m=hint[0],
+        ground_hint_source=hint[1],
         ground_is_stated=stated_z_m is not None,
         guessed_cameras=assignment.guessed,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
     )
+
+
+def _read_headers(
+    images_dir: Path, names: Sequence[str], read_facts: FactsReader
+) -> tuple[dict[str, ExifFacts], list[ReadFailure]]:
+    outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
+    failures = [ReadFailure(name, STAGE, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
+    return {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}, failures
 
 
 def _image(name: str, image_id: str, fact: ExifFacts, camera_id: str) -> Image:

@@ -16,6 +16,7 @@ from aeromatch_cli.data import Block, Image, Pair, PairGeometry, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor, Outcome
 from aeromatch_cli.formats import csv_text
+from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_hash, write_json, write_text
 
 T = TypeVar("T")
@@ -86,11 +87,8 @@ class Context:
         return self.block.poses.get(image_id)
 
     def ground_z_m(self, image_id: str) -> float | None:
-        """Ground height below an image's projection centre, None without ground or position."""
-        pose = self.pose(image_id)
-        if self.block.ground is None or pose is None:
-            return None
-        return float(self.block.ground.height_m(pose.center_m[None, :2])[0])
+        """Ground height where an image looks (below it, without attitude), None without ground or position."""
+        return _ground_heights(self.block).get(image_id)
 
     @property
     def image_by_id(self) -> Mapping[str, Image]:
@@ -127,6 +125,15 @@ class Context:
         if "ground" in needs:
             parts["ground"] = (self.ground_z_m(image_id), self.block.gsd_m)
         return fingerprint(parts)
+
+
+@lru_cache(maxsize=4)
+def _ground_heights(block: Block) -> Mapping[str, float]:
+    """World height of the ground by image_id: over relief an oblique image looks at other heights than it stands on."""
+    if block.ground is None:
+        return {}
+    below = {i: float(block.ground.height_m(pose.center_m[None, :2])[0]) for i, pose in block.poses.items()}
+    return below | {i: footprint.ground_z_m for i, footprint in block_footprints(block).items()}
 
 
 @lru_cache(maxsize=4)
@@ -182,6 +189,13 @@ class StageReport:
         for item, reason in self.failures:
             log.warning("%s: %s: %s", self.stage, item, reason)
         return self
+
+    def absorb(self, earlier: StageReport, workspace: Workspace) -> StageReport:
+        """Count what an earlier pass of the same command did as done by this one, and write the sum."""
+        self.done = min(self.items - len(self.failures), self.done + earlier.done)
+        self.skipped = self.items - len(self.failures) - self.done
+        self.started -= earlier.seconds
+        return self.write(workspace)
 
     def _says_nothing_new(self, path: Path) -> bool:
         if self.done or self.failures or not path.is_file():

@@ -61,7 +61,7 @@ def prepare(
     else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-    summary = summarise(assembled.block, pairs)
+    summary = summarise(assembled.block, pairs, assembled.guessed_cameras)
     report.facts = {
         "summary": list(summary.lines()),
         "warnings": [*assembled.warnings, *summary.warnings],

@@ -105,7 +105,12 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
     """extract, match, filter, and again for images whose attitude turns out wrong; then export and report."""
     reports: list[StageReport] = []
     for _ in range(_MAX_PASSES):
-        reports = _to_filter(context)
+        again = _to_filter(context)
+        reports = (
+            [now.absorb(then, context.workspace) for now, then in zip(again, reports, strict=True)]
+            if reports
+            else again
+        )
         trusted = without_distrusted(replace(context, overwrite=False))
         if context.shard is not None or _attitudes(trusted) == _attitudes(context):
             break

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import json
 import signal
+import sqlite3
 import threading
 import zlib
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -71,6 +73,7 @@ class Colmap(Strategy):
             raise WorkspaceError(f"{path} cannot be written ({error}); check free space, then run again") from error
         if path.with_name(path.name + "-wal").exists():
             raise WorkspaceError(f"{path} could not be completed; check free space, then run again")
+        _leave_wal_mode(path)
         return {"keypoints": sum(sizes.values()), **counts}
 
     def _write_images(self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: _Ids) -> dict[str, int]:
@@ -105,6 +108,13 @@ class Colmap(Strategy):
             counts["verified_pairs"] += len(item.verified) > 0
             counts["verified_matches"] += len(item.verified)
         return counts
+
+
+def _leave_wal_mode(path: Path) -> None:
+    """Back to a rollback journal: in WAL mode a mere reader leaves files beside the database, or fails on a read-only
+    disk."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
 
 
 @dataclass(frozen=True)
