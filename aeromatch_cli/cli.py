@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import io
 import json
-import logging
 import math
+import shlex
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,12 +25,14 @@ from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
 from aeromatch_cli.errors import AeromatchError, ConfigError
+from aeromatch_cli.record import RecordedProgress, logged_to, record
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
 
 EXIT_SOME_FAILED = 1
 EXIT_INTERRUPTED = 130
+_ARGUMENTS = "aeromatch.arguments"
 
 
 class _Commands(TyperGroup):
@@ -51,6 +53,12 @@ class _Commands(TyperGroup):
                 facts = {"error": "wrong arguments; stderr says which", "exit_code": stop.code}
                 typer.echo(json.dumps(facts))
             raise
+
+    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
+        """Keeps the arguments as they were written, for the log file."""
+        written = list(args)  # parsing uses them up
+        options["obj"] = {_ARGUMENTS: written}
+        return super().make_context(info_name, args, *rest, **options)
 
 
 app = typer.Typer(
@@ -104,6 +112,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors on stder
 def _add_stage_command(name: str, help_text: str) -> None:
     @app.command(name, help=help_text)
     def command(
+        context: typer.Context,
         config: Config,
         images: Images = None,
         poses: Poses = None,
@@ -134,7 +143,7 @@ def _add_stage_command(name: str, help_text: str) -> None:
             settings = load(config, set_ or (), _texts(block), run=_texts(run), workspace=_absolute(workspace))
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=_progress(quiet))
 
-        _guard(call, name, quiet=quiet, as_json=json_, log_file=log_file)
+        _guard(call, name, quiet=quiet, as_json=json_, log_file=log_file, arguments=_arguments(context))
 
 
 for _name, _help in STAGES.items():
@@ -143,6 +152,7 @@ for _name, _help in STAGES.items():
 
 @app.command()
 def synth(
+    context: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the rendered block.")],
     preset: Annotated[str, typer.Option("--preset", metavar="NAME", help="Scene and flight.")] = "town",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another scene.")] = 0,
@@ -162,13 +172,13 @@ def synth(
         summary = render_block(out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images)
         return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), _texts(asdict(summary)))
 
-    _guard(call, "synth", quiet=quiet, as_json=json_, log_file=log_file)
+    _guard(call, "synth", quiet=quiet, as_json=json_, log_file=log_file, arguments=_arguments(context))
 
 
 def _add_weights_command(action: str, help_text: str, *, takes_path: bool) -> None:
     def call(argument: str | None, json_: bool, quiet: bool) -> None:
         def work() -> Result:
-            from aeromatch_cli.stages.run import manage_weights
+            from aeromatch_cli.stages.weights import manage_weights
 
             return manage_weights(action, argument)
 
@@ -226,36 +236,65 @@ def _progress(quiet: bool) -> Any:
     from aeromatch_cli.executor import SilentProgress
 
     if quiet:
-        return SilentProgress()
-    return TerminalProgress() if sys.stderr.isatty() else LineProgress()
+        return RecordedProgress(SilentProgress())
+    return RecordedProgress(TerminalProgress() if sys.stderr.isatty() else LineProgress())
 
 
-def _guard(call: Callable[[], Result], command: str, *, quiet: bool, as_json: bool, log_file: Path | None) -> None:
+def _arguments(context: typer.Context) -> Sequence[str]:
+    return tuple(context.find_root().obj[_ARGUMENTS])
+
+
+def _guard(
+    call: Callable[[], Result],
+    command: str,
+    *,
+    quiet: bool,
+    as_json: bool,
+    log_file: Path | None,
+    arguments: Sequence[str] = (),
+) -> None:
     """Run one command; print its result, or its error, and leave with the right exit code."""
-    facts: dict[str, Any] = {"command": command}
-    try:
-        with _logging(quiet, log_file), _terminated_like_interrupt():
-            result = call()
-    except AeromatchError as error:
-        typer.echo(f"error: {error}", err=True)
-        facts |= {"error": str(error), "exit_code": error.exit_code}
-    except KeyboardInterrupt:
-        typer.echo("interrupted; run the same command again to resume", err=True)
-        facts |= {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
-    except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
-        typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
-        facts |= {"error": text, "exit_code": AeromatchError.exit_code}
-    else:
-        if not quiet:
-            for line in result.lines:
-                typer.echo(line)
-        facts |= result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+    started = time.monotonic()
+    with ExitStack() as stack:
+
+        def logged() -> Result:
+            stack.enter_context(logged_to(log_file, quiet=quiet))
+            record.info("aeromatch %s: aeromatch %s", __version__, shlex.join(arguments))
+            with _terminated_like_interrupt():
+                return call()
+
+        facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet)
+        record.info("exit code %d after %.1f s", facts["exit_code"], time.monotonic() - started)
     if as_json:
         typer.echo(json.dumps(_finite(facts), allow_nan=False))
     if facts["exit_code"]:
         raise typer.Exit(int(facts["exit_code"]))
+
+
+def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
+    """The facts of one call, with its exit code; its lines, or its error, are printed and recorded."""
+    try:
+        result = call()
+    except AeromatchError as error:
+        typer.echo(f"error: {error}", err=True)
+        record.error("error: %s", error)
+        record.debug("stopped by", exc_info=True)
+        return {"error": str(error), "exit_code": error.exit_code}
+    except KeyboardInterrupt:
+        typer.echo("interrupted; run the same command again to resume", err=True)
+        record.error("interrupted")
+        return {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
+    except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
+        typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
+        record.error("error: %s", text, exc_info=True)
+        return {"error": text, "exit_code": AeromatchError.exit_code}
+    for line in result.lines:
+        record.info("%s", line)
+        if not quiet:
+            typer.echo(line)
+    return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
 
 
 def _finite(value: Any) -> Any:
@@ -265,38 +304,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-@contextmanager
-def _logging(quiet: bool, log_file: Path | None) -> Iterator[None]:
-    """Messages to stderr, and all of them, with time, to the log file."""
-    logger = logging.getLogger("aeromatch")
-    logger.setLevel(logging.DEBUG)
-    logger.propagate = False
-    screen = logging.StreamHandler(sys.stderr)
-    screen.setLevel(logging.ERROR if quiet else logging.INFO)
-    screen.setFormatter(logging.Formatter("%(message)s"))
-    handlers: list[logging.Handler] = [screen]
-    if log_file is not None:
-        try:
-            log_file.parent.mkdir(parents=True, exist_ok=True)
-            file = logging.FileHandler(log_file, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"--log-file {log_file} cannot be written: {error.strerror}") from None
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-        handlers.append(file)
-    for handler in handlers:
-        logger.addHandler(handler)
-    logging.raiseExceptions = False  # a log file on a full disk must not print tracebacks
-    try:
-        yield
-    except Exception:
-        logger.debug("stopped by", exc_info=True)
-        raise
-    finally:
-        for handler in handlers:
-            logger.removeHandler(handler)
-            handler.close()
 
 
 @contextmanager

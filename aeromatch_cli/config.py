@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, Union
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
 
-from aeromatch_cli.config_faults import accidents, describe, nearest
+from aeromatch_cli.config_faults import accidents, describe, nearest, root_faults
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers import ENHANCERS
@@ -32,9 +32,7 @@ _WORDS = {"poses": ("exif", "none"), "cameras": ("exif", "folder"), "ground": ("
 
 
 def _named(value: Any) -> Any:
-    """A bare name stands for the strategy with its defaults; YAML's null means `none`."""
-    if value is None:
-        return {"name": "none"}
+    """A bare name stands for the strategy with its defaults."""
     return {"name": value} if isinstance(value, str) else value
 
 
@@ -124,6 +122,15 @@ class Settings(_Section):
         (EXPORTERS["colmap"](),), description="For which programs the result is written: a list."
     )
 
+    @field_validator("filter")
+    @classmethod
+    def _one_that_verifies(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
+        if not any(one.verifies for one in value):
+            names = "+".join(getattr(one, "name", "") for one in value)
+            evidence = next(name for name, strategy in FILTERS.items() if strategy.verifies)
+            raise ValueError(f"{names} verifies nothing by itself; use {evidence}+{names}")
+        return value
+
     @field_validator("export")
     @classmethod
     def _one_folder_each(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
@@ -169,6 +176,8 @@ def load(source: str, overrides: Sequence[str] = (), block: Mapping[str, Any] | 
     block_given = {key: value for key, value in (block or {}).items() if value is not None}
     if block_given:
         given["block"] = block_given
+    if overrides and given:
+        validate(tree, f"{origin} with --set")  # a mistake is one even where an option hides it
     _merge(tree, _absolute_paths(given, tree, Path.cwd()))
     return validate(tree, f"{origin} with the options given" if overrides or given else origin)
 
@@ -179,7 +188,7 @@ def validate(tree: Mapping[str, Any], origin: str = "configuration") -> Settings
         settings = Settings.model_validate(tree)
         faults = list(accidents(tree, settings.model_dump(mode="json")))
     except ValidationError as error:
-        faults = [describe(fault, Settings, FAMILIES) for fault in error.errors()]
+        faults = [describe(fault, Settings, FAMILIES) for fault in root_faults(error.errors())]
     if faults:
         raise ConfigError(f"{origin} is not valid:\n" + "\n".join(f"  {fault}" for fault in faults))
     return settings
@@ -311,13 +320,15 @@ def _merge(tree: dict[str, Any], differences: Mapping[str, Any]) -> None:
     for key, value in differences.items():
         current = tree.get(key)
         if key in FAMILIES and (isinstance(value, str) or value is None):
+            if value is None and "none" in FAMILIES[key]:
+                value = "none"
             value = _chain(value) if isinstance(current, list) else _named(value)
         if isinstance(current, dict) and isinstance(value, Mapping):
             if "name" in current and value.get("name", current["name"]) != current["name"]:
                 tree[key] = copy.deepcopy(dict(value))
             else:
                 _merge(current, value)
-        elif not (isinstance(current, dict) and value is None):  # an empty section changes nothing
+        elif key in FAMILIES or not (isinstance(current, dict) and value is None):  # an empty section changes nothing
             tree[key] = copy.deepcopy(value)
 
 
@@ -328,6 +339,8 @@ def _apply_override(tree: dict[str, Any], text: str) -> None:
     if not separator or not all(parts):
         raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set extract.keypoints=8000")
     value = _override_value(parts, value_text)
+    if value is None and not value_text.strip():
+        raise ConfigError(f"--set {text!r}: the value is missing; write --set {key.strip()}=VALUE")
     if isinstance(tree.get(parts[0]), list) and len(parts) > 1:
         member, table = _member(tree[parts[0]], parts), FAMILIES[parts[0]]
         inner = _nested(parts[2:], value)

@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 Families = Mapping[str, Mapping[str, type[BaseModel]]]
 
 _LONGEST_VALUE = 60
+_LARGEST_WRITTEN = 1e15
 # pydantic's fault types, in the words of someone who writes YAML.
 _PHRASES = {
     "model_type": "must hold settings (key: value)",
@@ -50,8 +51,23 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
         return f"{place.removesuffix('.name')}: no strategy is named {name!r}{nearest(name, list(family))}"
     if kind == "union_tag_not_found":
         return f"{place}: name the strategy (name: ...), one of {', '.join(family)} (got {_shown(fault['input'])})"
-    phrase = _PHRASES.get(kind) or fault["msg"].replace("Value error, ", "").replace("Input should", "must")
-    return f"{place or 'top level'}: {phrase} (got {_shown(fault['input'])})"
+    if fault["input"] is None and family and kind.startswith("model_"):
+        return f"{place}: a value is missing; one of {', '.join(family)}"
+    if kind == "value_error":
+        return f"{place or 'top level'}: {fault['msg'].removeprefix('Value error, ')}"
+    phrase = _PHRASES.get(kind) or fault["msg"].replace("Input should", "must")
+    hint = _whole_number(fault["input"]) if kind == "int_parsing" else ""
+    return f"{place or 'top level'}: {phrase} (got {_shown(fault['input'])}){hint}"
+
+
+def root_faults(faults: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+    """Without those that only follow from another: pydantic calls a chain too short when a member is invalid."""
+    places = [tuple(fault["loc"]) for fault in faults]
+    return [
+        fault
+        for fault, place in zip(faults, places, strict=True)
+        if fault["type"] != "too_short" or not any(other[:-1][: len(place)] == place for other in places)
+    ]
 
 
 def accidents(given: Any, validated: Any, place: str = "") -> Iterator[str]:
@@ -76,6 +92,15 @@ def nearest(word: str, known: Sequence[str], *, otherwise: str | None = None) ->
     if otherwise is not None:
         return otherwise
     return f"; valid here: {', '.join(known)}" if known else ""
+
+
+def _whole_number(value: Any) -> str:
+    """`; write 1000` for 1e3, which YAML reads as text."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return ""
+    return f"; write {number:.0f}" if number.is_integer() and abs(number) < _LARGEST_WRITTEN else ""
 
 
 def _shown(value: Any) -> str:

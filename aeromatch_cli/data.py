@@ -211,14 +211,3 @@ class Verdict:
     errors_px: FloatArray | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     relative_rotation: FloatArray | None = None
-
-
-class Raster(Protocol):
-    """A picture that is read by windows, so that a 100-megapixel file is never loaded whole by accident."""
-
-    width_px: int
-    height_px: int
-
-    def read(self, x_px: int, y_px: int, width_px: int, height_px: int, step: int = 1) -> NDArray[Any]:
-        """Pixels (H, W) or (H, W, C) of a window, every `step`-th pixel averaged, in the stored dtype, RGB order."""
-        ...

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from pathlib import Path
@@ -13,9 +12,7 @@ import numpy as np
 import pytest
 from conftest import HEIGHT, IMAGES, WIDTH, contents, invoke
 
-from aeromatch_cli import workspace as workspace_module
 from aeromatch_cli.blocks import scan
-from aeromatch_cli.workspace import Workspace, read_json
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 
@@ -265,77 +262,7 @@ def test_shards_do_not_fit_what_needs_everything(site):
         assert (outcome.code, "--shard does not work with" in outcome.stderr) == (2, True)
 
 
-# --- the workspace ------------------------------------------------------------------------------------------------
-
-
-def test_workspace_below_a_file(site):
-    (site.root / "file").write_text("")
-    for place in (site.root / "file", site.root / "file" / "work"):
-        outcome = site("run", "--workspace", place)
-        assert (outcome.code, "a file stands where a folder is needed" in outcome.stderr) == (3, True)
-
-
-def test_read_only_workspace(site, monkeypatch):
-    def refuse(self, *arguments, **options):
-        raise OSError(errno.EROFS, "Read-only file system", str(self))
-
-    monkeypatch.setattr(workspace_module.Path, "touch", refuse)
-    outcome = site("run")
-    assert outcome.code == 3
-    assert "Read-only file system" in outcome.stderr
-    assert "choose another --workspace" in outcome.stderr
-
-
-def test_full_disk_stops_and_resumes(done_site, monkeypatch):
-    work = done_site.root / "full"
-    write = workspace_module.write_atomically
-    left = [9]
-
-    def limited(path, fill):
-        def filled(stream):
-            left[0] -= 1
-            if left[0] < 0:
-                stream.write(b"half of")
-                raise OSError(errno.ENOSPC, "No space left on device")
-            fill(stream)
-
-        write(path, filled)
-
-    for module in ("workspace", "stages.extract", "stages.match", "stages.filter", "stages.enhance", "stages.simulate"):
-        monkeypatch.setattr(f"aeromatch_cli.{module}.write_atomically", limited)
-    outcome = done_site("run", "--workspace", work)
-    assert outcome.code == 3
-    assert "disk full" in outcome.stderr
-    assert "free space" in outcome.stderr
-    assert not list(work.rglob("*.tmp"))
-    monkeypatch.undo()
-    outcome = done_site("run", "--workspace", work)
-    assert outcome.code == 0
-    assert contents(work) == contents(done_site.work)
-
-
-def test_workspace_of_another_version(done_site):
-    block = read_json(done_site.work / "block.json")
-    (done_site.work / "block.json").write_text(json.dumps({**block, "format_version": 99}))
-    before = contents(done_site.work)
-    for command in ("run", "check", "pairs", "export"):
-        outcome = done_site(command)
-        assert outcome.code == 3
-        assert "format version 99" in outcome.stderr
-        assert "choose another --workspace" in outcome.stderr
-    assert contents(done_site.work) == before
-
-
-def test_workspace_inside_the_images_folder(site):
-    inside = site.images / "work"
-    assert site("run", "--keep-images", "--workspace", inside).code == 0
-    assert list(inside.rglob("*.png"))
-    again = site("run", "--keep-images", "--workspace", inside)
-    assert (again.code, again.done()) == (0, {})
-    other = site("run", "--workspace", site.root / "other")  # nor are those of another workspace
-    assert other.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
-    outcome = site("run", "--workspace", site.images)
-    assert (outcome.code, "choose another --workspace" in outcome.stderr) == (2, True)
+# --- masks --------------------------------------------------------------------------------------------------------
 
 
 def test_masks_inside_the_images_folder(site):
@@ -364,82 +291,7 @@ def test_unreadable_mask_fails_one_image(site):
     assert site.failures() == [("extract", site.names()[0].replace(".", "_"))]
 
 
-# --- images of all kinds ------------------------------------------------------------------------------------------
-
-
-def test_equal_names_in_two_folders(site):
-    for index, name in enumerate(site.names()):
-        folder = site.images / ("a" if index < 3 else "b")
-        folder.mkdir(exist_ok=True)
-        (site.images / name).rename(folder / f"{index % 3}.jpg")
-    names = [f"{'a' if index < 3 else 'b'}/{index % 3}.jpg" for index in range(IMAGES)]
-    site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
-    outcome = site("run")
-    assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
-    assert sorted(path.stem for path in (site.work / "features").iterdir()) == sorted(
-        name.replace("/", "--").replace(".", "_") for name in names
-    )
-    site.rewrite_poses(lambda rows: [{**row, "image": Path(row["image"]).name + str(i)} for i, row in enumerate(rows)])
-    assert site("run").code == 2
-
-
-def test_unicode_and_blanks_in_names(site):
-    names = [f"Flug über Łódź {index} #1.JPG" for index in range(IMAGES)]
-    for old, new in zip(site.names(), names, strict=True):
-        (site.images / old).rename(site.images / new)
-    site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
-    outcome = site("run", "--workspace", site.root / "Arbeit für mich")
-    assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
-    assert site("run", "--workspace", site.root / "Arbeit für mich").done() == {}
-
-
-def test_the_same_picture_twice(site):
-    shutil.copy(site.image(0), site.images / "copy.jpg")
-    site.rewrite_poses(lambda rows: [*rows, {**rows[0], "image": "copy.jpg"}])
-    outcome = site("run")
-    assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["components"] == [IMAGES + 1]
-
-
-def test_sizes_depths_and_formats_mixed(site):
-    """A 16-bit TIFF, a gray PNG and a smaller JPEG among the others, with cameras from EXIF defaults."""
-    deep, gray, small = (site.image(index) for index in range(3))
-    renamed = {deep.name: deep.with_suffix(".tif").name, gray.name: gray.with_suffix(".png").name}
-    cv2.imwrite(str(deep.with_suffix(".tif")), cv2.imread(str(deep)).astype(np.uint16) * 200)
-    cv2.imwrite(str(gray.with_suffix(".png")), cv2.imread(str(gray), cv2.IMREAD_GRAYSCALE))
-    cv2.imwrite(str(small), cv2.resize(cv2.imread(str(small)), (WIDTH * 3 // 4, HEIGHT * 3 // 4)))
-    deep.unlink()
-    gray.unlink()
-    site.rewrite_poses(lambda rows: [{**row, "image": renamed.get(row["image"], row["image"])} for row in rows])
-    outcome = site("run", "--cameras", "exif")
-    assert outcome.code == 0, outcome.stderr
-    assert outcome.facts["stages"]["extract"]["items"] == IMAGES
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"].get("verified", 0) >= PAIRS // 2
-
-
-def test_images_that_do_not_fit_their_camera(site):
-    cv2.imwrite(str(site.image(0)), np.zeros((HEIGHT + 50, WIDTH, 3), np.uint8))
-    outcome = site("run")
-    assert outcome.code == 1
-    assert site.failures() == [("pairs", site.names()[0])]
-    assert f"{WIDTH}" in outcome.stderr
-
-
-def test_images_without_any_pose(site):
-    outcome = site("run", "--poses", "none")
-    assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100
-    views = read_json(Workspace(site.work).views(site.names()[0].replace(".", "_")))["views"]
-    assert [view["is_source"] for view in views] == [True]
-
-
-def test_reduced_images_give_keypoints_in_stored_pixels(site):
-    assert site("run", "--max-size", WIDTH // 2).code == 0
-    with np.load(sorted((site.work / "features").glob("*.npz"))[0]) as archive:
-        assert archive["keypoints_px"][:, 0].max() > WIDTH * 0.75
-    assert site("run").counts("extract")[0] == IMAGES
+# --- what goes wrong on the way -----------------------------------------------------------------------------------
 
 
 def test_image_deleted_between_two_stages(done_site):
@@ -488,9 +340,6 @@ def test_a_defect_in_one_pair_costs_that_pair_only(site, monkeypatch):
     assert outcome.code == 0
     assert outcome.counts("match") == (1, PAIRS - 1, 0)
     assert site.failures() == []
-
-
-# --- failures of shards -------------------------------------------------------------------------------------------
 
 
 def test_failures_of_shards_vanish_when_a_later_run_repairs_them(site):

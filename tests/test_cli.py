@@ -116,7 +116,8 @@ def test_part_of_the_shards_is_said_to_be_a_part(site):
         assert site(command, "--shard", f"1/{count}").code == 0
     outcome = site("filter")
     assert outcome.code == 1
-    assert "run `aeromatch match` first" in outcome.stderr
+    assert "results of match" in outcome.stderr
+    assert "`aeromatch run`" in outcome.stderr
     assert {stage for stage, _ in site.failures()} == {"filter"}
     for command in ("match", "filter"):
         for index in range(2, count + 1):

@@ -165,6 +165,23 @@ def test_exported_essential_fits_colmaps_own_rays(truth: Truth, database: Any) -
     assert np.abs(np.einsum("ni,ij,nj->n", rays[1], geometry.E, rays[0])).max() < 1e-6
 
 
+def test_the_fundamental_matrix_of_an_essential_one_is_in_colmaps_pixels(truth: Truth, database: Any) -> None:
+    geometry = database.read_two_view_geometry(1, 2)
+    k0, k1 = (database.read_camera(number).calibration_matrix() for number in (1, 2))
+    assert (k0[0, 2], k1[0, 2]) == (503.7, 400.0)  # from the corner of the first pixel
+    expected = np.linalg.inv(k1).T @ truth.pairs[0].model @ np.linalg.inv(k0)
+    scale = np.sum(geometry.F * expected) / np.sum(expected**2)
+    assert scale > 0
+    np.testing.assert_allclose(geometry.F / scale, expected, rtol=1e-6, atol=1e-12 * np.abs(expected).max())
+    pixels = []
+    for side, (number, k) in enumerate(((1, k0), (2, k1))):
+        keypoints = database.read_keypoints(number)[geometry.inlier_matches[:, side]]
+        pixels.append(homogeneous(database.read_camera(number).cam_from_img(keypoints)) @ k.T)
+    lines = pixels[0] @ geometry.F.T
+    distances_px = np.abs((lines * pixels[1]).sum(axis=1)) / np.hypot(lines[:, 0], lines[:, 1])
+    assert distances_px.max() < 1e-3
+
+
 def test_pose_priors_are_cartesian_world_coordinates(truth: Truth, database: Any) -> None:
     priors = {prior.corr_data_id.id: prior for prior in database.read_all_pose_priors()}
     assert sorted(priors) == [1, 2, 3, 4, 5, 6]

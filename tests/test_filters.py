@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import poselib
 import pytest
 
 from aeromatch_cli.data import Camera, Pair, PairGeometry, Pose, Verdict
@@ -124,6 +125,26 @@ def test_two_runs_are_equal_to_the_bit(name):
     assert np.array_equal(first.keep, second.keep)
     assert np.array_equal(first.model, second.model)
     assert np.array_equal(first.errors_px, second.errors_px)
+
+
+@pytest.mark.parametrize(
+    ("model", "estimator"), [("relative_pose", "estimate_relative_pose"), ("fundamental", "estimate_fundamental")]
+)
+def test_the_options_and_the_seed_of_the_pair_reach_the_estimator(monkeypatch, model, estimator):
+    seen = []
+
+    def recording(*arguments):
+        seen.append(arguments[-2])
+        return estimate(*arguments)
+
+    estimate = getattr(poselib, estimator)
+    monkeypatch.setattr(poselib, estimator, recording)
+    points0, points1, _ = scene(100)
+    recipe = Poselib(model=model, threshold_px=2.5, confidence=0.99, min_iterations=20, max_iterations=700)
+    for seed in (12345, 0):
+        assert apply_chain([PoseBand(), recipe], points0, points1, GEOMETRY, seed).state == "verified"
+    options = {"max_epipolar_error": 2.5, "success_prob": 0.99, "min_iterations": 20, "max_iterations": 700}
+    assert seen == [{**options, "seed": 12345}, {**options, "seed": 0}]
 
 
 def turned(pose, rng):

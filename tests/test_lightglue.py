@@ -17,6 +17,7 @@ from torch import Tensor
 from aeromatch_cli.data import Camera, Features, FloatArray, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, build_lightglue, canonical_keys, load_lightglue
+from aeromatch_cli.strategies.matchers import lightglue
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue, _wrapped_rad
 
 SIFT = Dimensions(input_dim=128, descriptor_dim=64, n_layers=3, num_heads=2, add_scale_ori=True)
@@ -344,6 +345,64 @@ def test_scale_and_orientation_reach_the_network(weights: str) -> None:
 def test_orientations_are_wrapped_half_open(degrees: float, radians: float) -> None:
     wrapped: FloatArray = _wrapped_rad(np.array([degrees], np.float32))
     np.testing.assert_allclose(wrapped, [radians], atol=1e-6)
+
+
+def by_hand() -> Features:
+    """Three keypoints; two lie in view 0 (640 x 480), the third in view 1 (200 x 100)."""
+    descriptors = np.zeros((3, 128), np.uint8)
+    descriptors[0, :2], descriptors[1, 5], descriptors[2, 7] = (30, 40), 200, 9
+    places = np.array([[10.0, 20.25], [-0.7, 480.0], [150.0, 60.0]], np.float32)
+    return Features(
+        keypoints_px=np.array([[400.0, 300.0], [1.0, 2.0], [3.0, 4.0]], np.float32),  # in the source: not what is sent
+        sizes_px=np.array([90.0, 91.0, 92.0], np.float32),
+        responses=np.ones(3, np.float32),
+        descriptors=descriptors,
+        descriptor_keypoint_idx=np.array([0, 1, 2], np.int32),
+        view_idx=np.array([0, 0, 1], np.int32),
+        view_keypoints_px=places,
+        view_size_px=np.array([3.0, 8.0, 5.0], np.float32),
+        view_orientation_deg=np.array([270.0, 180.0, 45.0], np.float32),
+        view_sizes_px=np.array([[640, 480], [200, 100]], np.int32),
+        view_angles_deg=np.zeros(2, np.float32),
+    )
+
+
+class Recorder:
+    """Stands for the network: keeps what it is given, matches nothing."""
+
+    def __init__(self) -> None:
+        self.given: list[dict[str, dict[str, Tensor]]] = []
+
+    def __call__(self, given: dict[str, dict[str, Tensor]]) -> dict[str, list[Tensor]]:
+        self.given.append(given)
+        return {"matches": [torch.zeros((0, 2), dtype=torch.int64)], "scores": [torch.zeros(0)]}
+
+
+def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder = Recorder()
+    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, SIFT, "cpu"))
+    LightGlue(weights=weights)(by_hand(), by_hand(), GEOMETRY)
+    assert len(recorder.given) == 4  # every view with every view
+    first, last = recorder.given[0]["image0"], recorder.given[3]["image1"]
+    assert recorder.given[1]["image0"]["image_size"].tolist() == [[640, 480]]
+    assert recorder.given[1]["image1"]["image_size"].tolist() == [[200, 100]]
+    assert first["image_size"].tolist() == [[640, 480]]
+    # From the corner of the picture, and clipped to it.
+    assert first["keypoints"].tolist() == [[[10.5, 20.75], [0.0, 480.0]]]
+    assert last["keypoints"].tolist() == [[[150.5, 60.5]]]
+    assert first["scales"].tolist() == [[1.5, 4.0]]
+    np.testing.assert_allclose(first["oris"].numpy(), [[-np.pi / 2, np.pi]], atol=1e-6)
+    np.testing.assert_allclose(last["oris"].numpy(), [[np.pi / 4]], atol=1e-6)
+    np.testing.assert_allclose(first["descriptors"][0, 0, :3].numpy(), [0.6, 0.8, 0.0], atol=1e-6)
+    np.testing.assert_allclose(torch.linalg.norm(first["descriptors"], dim=2).numpy(), [[1.0, 1.0]], atol=1e-6)
+    assert all(value.dtype == torch.float32 for value in first.values())
+
+
+def test_networks_without_scale_and_orientation_get_none(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder, plain = Recorder(), dataclasses.replace(SIFT, add_scale_ori=False)
+    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, plain, "cpu"))
+    LightGlue(weights=weights)(by_hand(), by_hand(), GEOMETRY)
+    assert recorder.given[0]["image0"].keys() == {"keypoints", "descriptors", "image_size"}
 
 
 def test_other_descriptors_are_refused(weights: str) -> None:

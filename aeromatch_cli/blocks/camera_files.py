@@ -3,7 +3,7 @@
 Parameters follow COLMAP: its order and its corner origin (cx = W / 2 is the centre); here they become this project's.
 
 YAML and JSON: NAME: {model, width, height, params}, for every camera, or the same below a key `cameras`, beside which
-`crs` (a code) and `ground_z` (a height, or percentiles with p50) may stand.
+`crs` (a code) and `ground_z` (a height, or percentiles with p50) may stand. One camera may stand without its NAME.
 """
 
 from __future__ import annotations
@@ -74,6 +74,9 @@ def _tree(path: Path, text: str) -> CameraFile:
     if not isinstance(tree, dict):
         raise ConfigError(f"camera file {path} must hold NAME: {{model, width, height, params}}")
     entries = tree.get("cameras", tree)
+    if isinstance(entries, dict) and isinstance(entries.get("model"), str):
+        single = {key: value for key, value in entries.items() if entries is not tree or key not in ("crs", "ground_z")}
+        entries = {path.stem: single}
     if not isinstance(entries, dict):
         raise ConfigError(f"{path}, key cameras: must hold NAME: {{model, width, height, params}}")
     cameras = {str(name): _entry(f"{path}, camera {name!r}", entry) for name, entry in entries.items()}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -63,12 +64,28 @@ class BlockSummary:
             found.append(f"without position {self.images - self.positioned}: paired by name and time")
         if self.oriented < self.positioned:
             found.append(f"without attitude {self.positioned - self.oriented}: paired by position")
+        if not self.oriented:
+            found.append("views            source images only: no attitudes")
+        elif not np.isfinite(median):
+            found.append("views            source images only: no ground height")
         if self.pairs is not None:
             reasons = ", ".join(f"{count} by {reason}" for reason, count in self.pairs_by_reason)
             found.append(f"pairs            {self.pairs}" + (f" ({reasons})" if reasons else ""))
         if np.isfinite(self.best_overlap):
             found.append(f"overlap          {100.0 * self.best_overlap:.0f} % with the best neighbour, on average")
         return found
+
+    def figures(self) -> dict[str, Any]:
+        """Every field, JSON-ready: pairs_by_reason as a mapping, None for what is unknown."""
+        return {key: _plain(value) for key, value in asdict(self).items()} | {
+            "pairs_by_reason": dict(self.pairs_by_reason)
+        }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def summarise(block: Block, pairs: Sequence[Pair] | None = None, guessed_cameras: Collection[str] = ()) -> BlockSummary:

@@ -26,6 +26,7 @@ from aeromatch_cli.data import Block, Camera, FloatArray, Ground, Image, Pair, P
 from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
+from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images import mask_path, read_pixels, shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
@@ -66,7 +67,7 @@ def assemble(settings: Settings, workspace: Workspace, executor: Executor) -> As
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints = _read_inputs(settings, workspace, executor, before)
     basis = {i.image_id: _basis_print(inputs, i, prints[i.image_id]) for i in inputs.images}
-    wanted = fingerprint(settings.block.ground, settings.block.crs, inputs.crs, inputs.ground_hint_z_m)
+    wanted = fingerprint(_ground_print(settings), settings.block.crs, inputs.crs, inputs.ground_hint_z_m)
     kept = before.get("ground_fingerprint") == wanted
     same = all(basis.get(image_id) == value for image_id, value in before.get("basis", {}).items())
     warnings = [*inputs.warnings, *_mask_warnings(settings, inputs.images)]
@@ -186,6 +187,12 @@ def _read_header(path: Path) -> tuple[ExifFacts | str, str]:
         raise ItemError(f"cannot be read ({error.strerror or error}): was it moved or deleted?") from None
 
 
+def _ground_print(settings: Settings) -> str:
+    """The ground setting; of a DEM also its content, since it may be replaced in place."""
+    text = settings.block.ground
+    return f"{text} {image_fingerprint(Path(text))}" if Path(text).is_file() else text
+
+
 def _basis_print(inputs: BlockInputs, image: Image, image_print: str) -> str:
     pose = inputs.poses.get(image.image_id)
     place = None if pose is None else (pose.center_m, pose.world_rotation)
@@ -257,7 +264,7 @@ def _match_reduced(task: _GroundTask) -> tuple[FloatArray, FloatArray]:
     geometry = PairGeometry(pair, task.cameras[0], task.cameras[1], None, None, None)
     matches = Nearest()(features[0], features[1], geometry)
     points = [
-        (f.keypoints_px[matches.indices[:, side]].astype(np.float64) + 0.5) / scale - 0.5
+        apply_homography(np.linalg.inv(resize_matrix(scale)), f.keypoints_px[matches.indices[:, side]])
         for side, (f, scale) in enumerate(zip(features, scales, strict=True))
     ]
     return points[0], points[1]

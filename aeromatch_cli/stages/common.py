@@ -7,7 +7,8 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +20,8 @@ from aeromatch_cli.formats import csv_text
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_hash, write_json, write_text
 
+# Part of every fingerprint that pixels enter; raised when decoding, masking, warping or merging change results.
+PIPELINE_VERSION = 1
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger("aeromatch")
@@ -64,6 +67,9 @@ class Context:
     guessed_cameras: frozenset[str] = frozenset()
     shard: Shard | None = None
     overwrite: bool = False
+    # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
+    known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
+    known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def owns(self, item_id: str) -> bool:
         return self.shard is None or self.shard.owns(item_id)
@@ -108,10 +114,10 @@ class Context:
 
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """What strategies with these `needs` read of one image's geometry."""
-        known = _geometry_fingerprints(self, needs)
-        if image_id not in known:
-            known[image_id] = self._geometry_fingerprint(image_id, needs)
-        return known[image_id]
+        key = image_id, needs
+        if key not in self.known_fingerprints:
+            self.known_fingerprints[key] = self._geometry_fingerprint(image_id, needs)
+        return self.known_fingerprints[key]
 
     def _geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         pose = self.pose(image_id)
@@ -139,13 +145,6 @@ def _ground_heights(block: Block) -> Mapping[str, float]:
 @lru_cache(maxsize=4)
 def _image_index(block: Block) -> Mapping[str, Image]:
     return {image.image_id: image for image in block.images}
-
-
-@lru_cache(maxsize=8)
-def _geometry_fingerprints(context: Context, needs: frozenset[str]) -> dict[str, str]:
-    """Filled by `Context.geometry_fingerprint`: an image is asked for once per pair."""
-    del context, needs
-    return {}
 
 
 @dataclass
@@ -249,6 +248,12 @@ def forget_absent(context: Context) -> None:
             os.utime(path, ns=(stamp, stamp))
 
 
+@cache
+def library_version(distribution: str) -> str:
+    """Version of an installed library whose arithmetic decides results; another one makes them stale."""
+    return metadata.version(distribution)
+
+
 def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[tuple[str, str]]:
     """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes.
 
@@ -260,7 +265,8 @@ def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[t
     for pair in pairs:
         if failed.isdisjoint((pair.image_id0, pair.image_id1, f"{pair.image_id0} {pair.image_id1}")):
             rows[pair.image_id0] = rows.get(pair.image_id0, 0) + 1
-    text = f"missing, or made with other settings or inputs: run `aeromatch {command}` first"
+    remedy = "run `aeromatch run`, or the single stages match and filter in this order"
+    text = f"missing, or made with other settings, attitudes or inputs: {remedy}"
     return [(image_id, f"results of {command} for {count} pair(s): {text}") for image_id, count in rows.items()]
 
 

@@ -21,7 +21,7 @@ from aeromatch_cli.images import (
     shrink_camera,
     write_png,
 )
-from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.stages.common import PIPELINE_VERSION, Context, StageReport, library_version, run_stage
 from aeromatch_cli.strategies import Enhanced, Enhancer
 from aeromatch_cli.workspace import Workspace, fingerprint, image_fingerprint, read_json, write_atomically, write_json
 
@@ -56,6 +56,8 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
     pose = context.pose(image.image_id)
     sky = sees_sky(camera, pose)
     parts = [
+        PIPELINE_VERSION,
+        library_version("opencv-python-headless"),
         context.image_fingerprints[image.image_id],
         image_fingerprint(mask) if mask else "",
         scale,

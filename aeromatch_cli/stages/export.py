@@ -11,6 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import BrokenFileError, InputError
+from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import MatchEntry, read_keypoints, read_match_row
 from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
 from aeromatch_cli.stages.filter import outdated_pairs, pair_fingerprint, verified_pairs
@@ -47,6 +48,7 @@ def run(context: Context) -> StageReport:
         sorted(block.poses.items()),
         block.crs,
         block.origin_m,
+        sorted(context.guessed_cameras),
         [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in pairs],
     ]
     wanted = fingerprint(context.settings.export, contents)
@@ -68,7 +70,9 @@ def run(context: Context) -> StageReport:
         last.unlink(missing_ok=True)
     tasks = [ExportTask(e, context, f) for e, f in zip(context.settings.export, folders, strict=True)]
     names = [exporter.name for exporter in context.settings.export]
-    done = run_stage(context, report, _run_task, tasks, names)
+    # In this process, one after the other: a task holds the whole context.
+    alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
+    done = run_stage(alone, report, _run_task, tasks, names)
     report.facts = {str(facts["name"]): facts for facts in done}
     report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from aeromatch_cli.data import Features, Image
 from aeromatch_cli.formats import features_fingerprint, write_features
+from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images import shrink_camera
 from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
@@ -38,9 +40,9 @@ def make_task(context: Context, image: Image) -> ExtractTask:
     """The task of one image, with the fingerprint of everything that its result depends on."""
     views = simulate.make_task(context, image)
     settings = context.settings
-    return ExtractTask(
-        views, settings.extract, settings.run.keep_images, fingerprint(views.fingerprint, settings.extract)
-    )
+    geometry = context.geometry_fingerprint(image.image_id, settings.extract.needs)
+    own = fingerprint(views.fingerprint, settings.extract, geometry)
+    return ExtractTask(views, settings.extract, settings.run.keep_images, own)
 
 
 def run_task(task: ExtractTask) -> int:
@@ -60,7 +62,7 @@ def _in_stored_frame(features: Features, scale: float) -> Features:
     """Keypoints of a reduced raster in the stored one, half-pixel correct."""
     if scale >= 1.0:
         return features
-    keypoints = (features.keypoints_px.astype("float64") + 0.5) / scale - 0.5
+    keypoints = apply_homography(np.linalg.inv(resize_matrix(scale)), features.keypoints_px)
     return replace(
         features,
         keypoints_px=keypoints.astype("float32"),
@@ -68,19 +70,12 @@ def _in_stored_frame(features: Features, scale: float) -> Features:
     )
 
 
-@lru_cache(maxsize=4)
-def _tasks(context: Context) -> dict[str, ExtractTask]:
-    """Filled by `task_of`."""
-    del context
-    return {}
-
-
 def task_of(context: Context, image_id: str) -> ExtractTask:
     """The task of one image, made once per command."""
-    known = _tasks(context)
-    if image_id not in known:
-        known[image_id] = make_task(context, context.image_by_id[image_id])
-    return known[image_id]
+    if image_id not in context.known_tasks:
+        context.known_tasks[image_id] = make_task(context, context.image_by_id[image_id])
+    task: ExtractTask = context.known_tasks[image_id]
+    return task
 
 
 def run(context: Context, image_ids: Iterable[str] | None = None, before: StageReport | None = None) -> StageReport:

@@ -24,7 +24,7 @@ from aeromatch_cli.formats import (
     write_verified_row,
 )
 from aeromatch_cli.stages import distrust, extract, match
-from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
+from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage, unexplained
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
@@ -75,7 +75,8 @@ def pair_fingerprint(context: Context, pair: Pair) -> str:
     chain = context.settings.filter
     needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
     sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
-    return fingerprint(chain, match.pair_fingerprint(context, pair), sides, pair_seed(context, pair))
+    matches = match.pair_fingerprint(context, pair)
+    return fingerprint(chain, library_version("poselib"), matches, sides, pair_seed(context, pair))
 
 
 def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:

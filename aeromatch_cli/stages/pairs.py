@@ -36,6 +36,7 @@ def prepare(
     """
     report = StageReport("pairs")
     workspace = Workspace(Path(settings.workspace).absolute())
+    _check_files(settings)
     if dry:
         workspace.check_version()
     else:
@@ -78,12 +79,21 @@ def prepare(
         report.write(workspace)
     for warning in report.facts["warnings"]:
         log.warning("warning: %s", warning)
+    if len(context.block.images) == 1:
+        raise InputError(f"only one image can be used ({context.block.images[0].name}): one image makes no pair")
     if not pairs:
         raise InputError(
-            f"no pairs: {len(context.block.images)} image(s), none of which overlap; check poses, cameras and ground "
+            f"no pairs: {len(context.block.images)} images, none of which overlap; check poses, cameras and ground "
             "(the warnings above), or use --set pairs=exhaustive"
         )
     return context, report
+
+
+def _check_files(settings: Settings) -> None:
+    """Files that strategies need (weights, pair lists) are missed now and not after hours of extraction."""
+    chosen = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
+    for strategy in (*chosen, *settings.filter, *settings.export):
+        strategy.fingerprint_files()
 
 
 def _turned(context: Context) -> set[str]:

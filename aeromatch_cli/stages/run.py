@@ -93,12 +93,23 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
         reports += [features, match.run(context)]
     elif command != "pairs":
         reports.append(STAGES[command](context))
+    if command == "filter" and context.shard is None:
+        _report_turned(context, reports[-1])
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
             "(`aeromatch run` does everything)"
         )
     return _result(command, context, reports)
+
+
+def _report_turned(context: Context, judged: StageReport) -> None:
+    """Images that lost their attitude in this very stage: their views, pairs and verdicts are out of date now."""
+    turned = _attitudes(context) - _attitudes(without_distrusted(replace(context, overwrite=False)))
+    if turned:
+        reason = "matches contradict its attitude: run `aeromatch run`, or match and filter again, to go on without it"
+        judged.failures += [(image_id, reason) for image_id in sorted(turned)]
+        judged.write(context.workspace)
 
 
 def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], Context]:
@@ -226,21 +237,3 @@ def _check(context: Context, first: StageReport) -> Result:
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
     return Result((*lines, *(f"failed: {item}: {reason}" for _, item, reason in failures)), facts, failures)
-
-
-def manage_weights(action: str, path: str | None) -> Result:
-    """List, verify or add network weights; a file that does not match its record is a failure."""
-    from aeromatch_cli.nets.weights import add_weights, list_weights, verify_weights, weights_folder
-
-    if action == "add":
-        entry = add_weights(Path(path or ""))
-        return Result((f"added {entry.name} ({entry.architecture}), SHA-256 {entry.sha256}",), {"name": entry.name})
-    if action == "verify":
-        checks = verify_weights()
-        lines = tuple(f"{c.name}: {c.state}" for c in checks) or (f"no weights in {weights_folder()}",)
-        wrong = tuple(("weights", c.name, c.state) for c in checks if c.state != "ok")
-        return Result(lines, {"weights": {c.name: c.state for c in checks}}, wrong)
-    entries = list_weights()
-    lines = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e6:.1f} MB  {e.sha256}" for e in entries)
-    names = [e.name for e in entries]
-    return Result(lines or (f"no weights in {weights_folder()}",), {"weights": names})

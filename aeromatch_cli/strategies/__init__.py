@@ -30,11 +30,13 @@ class Strategy(BaseModel):
     version: raised whenever the results change; part of the fingerprint.
     needs: what the call reads of an image's geometry, of "camera", "pose" (centre and attitude), "sigma" and "ground";
     only that enters the fingerprint, so that a change re-does exactly the stages that depend on it.
+    verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
+    verifies: ClassVar[bool] = True
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Paths of files (weights) whose contents are part of the recipe."""

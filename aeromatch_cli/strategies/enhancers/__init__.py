@@ -6,6 +6,9 @@ and dtype.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
 
-ENHANCERS = {"none": NoEnhancement}
+ENHANCERS: Mapping[str, type[Strategy]] = {"none": NoEnhancement}

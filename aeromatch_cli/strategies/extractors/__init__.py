@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.extractors.sift import Sift
 
-EXTRACTORS = {"sift": Sift}
+EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift}

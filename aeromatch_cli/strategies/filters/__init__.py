@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import apply_chain as apply_chain
 from aeromatch_cli.strategies.filters.pose import PoseBand
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
-FILTERS: dict[str, type[Poselib] | type[PoseBand]] = {"poselib": Poselib, "pose": PoseBand}
+FILTERS: Mapping[str, type[Strategy]] = {"poselib": Poselib, "pose": PoseBand}

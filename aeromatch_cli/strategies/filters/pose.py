@@ -24,6 +24,7 @@ class PoseBand(Strategy):
 
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma"})
+    verifies: ClassVar[bool] = False
     name: Literal["pose"] = "pose"
     sigmas: float = Field(3.0, gt=0.0, description="Half-width of the band in predicted standard deviations.")
     sigma_px: float = Field(1.5, gt=0.0, description="Standard deviation of a keypoint, pixels.")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 
-MATCHERS: dict[str, type[Nearest] | type[LightGlue]] = {"nearest": Nearest, "lightglue": LightGlue}
+MATCHERS: Mapping[str, type[Strategy]] = {"nearest": Nearest, "lightglue": LightGlue}

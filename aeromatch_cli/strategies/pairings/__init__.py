@@ -7,12 +7,15 @@ and NaN elsewhere.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.pairings.exhaustive import Exhaustive
 from aeromatch_cli.strategies.pairings.file import PairFile
 from aeromatch_cli.strategies.pairings.overlap import Overlap
 from aeromatch_cli.strategies.pairings.sequential import Sequential
 
-PAIRINGS: dict[str, type[Exhaustive] | type[Overlap] | type[PairFile] | type[Sequential]] = {
+PAIRINGS: Mapping[str, type[Strategy]] = {
     "overlap": Overlap,
     "exhaustive": Exhaustive,
     "sequential": Sequential,

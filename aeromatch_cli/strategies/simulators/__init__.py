@@ -9,10 +9,13 @@ undistorted_from_view (identity) is not used.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.simulators.ground import GroundView
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 
-SIMULATORS: dict[str, type[GroundView] | type[SourceOnly]] = {
+SIMULATORS: Mapping[str, type[Strategy]] = {
     "none": SourceOnly,
     "ground": GroundView,
 }

@@ -1,0 +1,72 @@
+"""The log file of a command: everything the screen says, and with it when it began, what each stage did, how it ended."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aeromatch_cli.errors import ConfigError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.executor import Progress
+
+LOGGER = "aeromatch"
+# What the screen shows in its own way: for the log file only.
+record = logging.getLogger(f"{LOGGER}.record")
+
+
+@contextmanager
+def logged_to(log_file: Path | None, *, quiet: bool) -> Iterator[None]:
+    """Messages to stderr, and all of them and the record, with time, to the log file. Raises ConfigError."""
+    logger = logging.getLogger(LOGGER)
+    logger.setLevel(logging.DEBUG)
+    logger.propagate = False
+    screen = logging.StreamHandler(sys.stderr)
+    screen.setLevel(logging.ERROR if quiet else logging.INFO)
+    screen.setFormatter(logging.Formatter("%(message)s"))
+    screen.addFilter(lambda message: message.name != record.name)
+    handlers: list[logging.Handler] = [screen]
+    if log_file is not None:
+        try:
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            file = logging.FileHandler(log_file, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--log-file {log_file} cannot be written: {error.strerror}") from None
+        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handlers.append(file)
+    for handler in handlers:
+        logger.addHandler(handler)
+    logging.raiseExceptions = False  # a log file on a full disk must not print tracebacks
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            logger.removeHandler(handler)
+            handler.close()
+
+
+class RecordedProgress:
+    """Another progress, whose beginnings and ends go to the log file too."""
+
+    def __init__(self, shown: Progress) -> None:
+        self._shown = shown
+
+    def start(self, label: str, total: int) -> None:
+        self._label, self._total, self._count, self._started = label, total, 0, time.monotonic()
+        record.info("%s: %d to do", label, total)
+        self._shown.start(label, total)
+
+    def advance(self) -> None:
+        self._count += 1
+        self._shown.advance()
+
+    def stop(self) -> None:
+        self._shown.stop()
+        record.info(
+            "%s: %d of %d tried in %.1f s", self._label, self._count, self._total, time.monotonic() - self._started
+        )

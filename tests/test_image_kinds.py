@@ -1,0 +1,82 @@
+"""Images of all kinds: odd names, copies, mixed sizes, depths and formats, without poses."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from conftest import HEIGHT, IMAGES, WIDTH
+
+from aeromatch_cli.workspace import Workspace, read_json
+
+PAIRS = IMAGES * (IMAGES - 1) // 2
+
+
+def test_equal_names_in_two_folders(site):
+    for index, name in enumerate(site.names()):
+        folder = site.images / ("a" if index < 3 else "b")
+        folder.mkdir(exist_ok=True)
+        (site.images / name).rename(folder / f"{index % 3}.jpg")
+    names = [f"{'a' if index < 3 else 'b'}/{index % 3}.jpg" for index in range(IMAGES)]
+    site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
+    outcome = site("run")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert sorted(path.stem for path in (site.work / "features").iterdir()) == sorted(
+        name.replace("/", "--").replace(".", "_") for name in names
+    )
+    site.rewrite_poses(lambda rows: [{**row, "image": Path(row["image"]).name + str(i)} for i, row in enumerate(rows)])
+    assert site("run").code == 2
+
+
+def test_unicode_and_blanks_in_names(site):
+    names = [f"Flug über Łódź {index} #1.JPG" for index in range(IMAGES)]
+    for old, new in zip(site.names(), names, strict=True):
+        (site.images / old).rename(site.images / new)
+    site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
+    outcome = site("run", "--workspace", site.root / "Arbeit für mich")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert site("run", "--workspace", site.root / "Arbeit für mich").done() == {}
+
+
+def test_the_same_picture_twice(site):
+    shutil.copy(site.image(0), site.images / "copy.jpg")
+    site.rewrite_poses(lambda rows: [*rows, {**rows[0], "image": "copy.jpg"}])
+    outcome = site("run")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["filter"]["facts"]["components"] == [IMAGES + 1]
+
+
+def test_sizes_depths_and_formats_mixed(site):
+    """A 16-bit TIFF, a gray PNG and a smaller JPEG among the others, with cameras from EXIF defaults."""
+    deep, gray, small = (site.image(index) for index in range(3))
+    renamed = {deep.name: deep.with_suffix(".tif").name, gray.name: gray.with_suffix(".png").name}
+    cv2.imwrite(str(deep.with_suffix(".tif")), cv2.imread(str(deep)).astype(np.uint16) * 200)
+    cv2.imwrite(str(gray.with_suffix(".png")), cv2.imread(str(gray), cv2.IMREAD_GRAYSCALE))
+    cv2.imwrite(str(small), cv2.resize(cv2.imread(str(small)), (WIDTH * 3 // 4, HEIGHT * 3 // 4)))
+    deep.unlink()
+    gray.unlink()
+    site.rewrite_poses(lambda rows: [{**row, "image": renamed.get(row["image"], row["image"])} for row in rows])
+    outcome = site("run", "--cameras", "exif")
+    assert outcome.code == 0, outcome.stderr
+    assert outcome.facts["stages"]["extract"]["items"] == IMAGES
+    assert outcome.facts["stages"]["filter"]["facts"]["pairs"].get("verified", 0) >= PAIRS // 2
+
+
+def test_images_that_do_not_fit_their_camera(site):
+    cv2.imwrite(str(site.image(0)), np.zeros((HEIGHT + 50, WIDTH, 3), np.uint8))
+    outcome = site("run")
+    assert outcome.code == 1
+    assert site.failures() == [("pairs", site.names()[0])]
+    assert f"{WIDTH}" in outcome.stderr
+
+
+def test_images_without_any_pose(site):
+    outcome = site("run", "--poses", "none")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100
+    views = read_json(Workspace(site.work).views(site.names()[0].replace(".", "_")))["views"]
+    assert [view["is_source"] for view in views] == [True]
