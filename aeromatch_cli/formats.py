@@ -5,7 +5,8 @@ precision. Pixels are (x, y) with (0, 0) at the centre of the top-left pixel of 
 world frame (`block.json`: `crs` minus `origin_m`). `.npz` files are uncompressed numpy archives without objects.
 
 block.json      format_version, crs, origin_m [x, y, z], ground_source, ground_z_m (null with a DEM or none), gsd_m
-                (null without attitudes), basis: fingerprint of every image when ground and GSD were fixed.
+                (null without attitudes), ground_fingerprint: of the settings that ground and GSD come from, basis:
+                fingerprint of every image when they were fixed.
 images.csv      image_id, name, width_px, height_px, camera_id, exif_orientation, time, fingerprint
 cameras.csv     camera_id, model, width_px, height_px, params: space-separated, COLMAP's order, cx and cy in this
                 project's pixel frame (COLMAP's minus 0.5).
@@ -13,11 +14,13 @@ poses.csv       image_id, x, y, z (metres, world frame, projection centre), qw, 
                 the attitude is unknown), sigma_position_m, sigma_angle_deg
 pairs.csv       image_id0, image_id1 (id0 < id1), overlap (0-1), view_angle_deg, reason
 failures.csv    stage, item, reason
-distrusted.json images whose attitude contradicts the pictures: fingerprint of all that the judgement rests on, and of
-                the settings; images: image_id -> angle_deg, facts (fingerprint of the image and its pose)
+distrusted.json images whose attitude contradicts the pictures: fingerprint (of all that the judgement rests on),
+                settings (fingerprint of the strategies), images: image_id -> angle_deg, facts (fingerprint of the
+                image and its pose)
 
-enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json facts of the strategy.
-simulated/<id>/views.json    fingerprint, scale (stored raster to the raster that the views were made from), views:
+enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json: fingerprint, picture
+                             (whether the picture is kept), and the facts that the strategy states.
+simulated/<id>/views.json    fingerprint, pictures (whether they are kept), scale (stored raster to the raster that the views were made from), views:
                              name, width_px, height_px, is_source, angle_deg, undistorted_from_view (3 x 3). Source
                              pixel = distort(camera, undistorted_from_view . view pixel); for is_source the view is
                              the raster itself. With scale < 1 the camera is the one resized by scale.
@@ -43,7 +46,14 @@ verified/<id0>.npz           the same row layout, only kept matches
   rejected (P,) str: JSON object, filter name -> matches that it dropped
 
 reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up to date), failed, fingerprint, facts,
-                             failures: [[item, reason], ...]
+                             failures: [[item, reason], ...]. facts of pairs: summary lines, warnings, images,
+                             distrusted, pairs_sha256; of extract: keypoints, images_without_keypoints; of match:
+                             matches; of filter: pairs (state -> count), verified_matches, components (sizes),
+                             weakly_tied, rotation_contradicts_pose (image_id -> degrees); of export: exporter ->
+                             files and counts.
+
+export/colmap/               database.db, sparse/{cameras,images,points3D}.txt in COLMAP's own formats and pixel frame
+                             (ours + 0.5); world.json: crs, origin_m; a coordinate in the CRS = here + origin.
 """
 
 from __future__ import annotations

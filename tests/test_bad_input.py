@@ -114,7 +114,7 @@ def test_one_image_only(site):
         path.unlink()
     outcome = site("run")
     assert outcome.code == 3
-    assert "no pairs: 1 image" in outcome.stderr
+    assert f"only one image can be used ({site.names()[0]})" in outcome.stderr
 
 
 def test_empty_missing_and_wrong_folder(site):

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor, Outcome, available_cores
+from aeromatch_cli.workspace import stable_hash
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,15 @@ def test_dask_without_the_extra_says_what_to_install(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match="cluster"):
         Executor("dask").run(work, [Task(1)], "x")
+
+
+def test_dask_gives_what_serial_gives() -> None:
+    texts = [f"image {number}" for number in range(20)]
+    with Executor("dask", jobs=2) as executor:
+        assert executor.run(stable_hash, texts, "x") == Executor("serial").run(stable_hash, texts, "x")
+        outcomes = executor.run(read_exif, [Path("nowhere.jpg")], "y")
+    assert outcomes[0].value is None
+    assert "nowhere.jpg" in outcomes[0].error
 
 
 def test_cores_are_those_of_this_process() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +23,8 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_quaternion, from_yaw_pitch_roll
 
 AngleConvention = Literal["auto", "gimbal", "nadir"]
+
+_FAR_M = 1_000_000.0  # no block reaches from its frame's zero this far
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,8 @@ def oriented(
     known_frame: WorldFrame | None,
     sigma_position_m: float,
     sigma_angle_deg: float,
-) -> tuple[WorldFrame, dict[str, Pose], tuple[str, ...]]:
-    """World frame, poses by image name, and names whose position lies outside the CRS.
+) -> tuple[WorldFrame, dict[str, Pose], Mapping[str, Sequence[str]]]:
+    """World frame, poses by image name, and what is wrong with other positions, in words -> names.
 
     crs: what the user gave ("auto", "local" or a code); stated_crs: what an input file states, or None. known_frame:
     the frame of an earlier run on a block that has grown since; used again where its CRS is the same, so that old
@@ -106,6 +108,8 @@ def oriented(
                 outside.append(name)
         if len(outside) == len(geographic):
             raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
+    zeros = _grid_zeros(code, grid)
+    grid = {name: center_m for name, center_m in grid.items() if name not in zeros}
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
     poses = {
         name: Pose(
@@ -116,7 +120,17 @@ def oriented(
         )
         for name, center_m in grid.items()
     }
-    return frame, poses, tuple(outside)
+    unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
+    return frame, poses, {words: names for words, names in unusable.items() if names}
+
+
+def _grid_zeros(crs: str, grid: Mapping[str, FloatArray]) -> list[str]:
+    """Names whose x and y are exactly zero, which stands for "unknown"; a local frame may begin there."""
+    zeros = [name for name, center_m in grid.items() if not center_m[:2].any()]
+    others = [float(np.hypot(*center_m[:2])) for name, center_m in grid.items() if center_m[:2].any()]
+    if crs == LOCAL and (not others or min(others) < _FAR_M):
+        return []
+    return zeros
 
 
 def _origin_m(crs: str, centers_m: list[FloatArray], known: WorldFrame | None) -> tuple[float, float, float]:

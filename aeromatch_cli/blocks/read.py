@@ -29,7 +29,6 @@ from aeromatch_cli.blocks.scan import ScanFailure, image_ids, scan_images
 from aeromatch_cli.data import Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 
-STAGE = "read"
 EXIF = "exif"
 FOLDER = "folder"
 
@@ -37,10 +36,9 @@ FactsReader = Callable[[Sequence[Path]], Sequence[ExifFacts | str]]
 
 
 class ReadFailure(NamedTuple):
-    """An image that is left out: its relative path, the stage ("read") and why."""
+    """An image that is left out: its relative path and why."""
 
     name: str
-    stage: str
     reason: str
 
 
@@ -97,41 +95,32 @@ def read_block_inputs(
 
     Raises ConfigError for a bad argument, pose list or camera file, InputError where no image is left.
     """
-    if angles not in get_args(AngleConvention):
-        raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
     # Lists first: they are quick, and a mistake in them should not cost a walk over 10,000 files.
-    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
-    camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
-    names, scan_failures = scan_images(images_dir, exclude)
-    warnings, failures = _report_scan(scan_failures)
-    facts, unreadable = _read_headers(images_dir, names, read_facts)
-    failures += unreadable
+    pose_list, camera_file = _read_lists(poses, cameras, angles)
+    names, facts, warnings, failures = _read_folder(images_dir, exclude, read_facts)
     rows: dict[str, PoseRow] = {}
     if pose_list is not None:
         rows, remarks = _matched(pose_list, names, f"pose list {poses}")
         warnings += [*pose_list.warnings, *remarks]
     assignment = _assign_cameras(cameras, camera_file, facts, {name: row.camera for name, row in rows.items()})
     warnings += assignment.warnings
-    failures += [ReadFailure(name, STAGE, reason) for name, reason in assignment.reasons.items()]
+    failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
     facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
     if not facts:
         raise InputError(_nothing_left(images_dir, failures))
 
     observations, remarks = _observations(poses or "", rows, facts, angles)
     warnings += remarks
-    frame, named_poses, outside = oriented(
+    frame, named_poses, unusable = oriented(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
-    if outside:
-        warnings.append(f"{_count(outside, facts)} lie outside the area of {frame.crs} and are treated as unposed")
+    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
     stated_z_m = _stated_ground(camera_file, frame)
-    hint = _relative_ground(named_poses, facts)
-    if stated_z_m is not None:
-        hint = stated_z_m, f"ground height of {Path(cameras).name}"
+    stated = stated_z_m, f"ground height of {Path(cameras).name}"
+    hint = _relative_ground(named_poses, facts) if stated_z_m is None else stated
     ids = image_ids(facts)
-    images = [_image(name, ids[name], fact, assignment.camera_ids[name]) for name, fact in facts.items()]
     return BlockInputs(
-        images=tuple(sorted(images, key=lambda image: image.image_id)),
+        images=_images(ids, facts, assignment.camera_ids),
         cameras=assignment.cameras,
         poses={ids[name]: pose for name, pose in named_poses.items()},
         crs=frame.crs,
@@ -145,29 +134,46 @@ def read_block_inputs(
     )
 
 
-def _read_headers(
-    images_dir: Path, names: Sequence[str], read_facts: FactsReader
-) -> tuple[dict[str, ExifFacts], list[ReadFailure]]:
+def _read_lists(poses: str | None, cameras: str, angles: AngleConvention) -> tuple[PoseList | None, CameraFile | None]:
+    """The pose list and the camera file, None where they are not files."""
+    if angles not in get_args(AngleConvention):
+        raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
+    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
+    return pose_list, read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
+
+
+def _read_folder(
+    images_dir: Path, exclude: Sequence[Path], read_facts: FactsReader
+) -> tuple[Sequence[str], dict[str, ExifFacts], list[str], list[ReadFailure]]:
+    """Names of all pictures, header facts of the readable ones, warnings, and failures."""
+    names, scan_failures = scan_images(images_dir, exclude)
+    warnings, failures = _report_scan(scan_failures)
     outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
-    failures = [ReadFailure(name, STAGE, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
-    return {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}, failures
+    failures += [ReadFailure(name, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
+    facts = {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}
+    return names, facts, warnings, failures
 
 
-def _image(name: str, image_id: str, fact: ExifFacts, camera_id: str) -> Image:
-    return Image(
-        image_id=image_id,
-        name=name,
-        width_px=fact.width_px,
-        height_px=fact.height_px,
-        camera_id=camera_id,
-        exif_orientation=fact.orientation,
-        time=fact.time,
-    )
+def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: Mapping[str, str]) -> tuple[Image, ...]:
+    """Sorted by image_id."""
+    images = [
+        Image(
+            image_id=ids[name],
+            name=name,
+            width_px=fact.width_px,
+            height_px=fact.height_px,
+            camera_id=camera_ids[name],
+            exif_orientation=fact.orientation,
+            time=fact.time,
+        )
+        for name, fact in facts.items()
+    ]
+    return tuple(sorted(images, key=lambda image: image.image_id))
 
 
 def _report_scan(scan_failures: list[ScanFailure]) -> tuple[list[str], list[ReadFailure]]:
     """Warnings of by-products, one per kind, and failures of pictures that are missing."""
-    failures = [ReadFailure(item.name, STAGE, item.reason) for item in scan_failures if item.image_lost]
+    failures = [ReadFailure(item.name, item.reason) for item in scan_failures if item.image_lost]
     passed: dict[str, list[str]] = defaultdict(list)
     for item in scan_failures:
         if not item.image_lost:

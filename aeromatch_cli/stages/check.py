@@ -13,7 +13,8 @@ from aeromatch_cli.images import shrink_camera
 from aeromatch_cli.stages import enhance, extract, simulate
 from aeromatch_cli.stages.common import Context
 
-# Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per source pixel with one view of it.
+# Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per pixel of the source or of its views
+# together, whichever are more: a view of a turned or tilted image is larger than the image.
 _BASE_MB = 350.0
 _BYTES_PER_PIXEL = 12.0
 _TILE_MB = 700.0
@@ -54,6 +55,7 @@ def run(context: Context) -> Check:
     images = list(context.block.images)
     sampled = _sample(context)
     trials = [_Trial(extract.make_task(context, image), image.image_id in sampled) for image in images]
+    largest_px = max(_pixels(image, trial) for image, trial in zip(images, trials, strict=True))
     outcomes = context.executor.run(_try_image, trials, "check")
     failures = tuple((i.name, o.error) for i, o in zip(images, outcomes, strict=True) if o.value is None)
     timed = {
@@ -61,7 +63,7 @@ def run(context: Context) -> Check:
         for image, outcome in zip(images, outcomes, strict=True)
         if outcome.value is not None and image.image_id in sampled
     }
-    estimate = _estimate(context, images, timed)
+    estimate = _estimate(context, len(images), largest_px, timed)
     estimate["readable_images"] = len(images) - len(failures)
     return Check(_lines(context, estimate, len(images)), estimate, failures)
 
@@ -72,15 +74,24 @@ def _sample(context: Context) -> set[str]:
     return {pair.image_id0, pair.image_id1}
 
 
-def _estimate(context: Context, images: list[Image], timed: dict[str, tuple[float, Features | None]]) -> dict[str, Any]:
+def _pixels(image: Image, trial: _Trial) -> int:
+    """What an image is worked on as: its own pixels, or those of all its views."""
+    views = simulate.views_of(trial.task.views)
+    return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
+
+
+def _estimate(
+    context: Context, images: int, largest_px: int, timed: dict[str, tuple[float, Features | None]]
+) -> dict[str, Any]:
+    """images: how many. largest_px: of the image, or its views, that needs most memory."""
     seconds_image = max((seconds for seconds, _ in timed.values()), default=float("nan"))
     descriptors = max((len(f.descriptors) for _, f in timed.values() if f is not None), default=0)
     seconds_pair, matches = _time_pair(context, timed)
     jobs = context.executor.jobs
-    megapixels = max(image.width_px * image.height_px for image in images) / 1e6
+    megapixels = largest_px / 1e6
     memory_mb = _BASE_MB + _BYTES_PER_PIXEL * megapixels + min(_TILE_MB, _TILE_MB * megapixels / 4.0)
-    disk = len(images) * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
-    seconds = (len(images) * seconds_image + len(context.pairs) * seconds_pair) / jobs
+    disk = images * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
+    seconds = (images * seconds_image + len(context.pairs) * seconds_pair) / jobs
     return {
         "pairs": len(context.pairs),
         "seconds_per_image": round(seconds_image, 3) if timed else None,

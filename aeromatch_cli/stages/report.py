@@ -78,7 +78,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     template = environment.from_string(source.read_text(encoding="utf-8"))
     facts = summarise(context)
     contradictions = _contradictions(context)
-    failures = failure_rows(context.workspace)
+    failures = failure_rows(context)
     remarks = _remarks(context)
     verified = [row for row in pairs if row.state == "verified"]
     stages = stage_rows(context.workspace)
@@ -145,6 +145,7 @@ def notices(
 ) -> list[Notice]:
     """What needs a person's eye, the gravest first."""
     found = []
+    names = {row.image_id: row.name for row in images}
     if not facts["verified_matches"]:
         found.append(Notice("bad", "No pair is verified", "The block has no tie points; the pair table says why."))
     elif len(facts["components"]) > 1:
@@ -154,18 +155,18 @@ def notices(
         found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
     if contradictions:
         text = "Matches say that these attitudes are wrong by the angle given; only their positions are used."
-        items = tuple(f"{image_id}: {angle:.1f}°" for image_id, angle in contradictions.items())
+        items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in contradictions.items())
         found.append(Notice("bad", f"{len(items):,} attitudes contradict the pictures", text, items))
     if facts["weakly_tied"] and facts["verified_matches"]:
         ties = {row.image_id: row for row in images}
-        items = tuple(f"{i} ({ties[i].verified_matches})" for i in facts["weakly_tied"])
+        items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in facts["weakly_tied"])
         text = f"Fewer than {WEAK_MATCHES} verified matches over all their pairs (their number in brackets)."
         found.append(Notice("bad", f"{len(items):,} images are weakly tied", text, items))
     for pose, title, text in (
         ("none", "images have no position", "They were paired by name or time and are not on the map."),
         ("position", "images have no usable attitude", "They were paired by position and have no footprint."),
     ):
-        items = tuple(row.image_id for row in images if row.pose == pose and row.image_id not in contradictions)
+        items = tuple(row.name for row in images if row.pose == pose and row.image_id not in contradictions)
         if items:
             found.append(Notice("warn", f"{len(items):,} {title}", text, items))
     lost = sum(row.state == NOT_JUDGED for row in pairs)
@@ -238,7 +239,7 @@ def _map(
 
 def _link(row: PairRow) -> report_map.Link:
     words = f"{row.verified:,} verified matches" if row.state == "verified" else f"{row.state}: {row.reason}"
-    title = f"{row.image_id0} – {row.image_id1}: {words}"
+    title = f"{row.name0} – {row.name1}: {words}"
     return report_map.Link(row.image_id0, row.image_id1, row.state, row.verified, title)
 
 
@@ -310,4 +311,4 @@ def _preview(context: Context, row: PairRow) -> str:
         image = context.image_by_id[image_id]
         pixels = read_pixels(context.image_path(image), colour=True)
         sides.append(figures.Side(pixels, image.exif_orientation, points_px))
-    return figures.preview(sides[0], sides[1], errors, f"Matches of {ids[0]} and {ids[1]}")
+    return figures.preview(sides[0], sides[1], errors, f"Matches of {row.name0} and {row.name1}")

@@ -27,6 +27,8 @@ MAX_LABELS = 60
 
 _MAP_WIDTH = 1100.0
 _MAP_HEIGHTS = (320.0, 1000.0)
+# Side of the frame over the extent of the cameras.
+_LARGEST_FRAME = 5.0
 _MARGIN_LEFT, _MARGIN_BOTTOM, _MARGIN = 64.0, 44.0, 14.0
 
 
@@ -141,13 +143,14 @@ def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], lin
 
 
 def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> _Frame:
-    """All cameras, and of the footprints what does not shrink the block to a dot, as views of the horizon would."""
+    """All cameras and footprints, up to a size that does not shrink the cameras to a dot, as views of the horizon would."""
     centers = np.array([[s.x_m, s.y_m] for s in stations])
     low, high = centers.min(axis=0), centers.max(axis=0)
     if footprints:
         corners = np.concatenate(list(footprints))
         sizes = [float(np.ptp(polygon, axis=0).max()) for polygon in footprints]
-        most = max(0.6 * float((high - low).max()), 0.15 * float(np.median(sizes)))
+        # Of cameras close together, or only one, the footprints alone tell a size.
+        most = max((_LARGEST_FRAME - 1.0) / 2.0 * float((high - low).max()), 0.6 * float(np.median(sizes)))
         low = np.maximum(np.minimum(low, corners.min(axis=0)), low - most)
         high = np.minimum(np.maximum(high, corners.max(axis=0)), high + most)
     span = np.maximum(high - low, max(float((high - low).max()) * 0.02, 1.0))

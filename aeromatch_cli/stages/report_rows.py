@@ -33,6 +33,8 @@ class PairRow:
 
     image_id0: str
     image_id1: str
+    name0: str
+    name1: str
     overlap: float
     view_angle_deg: float
     chosen_by: str
@@ -124,12 +126,12 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
     tied: Counter[str] = Counter()
     matches: Counter[str] = Counter()
     for pair, entry in verified_pairs(context):
-        row = judged[pair.image_id0, pair.image_id1] = _pair_row(pair, entry)
+        row = judged[pair.image_id0, pair.image_id1] = _pair_row(context, pair, entry)
         if row.state == "verified":
             coverage.add(pair, entry)
             tied.update((pair.image_id0, pair.image_id1))
             matches.update({pair.image_id0: row.verified, pair.image_id1: row.verified})
-    pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(p, None) for p in context.pairs]
+    pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(context, p, None) for p in context.pairs]
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     images = []
     for image in context.block.images:
@@ -150,8 +152,9 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
     return pairs, images
 
 
-def _pair_row(pair: Pair, entry: VerifiedEntry | None) -> PairRow:
-    known = (pair.image_id0, pair.image_id1, pair.overlap, pair.view_angle_deg, pair.reason)
+def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:
+    ids = (pair.image_id0, pair.image_id1)
+    known = (*ids, *(context.image_by_id[i].name for i in ids), pair.overlap, pair.view_angle_deg, pair.reason)
     if entry is None:
         words = "no matches on file: the match stage failed or has not run"
         return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})
@@ -223,6 +226,12 @@ def _number(value: float | str) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}" if isinstance(value, float) else value
 
 
-def failure_rows(workspace: Workspace) -> list[dict[str, str]]:
-    """Rows of failures.csv: stage, item, reason."""
-    return read_csv(workspace.failures) if workspace.failures.is_file() else []
+def failure_rows(context: Context) -> list[dict[str, str]]:
+    """Rows of failures.csv: stage, item, reason; the items, where they are images or pairs, by their files' names."""
+    path, images = context.workspace.failures, context.image_by_id
+    rows = read_csv(path) if path.is_file() else []
+    for row in rows:
+        ids = row["item"].split(" ")
+        if all(image_id in images for image_id in ids):
+            row["item"] = " – ".join(images[image_id].name for image_id in ids)
+    return rows
