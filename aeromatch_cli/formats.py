@@ -20,7 +20,8 @@ distrusted.json images whose attitude contradicts the pictures: fingerprint (of 
 
 enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json: fingerprint, picture
                              (whether the picture is kept), and the facts that the strategy states.
-simulated/<id>/views.json    fingerprint, pictures (whether they are kept), scale (stored raster to the raster that the views were made from), views:
+simulated/<id>/views.json    fingerprint, pictures (whether they are kept), scale (stored raster to the raster that
+                             the views were made from), views:
                              name, width_px, height_px, is_source, angle_deg, undistorted_from_view (3 x 3). Source
                              pixel = distort(camera, undistorted_from_view . view pixel); for is_source the view is
                              the raster itself. With scale < 1 the camera is the one resized by scale.
@@ -46,9 +47,9 @@ verified/<id0>.npz           the same row layout, only kept matches
   rejected (P,) str: JSON object, filter name -> matches that it dropped
 
 reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up to date), failed, fingerprint, facts,
-                             failures: [[item, reason], ...]. facts of pairs: summary lines, warnings, images,
-                             distrusted, pairs_sha256; of extract: keypoints, images_without_keypoints; of match:
-                             matches; of filter: pairs (state -> count), verified_matches, components (sizes),
+                             failures: [[item, reason], ...]. facts of pairs: summary lines, block figures, warnings,
+                             images, distrusted, pairs_sha256; of extract: keypoints, images_without_keypoints; of
+                             match: matches; of filter: pairs (state -> count), verified_matches, components (sizes),
                              weakly_tied, rotation_contradicts_pose (image_id -> degrees); of export: exporter ->
                              files and counts.
 

@@ -1,4 +1,4 @@
-"""The log file of a command: everything the screen says, and with it when it began, what each stage did, how it ended."""
+"""The log file of a command: all that the screen says, when it began, what each stage did, and how it ended."""
 
 from __future__ import annotations
 

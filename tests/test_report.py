@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 from PIL import Image as PilImage
 from read_html import Structure
 
@@ -174,7 +175,7 @@ def test_page_shows_headline_tables_and_reasons(full):
         "2 unconnected groups",
         "2 weakly tied images (< 50 matches)",
         "1 failures",
-        "c: 178.4°",
+        f"{NASTY}: 178.4°",
         "altitudes look relative",
         "flying height 100 m",
         "cut <off> & empty",
@@ -183,12 +184,12 @@ def test_page_shows_headline_tables_and_reasons(full):
         "given: 0 m",
     ):
         assert text in words, text
-    ab = row_with(page, "pair-table", "a", "b")
-    assert ab == ["a", "b", "overlap", "61", "7.3", "80", "60", "75", "0.72", "verified", "E", "", "poselib 20"]
-    ac = row_with(page, "pair-table", "a", "c")
+    ab = row_with(page, "pair-table", "a.png", "b.jpg")
+    assert ab == ["a.png", "b.jpg", "overlap", "61", "7.3", "80", "60", "75", "0.72", "verified", "E", "", "poselib 20"]
+    ac = row_with(page, "pair-table", "a.png", str(escape(NASTY)))
     assert ac[5:7] == ["12", "0"]
     assert ac[9:12] == ["rejected", "", "8 inliers of 12 matches"]
-    assert row_with(page, "image-table", "d")[2:] == ["full", "100", "2", "0", "0", "0", "weakly tied."]
+    assert row_with(page, "image-table", "sub/d.png")[1:] == ["full", "100", "2", "0", "0", "0", "weakly tied."]
     assert row_with(page, "stage-table", "extract")[3:7] == ["5", "4", "0", "1"]
     assert "name: poselib" in words  # the settings
 
@@ -208,8 +209,12 @@ def test_page_escapes_names_and_needs_no_network(full):
 
 def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):
     page = page_of(full)
-    headings = re.findall(r"<h3>(.*?)</h3>", page)
-    assert headings == ["Best verified pair: a – b", "Worst verified pair: b – c", "Rejected pair: a – c"]
+    headings = re.findall(r"<h3[^>]*>(.*?)</h3>", page)
+    assert headings == [
+        "Best verified pair: a.png – b.jpg",
+        f"Worst verified pair: b.jpg – {escape(NASTY)}",
+        f"Rejected pair: a.png – {escape(NASTY)}",
+    ]
     assert page.count('class="preview"') == 3
     full.image_path(full.block.images[0]).unlink()
     page = page_of(full)
@@ -239,7 +244,7 @@ def test_page_without_poses_features_or_verified_pairs(tmp_path):
         "4 images have no position",
     ):
         assert text in words, text
-    assert row_with(page_of(empty), "image-table", "a")[3:] == ["", "1", "0", "0", "", "no features. weakly tied."]
+    assert row_with(page_of(empty), "image-table", "a.png")[2:] == ["", "1", "0", "0", "", "no features. weakly tied."]
     filed = [row.label for row in stage_rows(empty.workspace)]
     assert filed == []  # the report stage does not report about itself
 
@@ -274,7 +279,7 @@ def test_shards_are_summed_per_stage(tmp_path):
 def pair_row(index: int, state: str, matches: int, ids: tuple[str, str] = ("a", "b")) -> PairRow:
     reason = "" if state == "verified" else "3 inliers of 40 matches, 15 needed"
     verified = matches if state == "verified" else 0
-    known = (*ids, 0.5 + index * 1e-6, 12.0, "overlap", matches + 9, verified, 0.61)
+    known = (*ids, *ids, 0.5 + index * 1e-6, 12.0, "overlap", matches + 9, verified, 0.61)
     return PairRow(*known, state, reason, "E", {"poselib": 9})
 
 

@@ -115,9 +115,8 @@ def read_block_inputs(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
-    stated_z_m = _stated_ground(camera_file, frame)
-    stated = stated_z_m, f"ground height of {Path(cameras).name}"
-    hint = _relative_ground(named_poses, facts) if stated_z_m is None else stated
+    stated = _stated_ground(camera_file, frame, Path(cameras).name)
+    hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
     ids = image_ids(facts)
     return BlockInputs(
         images=_images(ids, facts, assignment.camera_ids),
@@ -125,9 +124,9 @@ def read_block_inputs(
         poses={ids[name]: pose for name, pose in named_poses.items()},
         crs=frame.crs,
         origin_m=frame.origin_m,
-        ground_hint_z_m=hint[0],
-        ground_hint_source=hint[1],
-        ground_is_stated=stated_z_m is not None,
+        ground_hint_z_m=hint_z_m,
+        ground_hint_source=hint_source,
+        ground_is_stated=stated is not None,
         guessed_cameras=assignment.guessed,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
@@ -282,13 +281,13 @@ def _count(names: Sequence[str], total: Mapping[str, object]) -> str:
     return f"{len(names)} of {len(total)} images ({listed(list(names))})"
 
 
-def _stated_ground(camera_file: CameraFile | None, frame: WorldFrame) -> float | None:
-    """World height that the camera file states, None in another frame than the block's: its datum may differ."""
+def _stated_ground(camera_file: CameraFile | None, frame: WorldFrame, source: str) -> tuple[float, str] | None:
+    """World height that the camera file states, and where, None in another frame than the block's: datums differ."""
     if camera_file is None or camera_file.ground_z_m is None:
         return None
     if camera_file.crs is not None and checked_crs(camera_file.crs) != frame.crs:
         return None
-    return camera_file.ground_z_m - frame.origin_m[2]
+    return camera_file.ground_z_m - frame.origin_m[2], f"ground height of {source}"
 
 
 def _relative_ground(poses: Mapping[str, Pose], facts: Mapping[str, ExifFacts]) -> tuple[float | None, str]:

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray, Matches, Pair, PairGeometry
-from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.executor import guarded
+from aeromatch_cli.data import FloatArray, Matches, Pair
 from aeromatch_cli.formats import (
     MatchEntry,
     VerifiedEntry,
@@ -23,27 +21,15 @@ from aeromatch_cli.formats import (
     row_fingerprints,
     write_verified_row,
 )
-from aeromatch_cli.stages import distrust, extract, match
+from aeromatch_cli.stages import distrust, extract, match, rows
 from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage, unexplained
+from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
 
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
 WEAK_MATCHES = 50
-
-
-@dataclass(frozen=True, eq=False)
-class PairTask:
-    """One pair of a row; seed depends on the two names only."""
-
-    geometry: PairGeometry
-    fingerprint: str
-    seed: int
-
-    @property
-    def image_id1(self) -> str:
-        return self.geometry.pair.image_id1
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,24 +88,13 @@ def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:
 
 
 def run_task(task: FilterTask) -> RowResult:
-    """Judge what is not up to date in one row; one failing pair does not stop the others."""
+    """Judge what is not up to date in one row."""
     path = task.workspace.verified(task.image_id0)
-    old = {} if task.overwrite else _usable_row(path)
-    row = read_match_row(task.workspace.matches(task.image_id0))
-    entries, failures, judged = [], [], 0
-    for pair in task.pairs:
-        image_id1 = pair.image_id1
-        entry = old.get(image_id1)
-        if entry is None or entry.fingerprint != pair.fingerprint:
-            outcome = guarded(lambda one: _judge(task, one, row[one.image_id1]), pair)
-            if outcome.value is None:
-                failures.append((f"{task.image_id0} {image_id1}", outcome.error))
-                continue
-            entry = outcome.value
-            judged += 1
-        entries.append(entry)
-    write_atomically(path, lambda stream: write_verified_row(stream, entries))
-    return RowResult(judged, tuple(failures))
+    old = rows.readable(read_verified_row, path, task.overwrite)
+    matched = read_match_row(task.workspace.matches(task.image_id0))
+    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _judge(task, pair, matched[pair.image_id1]))
+    write_atomically(path, lambda stream: write_verified_row(stream, row.entries))
+    return RowResult(len(row.made), row.failures)
 
 
 def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry:
@@ -168,39 +143,23 @@ def _keypoints(path: Path) -> FloatArray:
     return _cached_keypoints(path, path.stat().st_mtime_ns)
 
 
-def _usable_row(path: Path) -> dict[str, VerifiedEntry]:
-    try:
-        return read_verified_row(path)
-    except BrokenFileError:
-        return {}
-
-
 def run(context: Context) -> StageReport:
     """Write verified/<id0>.npz for every row of the shard, then sum up what the block now is."""
     report = StageReport("filter")
     tasks, missing = make_tasks(context)
     on_file = {task.image_id0: row_fingerprints(context.workspace.verified(task.image_id0)) for task in tasks}
-    todo = [task for task in tasks if context.overwrite or not _is_done(task, on_file[task.image_id0])]
+    todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
     results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
     report.failures.extend(failure for result in results for failure in result.failures)
     report.failures.extend(unexplained(context, missing, "match"))
     report.done = sum(result.done for result in results)
-    report.skipped = 0 if context.overwrite else sum(_kept(task, on_file[task.image_id0]) for task in tasks)
+    report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     report.facts = summarise(context)
     if context.shard is None:
         report.facts["rotation_contradicts_pose"] = distrust.judge(context, _rotations(context))
     return report.write(context.workspace, context.shard)
-
-
-def _is_done(task: FilterTask, on_file: dict[str, str]) -> bool:
-    """Exactly the wanted pairs, each up to date: verdicts that no longer hold leave the file."""
-    return on_file == {pair.image_id1: pair.fingerprint for pair in task.pairs}
-
-
-def _kept(task: FilterTask, on_file: dict[str, str]) -> int:
-    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in task.pairs)
 
 
 def outdated_pairs(context: Context) -> list[Pair]:

@@ -6,26 +6,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from aeromatch_cli.data import Features, Pair, PairGeometry
-from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.executor import guarded
+from aeromatch_cli.data import Features, Pair
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
-from aeromatch_cli.stages import extract
+from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
-
-
-@dataclass(frozen=True, eq=False)
-class PairTask:
-    """One pair of a row: its geometry and the fingerprint that its result must carry."""
-
-    geometry: PairGeometry
-    fingerprint: str
-
-    @property
-    def image_id1(self) -> str:
-        return self.geometry.pair.image_id1
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,44 +57,26 @@ def make_tasks(context: Context) -> list[MatchTask]:
     tasks = []
     for image_id0, pairs in context.rows().items():
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
-        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p)) for p in usable)
+        row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p), seed=0) for p in usable)
         if row:
             tasks.append(MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite))
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
 
 def run_task(task: MatchTask) -> RowResult:
-    """Match what is not up to date in one row; one failing pair does not stop the others."""
+    """Match what is not up to date in one row."""
     path = task.workspace.matches(task.image_id0)
-    old = {} if task.overwrite else _usable_row(path)
-    entries, failures, made = [], [], []
+    old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
-    for pair in task.pairs:
-        entry = old.get(pair.image_id1)
-        if entry is None or entry.fingerprint != pair.fingerprint:
-            outcome = guarded(lambda one: _match_pair(task, one, features0), pair)
-            if outcome.value is None:
-                failures.append((f"{task.image_id0} {pair.image_id1}", outcome.error))
-                continue
-            entry = outcome.value
-            made.append(len(entry.matches.indices))
-        entries.append(entry)
-    write_atomically(path, lambda stream: write_match_row(stream, entries))
-    return RowResult(len(made), sum(made), tuple(failures))
+    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0))
+    write_atomically(path, lambda stream: write_match_row(stream, row.entries))
+    return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)
 
 
 def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
     path1 = task.workspace.features(pair.image_id1)
     matches = task.matcher(features0, _features(path1, _stamp(path1)), pair.geometry)
     return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
-
-
-def _usable_row(path: Path) -> dict[str, MatchEntry]:
-    """The row as far as it can be read: a broken file is made again."""
-    try:
-        return read_match_row(path)
-    except BrokenFileError:
-        return {}
 
 
 def _stamp(path: Path) -> int:
@@ -126,21 +95,12 @@ def run(context: Context) -> StageReport:
     report = StageReport("match")
     tasks = make_tasks(context)
     on_file = {task.image_id0: row_fingerprints(context.workspace.matches(task.image_id0)) for task in tasks}
-    todo = [task for task in tasks if context.overwrite or not _is_done(task, on_file[task.image_id0])]
+    todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
     results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
     report.failures.extend(failure for result in results for failure in result.failures)
     report.done = sum(result.done for result in results)
-    report.skipped = 0 if context.overwrite else sum(_kept(task, on_file[task.image_id0]) for task in tasks)
+    report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     report.facts = {"matches": sum(result.found for result in results)} if report.done else {}
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     return report.write(context.workspace, context.shard)
-
-
-def _is_done(task: MatchTask, on_file: dict[str, str]) -> bool:
-    """Exactly the wanted pairs, each up to date: pairs that are no longer wanted leave the file."""
-    return on_file == {pair.image_id1: pair.fingerprint for pair in task.pairs}
-
-
-def _kept(task: MatchTask, on_file: dict[str, str]) -> int:
-    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in task.pairs)

@@ -42,19 +42,7 @@ def prepare(
     else:
         workspace.create()
     assembled = assemble(settings, workspace, executor)
-    context = Context(
-        settings=settings,
-        workspace=workspace,
-        executor=executor,
-        block=assembled.block,
-        pairs=(),
-        image_fingerprints=assembled.image_fingerprints,
-        given_poses=assembled.block.poses,
-        guessed_cameras=assembled.guessed_cameras,
-        shard=shard,
-        overwrite=overwrite,
-    )
-    context = without_distrusted(context)
+    context = without_distrusted(_context(settings, workspace, executor, assembled, shard, overwrite))
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
     if pairs is not None:
@@ -62,9 +50,10 @@ def prepare(
     else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-    summary = summarise(assembled.block, pairs, assembled.guessed_cameras)
+    summary = summarise(assembled.block, pairs)
     report.facts = {
         "summary": list(summary.lines()),
+        "block": summary.figures(),
         "warnings": [*assembled.warnings, *summary.warnings],
         "images": len(assembled.block.images),
         "distrusted": sorted(_turned(context)),
@@ -87,6 +76,29 @@ def prepare(
             "(the warnings above), or use --set pairs=exhaustive"
         )
     return context, report
+
+
+def _context(
+    settings: Settings,
+    workspace: Workspace,
+    executor: Executor,
+    assembled: Assembled,
+    shard: Shard | None,
+    overwrite: bool,
+) -> Context:
+    """The context without pairs, with every given attitude."""
+    return Context(
+        settings=settings,
+        workspace=workspace,
+        executor=executor,
+        block=assembled.block,
+        pairs=(),
+        image_fingerprints=assembled.image_fingerprints,
+        given_poses=assembled.block.poses,
+        guessed_cameras=assembled.guessed_cameras,
+        shard=shard,
+        overwrite=overwrite,
+    )
 
 
 def _check_files(settings: Settings) -> None:

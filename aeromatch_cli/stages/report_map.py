@@ -25,10 +25,12 @@ MAX_LINES = 20000
 MAX_FOOTPRINTS = 3000
 MAX_LABELS = 60
 
+_LABEL_CHARACTER, _LABEL_HEIGHT = 6.2, 9.0
 _MAP_WIDTH = 1100.0
 _MAP_HEIGHTS = (320.0, 1000.0)
-# Side of the frame over the extent of the cameras.
+# Side of the frame over the extent of the cameras, and over the extent of what it shows.
 _LARGEST_FRAME = 5.0
+_AIR = 1.08
 _MARGIN_LEFT, _MARGIN_BOTTOM, _MARGIN = 64.0, 44.0, 14.0
 
 
@@ -143,19 +145,19 @@ def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], lin
 
 
 def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> _Frame:
-    """All cameras and footprints, up to a size that does not shrink the cameras to a dot, as views of the horizon would."""
+    """All cameras, and of the footprints what does not shrink the cameras to a dot, as views of the horizon would."""
     centers = np.array([[s.x_m, s.y_m] for s in stations])
     low, high = centers.min(axis=0), centers.max(axis=0)
     if footprints:
         corners = np.concatenate(list(footprints))
         sizes = [float(np.ptp(polygon, axis=0).max()) for polygon in footprints]
         # Of cameras close together, or only one, the footprints alone tell a size.
-        most = max((_LARGEST_FRAME - 1.0) / 2.0 * float((high - low).max()), 0.6 * float(np.median(sizes)))
+        most = max((_LARGEST_FRAME / _AIR - 1.0) / 2.0 * float((high - low).max()), 0.15 * float(np.median(sizes)))
         low = np.maximum(np.minimum(low, corners.min(axis=0)), low - most)
         high = np.minimum(np.maximum(high, corners.max(axis=0)), high + most)
     span = np.maximum(high - low, max(float((high - low).max()) * 0.02, 1.0))
     middle = (low + high) / 2
-    low, high = middle - span * 0.54, middle + span * 0.54
+    low, high = middle - span * _AIR / 2, middle + span * _AIR / 2
     inner = _MAP_WIDTH - _MARGIN_LEFT - _MARGIN
     scale = min(inner / float(high[0] - low[0]), _MAP_HEIGHTS[1] / float(high[1] - low[1]))
     # What is left of the page's width and of the least height shows more ground.
@@ -237,11 +239,21 @@ def _stations(place: dict[str, tuple[float, float]], stations: Sequence[Station]
             f"<title>{escape(station.title)}</title></circle>"
         )
     if len(stations) <= MAX_LABELS:
-        parts += [
-            f'<text x="{place[s.image_id][0] + 6:.1f}" y="{place[s.image_id][1] - 5:.1f}">{escape(s.label)}</text>'
-            for s in stations
-        ]
+        parts += _labels(place, stations)
     return [*parts, "</g>"]
+
+
+def _labels(place: dict[str, tuple[float, float]], stations: Sequence[Station]) -> list[str]:
+    """Labels that do not lie on an earlier one; the tooltips name every camera. Weak and suspect ones come first."""
+    parts: list[str] = []
+    taken: list[tuple[float, float, float]] = []
+    for station in sorted(stations, key=lambda s: (not s.suspect, not s.weak)):
+        x, y = place[station.image_id][0] + 6, place[station.image_id][1] - 5
+        end = x + _LABEL_CHARACTER * len(station.label)
+        if all(end < left or right < x or abs(y - line) > _LABEL_HEIGHT for left, right, line in taken):
+            taken.append((x, end, y))
+            parts.append(f'<text x="{x:.1f}" y="{y:.1f}">{escape(station.label)}</text>')
+    return parts
 
 
 def _north_arrow(frame: _Frame) -> str:

@@ -153,8 +153,8 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
 
 
 def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:
-    ids = (pair.image_id0, pair.image_id1)
-    known = (*ids, *(context.image_by_id[i].name for i in ids), pair.overlap, pair.view_angle_deg, pair.reason)
+    names = (context.image_by_id[pair.image_id0].name, context.image_by_id[pair.image_id1].name)
+    known = (pair.image_id0, pair.image_id1, *names, pair.overlap, pair.view_angle_deg, pair.reason)
     if entry is None:
         words = "no matches on file: the match stage failed or has not run"
         return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})

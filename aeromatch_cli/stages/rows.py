@@ -1,0 +1,80 @@
+"""Rows: all pairs of one image in one file, redone pair by pair. What match and filter share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar
+
+from aeromatch_cli.data import PairGeometry
+from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.executor import guarded
+
+
+class Entry(Protocol):
+    """What a row holds of one pair."""
+
+    @property
+    def fingerprint(self) -> str: ...
+
+
+E = TypeVar("E", bound=Entry)
+
+
+@dataclass(frozen=True, eq=False)
+class PairTask:
+    """One pair of a row: its geometry, the fingerprint that its result must carry, and the seed of what is random."""
+
+    geometry: PairGeometry
+    fingerprint: str
+    seed: int
+
+    @property
+    def image_id1(self) -> str:
+        return self.geometry.pair.image_id1
+
+
+@dataclass(frozen=True, eq=False)
+class Row(Generic[E]):
+    """entries: of all pairs that could be made, in order; made: the new ones among them; failures: (pair, reason)."""
+
+    entries: tuple[E, ...]
+    made: tuple[E, ...]
+    failures: tuple[tuple[str, str], ...]
+
+
+def redo(image_id0: str, pairs: Sequence[PairTask], old: Mapping[str, E], make: Callable[[PairTask], E]) -> Row[E]:
+    """Keep the entries that carry the wanted fingerprint, make the others; one failing pair does not stop the rest."""
+    entries, made, failures = [], [], []
+    for pair in pairs:
+        entry = old.get(pair.image_id1)
+        if entry is None or entry.fingerprint != pair.fingerprint:
+            outcome = guarded(make, pair)
+            if outcome.value is None:
+                failures.append((f"{image_id0} {pair.image_id1}", outcome.error))
+                continue
+            entry = outcome.value
+            made.append(entry)
+        entries.append(entry)
+    return Row(tuple(entries), tuple(made), tuple(failures))
+
+
+def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) -> dict[str, E]:
+    """The row on file as far as it is wanted and can be read: a broken file is made again."""
+    if overwrite:
+        return {}
+    try:
+        return read(path)
+    except BrokenFileError:
+        return {}
+
+
+def is_done(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> bool:
+    """Exactly the wanted pairs, each up to date: pairs that are no longer wanted leave the file."""
+    return dict(on_file) == {pair.image_id1: pair.fingerprint for pair in pairs}
+
+
+def kept(pairs: Sequence[PairTask], on_file: Mapping[str, str]) -> int:
+    """How many of the wanted pairs are on file and up to date."""
+    return sum(on_file.get(pair.image_id1) == pair.fingerprint for pair in pairs)
