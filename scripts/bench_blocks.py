@@ -9,7 +9,7 @@ place with two orientations twice); images registered by pycolmap's incremental 
 The budget is exact on both sides, in COLMAP's sense of a keypoint (a place with two orientations counts twice).
 pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. Peer `pycolmap` is therefore cut to
 the budget after extraction, untimed, largest scales first as its own rule would; peer `pycolmap-uncut` is not.
-Writes OUT/results.json and OUT/table.md; with --readme also the README's table.
+Writes OUT/results.json and OUT/table.md; with --readme SECTION also that table of the README.
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--peers", default=",".join(PEERS))
     parser.add_argument("--no-mapping", action="store_true", help="leave out pycolmap's mapping")
-    parser.add_argument("--readme", action="store_true", help="write the table into the README")
+    parser.add_argument("--readme", metavar="SECTION", help="write the table into the README: blocks, thinned")
     parser.add_argument("--out", type=Path, default=Path("bench/blocks"))
     for name in ("--step", "--images", "--reference", "--work"):
         parser.add_argument(name, type=str if name == "--step" else Path, help=argparse.SUPPRESS)
@@ -272,8 +272,8 @@ def main() -> None:
     (args.out / "table.md").write_text(table(rows), encoding="utf-8")
     print(table(rows))
     if args.readme:
-        command = f"scripts/bench_blocks --blocks {args.blocks} --thin {args.thin} --keypoints {args.keypoints}"
-        write_readme(f"`{command}`, {args.jobs} cores\n\n{table(rows)}", "bench_blocks")
+        command = f"scripts/bench_blocks --data DIR --blocks {args.blocks} --thin {args.thin} --keypoints {args.keypoints}"
+        write_readme(f"    {command}\n\n{table(rows)}", f"bench_{args.readme}")
 
 
 if __name__ == "__main__":
