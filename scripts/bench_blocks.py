@@ -272,7 +272,9 @@ def main() -> None:
     (args.out / "table.md").write_text(table(rows), encoding="utf-8")
     print(table(rows))
     if args.readme:
-        command = f"scripts/bench_blocks --data DIR --blocks {args.blocks} --thin {args.thin} --keypoints {args.keypoints}"
+        command = (
+            f"scripts/bench_blocks --data DIR --blocks {args.blocks} --thin {args.thin} --keypoints {args.keypoints}"
+        )
         write_readme(f"    {command}\n\n{table(rows)}", f"bench_{args.readme}")
 
 

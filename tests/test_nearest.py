@@ -9,7 +9,8 @@ from aeromatch_cli.data import Features, Pair, PairGeometry
 from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.strategies.matchers import MATCHERS
 from aeromatch_cli.strategies.matchers import nearest as nearest_module
-from aeromatch_cli.strategies.matchers.nearest import Nearest, mutual_nearest, one_to_one
+from aeromatch_cli.strategies.matchers.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.nearest import Nearest, mutual_nearest
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
 GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)

@@ -19,7 +19,7 @@ from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeom
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.matchers.nearest import one_to_one
+from aeromatch_cli.strategies.matchers.assignment import one_to_one
 
 if TYPE_CHECKING:
     from aeromatch_cli.nets.lightglue import Dimensions
