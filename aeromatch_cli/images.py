@@ -246,7 +246,7 @@ def view_maps(camera: Camera, view: View) -> tuple[FloatArray, FloatArray]:
         grid = distort(camera, apply_homography(view.undistorted_from_view, nodes)).reshape(rows, columns, 2)
         error = _interpolation_error_px(grid, camera)
     full = cv2.resize(grid.astype(np.float32), (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    part: FloatArray = full[step : step + view.height_px, step : step + view.width_px]
+    part: FloatArray = np.asarray(full[step : step + view.height_px, step : step + view.width_px], dtype=np.float32)
     part[np.isnan(part)] = -1e6
     return part[..., 0], part[..., 1]
 

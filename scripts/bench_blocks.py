@@ -272,9 +272,7 @@ def main() -> None:
     (args.out / "table.md").write_text(table(rows), encoding="utf-8")
     print(table(rows))
     if args.readme:
-        command = (
-            f"scripts/bench_blocks --data DIR --blocks {args.blocks} --thin {args.thin} --keypoints {args.keypoints}"
-        )
+        command = f"scripts/bench_blocks --data DIR --blocks {args.blocks} --peers {args.peers} --thin {args.thin}"
         write_readme(f"    {command}\n\n{table(rows)}", f"bench_{args.readme}")
 
 
