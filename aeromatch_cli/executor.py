@@ -27,6 +27,13 @@ log = logging.getLogger("aeromatch")
 
 # One thread inside each worker: the processes are the parallelism, and results do not depend on thread counts.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+# glibc gives the large arrays of every image back to the system and faults them in again for the next one: 40 % of
+# the time of SIFT. Workers keep them instead; their peak grows by a tenth (measured on 12 megapixels).
+_KEPT_BYTES = str(4_000_000_000)
+_WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {
+    "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
+    "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
+}
 
 
 class Progress(Protocol):
@@ -85,10 +92,10 @@ def _leave_with_parent() -> None:
 
 
 @contextlib.contextmanager
-def _thread_environment() -> Iterator[None]:
-    """Workers inherit one-thread settings; BLAS reads them when it is loaded, before any initializer runs."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+def _worker_environment() -> Iterator[None]:
+    """Workers inherit these settings; BLAS and glibc read them when they are loaded, before any initializer runs."""
+    before = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
+    os.environ.update(_WORKER_ENVIRONMENT)
     try:
         yield
     finally:
@@ -225,7 +232,7 @@ class Executor:
 
     def _processes(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            with _thread_environment():
+            with _worker_environment():
                 self._pool = ProcessPoolExecutor(
                     self.jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_worker_start
                 )
