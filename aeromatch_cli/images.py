@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose, View
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import distort, resized, world_rays
+from aeromatch_cli.geometry.footprints import sees_horizon
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.warps import area_scale
 
@@ -176,12 +177,8 @@ def shrink_camera(camera: Camera, scale: float) -> Camera:
 
 
 def sees_sky(camera: Camera, pose: Pose | None) -> bool:
-    """Whether some corner of the image looks above the horizon."""
-    if pose is None or pose.world_rotation is None:
-        return False
-    right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
-    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
-    return not (world_rays(camera, pose.world_rotation, corners)[:, 2] < 0).all()
+    """Whether some part of the image's border looks level or above the horizon."""
+    return pose is not None and pose.world_rotation is not None and sees_horizon(camera, pose.world_rotation)
 
 
 def below_horizon(camera: Camera, world_rotation: FloatArray) -> BoolArray:
