@@ -53,6 +53,11 @@ reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up
                              weakly_tied, rotation_contradicts_pose (image_id -> degrees); of export: exporter ->
                              files and counts.
 
+evaluation/                  of `aeromatch evaluate`: evaluation.json (format_version, workspace, truth, truth_kind,
+                             images, left_out, min_overlap, totals, conditions, summary, consumer, seconds;
+                             figures as in evaluate/totals.py, null where unknown), pairs.csv (a line per pair: names,
+                             state, conditions, figures as in evaluate/scores.py), conditions.csv, plots as PNG.
+
 export/colmap/               database.db, sparse/{cameras,images,points3D}.txt in COLMAP's own formats and pixel frame
                              (ours + 0.5); world.json: crs, origin_m; a coordinate in the CRS = here + origin.
 """

@@ -70,6 +70,10 @@ class Workspace:
         return self.root / "reports"
 
     @property
+    def evaluation(self) -> Path:
+        return self.root / "evaluation"
+
+    @property
     def report(self) -> Path:
         return self.root / "report" / "index.html"
 

@@ -109,7 +109,7 @@ class Site:
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five overlapping images with poses; tests copy it and leave this one alone."""
     folder = tmp_path_factory.mktemp("rendered")
-    render_block(folder, "town", seed=3, width_px=WIDTH, height_px=HEIGHT, images=IMAGES)
+    render_block(folder, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=IMAGES)
     return folder
 
 

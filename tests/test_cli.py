@@ -283,3 +283,12 @@ def test_every_other_command_as_a_process(done_site: Site, tmp_path: Path):
     done = run_process("extract", "baseline", "--images", tmp_path / "fehlt-ü", "--json", env=environment)
     assert done.returncode == 2
     assert "does not exist" in json.loads(done.stdout)["error"]
+
+
+def test_help_of_synth_names_every_scene_and_flight() -> None:
+    from aeromatch_cli import cli
+    from aeromatch_cli.synthetic import PRESETS
+    from aeromatch_cli.synthetic.flights import FLIGHTS
+
+    assert cli._SCENES.split(", ") == list(PRESETS)
+    assert cli._FLIGHTS.split(", ") == list(FLIGHTS)

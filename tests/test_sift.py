@@ -74,6 +74,17 @@ def test_the_budget_is_exact(budget):
     assert np.array_equal(np.unique(features.descriptor_keypoint_idx), np.arange(keypoints))
 
 
+def test_the_budget_is_for_the_image_or_for_each_view():
+    gray = texture(400, 300)
+    views = (source(gray), shrunk_view(gray))
+    whole = Sift(keypoints=60)(camera_of(gray), views)
+    each = Sift(keypoints=60, budget="view")(camera_of(gray), views)
+    assert len(whole.descriptors) == 60
+    assert np.bincount(each.view_idx).tolist() == [60, 60]
+    alone = [Sift(keypoints=60, budget=b)(camera_of(gray), views[:1]).descriptors for b in ("image", "view")]
+    assert np.array_equal(*alone)
+
+
 def test_fewer_only_where_fewer_exist():
     gray = texture(200, 150)
     everything = extract(gray, keypoints=10**6)

@@ -134,10 +134,7 @@ def test_local_frame_may_hold_zero_and_low_ground() -> None:
     assert summarise(shifted).warnings == ()
 
 
-def test_guessed_focal_length_and_unpaired_images() -> None:
-    (guessed,) = summarise(block(), guessed_cameras=("cam",)).warnings
-    assert "focal length of 6 images" in guessed
-    assert "--cameras" in guessed
+def test_unpaired_images_are_named() -> None:
     pairs = [Pair(f"img{i}", f"img{i + 1}", 0.8, 5.0, "overlap") for i in range(4)]
     summary = summarise(block(), pairs)
     assert summary.unpaired == ("flight/img5.jpg",)

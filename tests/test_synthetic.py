@@ -9,25 +9,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from make_scenes import NOON_WEST, make_scene, make_truth, make_view, one_box
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
-from aeromatch_cli.geometry.cameras import focal_px, from_colmap
+from aeromatch_cli.geometry.cameras import MODELS, colmap_params
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
-from aeromatch_cli.synthetic import Truth, flight, load_truth, noise, read_depth, render_block, transfer
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.render import ray_grid, render_image
-from aeromatch_cli.synthetic.scene import Scene, assemble, build_scene, sun_direction
-from aeromatch_cli.synthetic.solids import Footprint, Material, Surface, box, crown, gabled_house, ground_square
+from aeromatch_cli.synthetic import Truth, load_truth, noise, render_block, transfer
+from aeromatch_cli.synthetic.flights import Exterior
+from aeromatch_cli.synthetic.light import Light
+from aeromatch_cli.synthetic.render import render_image
+from aeromatch_cli.synthetic.sensor import Development
+from aeromatch_cli.synthetic.shade import Stage
+from aeromatch_cli.synthetic.solids import Material
+from aeromatch_cli.synthetic.terrain import Area, Flat, sample_terrain
 
 WIDTH, HEIGHT = 240, 180
-PLAIN = (Material.PAINT, (0.5, 0.5, 0.5))
+NOISELESS = Development(exposure=0.3, vignetting=0.0, blur_px=0.0, read_noise=0.0, shot_noise=0.0)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("synthetic") / "block"
-    render_block(out, "town", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3)
+    render_block(out, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3)
     return out
 
 
@@ -68,7 +72,7 @@ def test_every_pixel_shows_the_point_that_projects_there(folder: Path, truth: Tr
         surface = truth.surface_points(name, pixels)
         places, depth = project_by_hand(folder, name, surface)
         assert np.abs(places - pixels).max() < 1e-6  # asked for: 0.02 px
-        stored = read_depth(folder, name)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        stored = truth.depth_m(name)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
         np.testing.assert_allclose(stored, depth, rtol=1e-7)  # float32
         assert np.median(np.abs(surface[:, 2])) < 1e-9  # most of it is ground, exactly at z = 0
 
@@ -96,7 +100,7 @@ def test_known_corners_and_ground_points_are_seen_where_they_project(folder: Pat
     # The depth map agrees at the nearest pixel wherever the surface is level around it.
     column, row = np.rint(places[hit]).astype(int).T
     level = known[hit][:, 2] == 0.0
-    nearest = read_depth(folder, name)[row, column]
+    nearest = truth.depth_m(name)[row, column]
     assert np.median(np.abs(nearest - depth[hit])[level]) < 0.05
 
 
@@ -111,13 +115,14 @@ def test_transfer_agrees_with_projection_by_hand_and_with_depth(folder: Path, tr
     # Second opinion from image 1's depth map, away from its edges.
     inner = ((places > 1) & (places < [WIDTH - 2, HEIGHT - 2])).all(axis=1)
     x, y = np.rint(places[inner]).astype(int).T
-    around = np.stack([read_depth(folder, name1)[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    around = np.stack([truth.depth_m(name1)[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     in_front = around.max(axis=0) < depth[inner] - 1.0
     open_to_view = around.min(axis=0) > depth[inner] - 0.1
-    assert in_front.sum() > 50
+    assert in_front.sum() > 30
     assert open_to_view.sum() > 1000
     assert hidden[inner][in_front].all()
-    assert not hidden[inner][open_to_view].any()
+    # Twigs and posts are thinner than a pixel: the depth map cannot show all of them.
+    assert hidden[inner][open_to_view].mean() < 0.003
 
 
 def test_two_renders_agree_in_brightness_only_at_the_true_place(folder: Path, truth: Truth) -> None:
@@ -150,18 +155,12 @@ def test_two_renders_agree_in_brightness_only_at_the_true_place(folder: Path, tr
         assert abs(0.25 * (plus - minus) / (2 * best - plus - minus)) < 0.05
 
 
-def one_box() -> Scene:
-    """A box of 10 m x 10 m x 20 m around the origin; the sun 45 degrees high in the west."""
-    solids = box(Footprint(0.0, 0.0, 10.0, 10.0, 0.0), 0.0, 20.0, PLAIN, PLAIN)
-    return assemble("box", 0, 50.0, [ground_square(500.0, 0.0), *solids], sun_direction(270.0, 45.0), {})
-
-
 def test_hidden_points_and_shadow_of_one_box_worked_by_hand() -> None:
     scene = one_box()
     camera = Camera("SIMPLE_PINHOLE", 201, 201, (100.0, 100.0, 100.0))
-    down = from_omega_phi_kappa(0.0, 0.0, 0.0)
-    nadir, east = (flight.Exterior(x, 0.0, 100.0, 0.0, 0.0, 0.0).pose() for x in (0.0, 60.0))
-    truth = Truth(scene, RayCaster(scene), {"a": camera, "b": camera}, {"a": nadir, "b": east})
+    truth = make_truth(
+        scene, camera, a=Exterior(0.0, 0.0, 100.0, 0.0, 0.0, 0.0), b=Exterior(60.0, 0.0, 100.0, 0.0, 0.0, 0.0)
+    )
     # Seen from above the origin, ground x maps to column 100 + x and roof x to 100 + x / 0.8.
     pixels = np.array(
         [[100 - 8, 100], [100 - 21, 100], [100 - 22, 100], [100 + 8, 100], [100 + 5, 100], [100, 100]], float
@@ -172,64 +171,134 @@ def test_hidden_points_and_shadow_of_one_box_worked_by_hand() -> None:
     assert hidden.tolist() == [True, True, False, False, False, False]
     np.testing.assert_allclose(places[:, 0], [32, 19, 18, 48, 30, 25], atol=1e-9)
     np.testing.assert_allclose(places[:, 1], 100.0, atol=1e-9)
-    # The sun stands 45 degrees high: the box of 20 m throws its shadow from x = 5 to x = 25.
+    # The sun stands 45 degrees high in the west: the box of 20 m throws its shadow from x = 5 to x = 25.
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
-    ground = np.array([[6.0, 0, 0], [24.9, 0, 0], [25.1, 0, 0], [-6.0, 0, 0]])
-    assert truth.caster.is_free(ground, up, scene.to_sun).tolist() == [False, False, True, True]
-    picture = render_image(
-        scene, truth.caster, ray_grid(camera), down, nadir.center_m,
-        exposure=0.8, noise_sigma=0.0, rng=np.random.default_rng(0),
-    )  # fmt: skip
+    ground = np.array([[6.0, 0, 0], [24.7, 0, 0], [25.3, 0, 0], [-6.0, 0, 0]])
+    assert truth.caster.is_free(ground, up, NOON_WEST.to_sun).tolist() == [False, False, True, True]
+    view = make_view(camera, Exterior(0.0, 0.0, 100.0, 0.0, 0.0, 0.0))
+    picture = render_image(Stage(scene, truth.caster, NOON_WEST), view, NOISELESS, np.random.default_rng(0))
     assert picture.depth_m[100, 100] == pytest.approx(80.0, abs=1e-5)
     assert picture.depth_m[100, 120] == pytest.approx(100.0, abs=1e-5)
+    assert picture.sun[100, 107:125].max() < 10
+    assert picture.sun[100, 127:].min() == 255
+    assert picture.sun[100, 100] == 255
     lit, dark = picture.pixels[95:106, 128:135].mean((0, 1)), picture.pixels[95:106, 110:122].mean((0, 1))
-    assert (dark < 0.6 * lit).all()
+    assert (dark < [0.55 * lit[0], 0.6 * lit[1], 0.65 * lit[2]]).all()
     assert dark[2] / dark[0] > lit[2] / lit[0]  # the sky's light is bluer than the sun's
+
+
+def test_penumbra_is_as_wide_as_the_sun() -> None:
+    """Behind an edge 20 m high under a 45 degree sun the disc of 0.533 degrees blurs the shadow over 0.53 m."""
+    scene = one_box()
+    camera = Camera("SIMPLE_PINHOLE", 201, 21, (4000.0, -2400.0, 10.0))  # 1/40 m a pixel; x = 62.5 / 2.5 at the left
+    truth = make_truth(scene, camera, a=Exterior(-37.0, 0.0, 100.0, 0.0, 0.0, 0.0))
+    view = make_view(camera, Exterior(-37.0, 0.0, 100.0, 0.0, 0.0, 0.0))
+    picture = render_image(Stage(scene, truth.caster, NOON_WEST), view, NOISELESS, np.random.default_rng(0))
+    x_m = truth.surface_points("a", np.stack([np.arange(201.0), np.full(201, 10.0)], axis=1))[:, 0]
+    share = picture.sun[10] / 255.0
+    distance, radius = 20.0 * np.sqrt(2.0), np.tan(np.deg2rad(0.2665))
+    # Share of a disc of unit radius on one side of a chord at h: (acos(h) - h sqrt(1 - h^2)) / pi.
+    h = np.clip((25.0 - x_m) / np.sqrt(2.0) / (distance * radius), -1.0, 1.0)
+    expected = (np.arccos(h) - h * np.sqrt(1.0 - h**2)) / np.pi
+    assert x_m[0] < 24.5 < 25.5 < x_m[-1]
+    assert np.abs(share - expected).max() < 0.13  # sixteen rays stand for the disc
+    assert np.abs(share - expected).mean() < 0.02
 
 
 def test_colour_is_centred_on_its_pixel() -> None:
     """A camera turned by 180 degrees about its axis takes the same picture, turned: any constant shift would double."""
     scene, camera = one_box(), Camera("SIMPLE_RADIAL", 81, 61, (80.0, 40.0, 30.0, -0.02))
-    caster, rays = RayCaster(scene), ray_grid(camera)
-    taken = []
-    for kappa_deg in (0.0, 180.0):
-        rotation = from_omega_phi_kappa(0.0, 0.0, kappa_deg)
-        center_m = np.array([3.0, -2.0, 60.0])
-        rng = np.random.default_rng(0)
-        taken.append(render_image(scene, caster, rays, rotation, center_m, exposure=0.8, noise_sigma=0.0, rng=rng))
+    stage = Stage(scene, make_truth(scene, camera).caster, NOON_WEST)
+    taken = [
+        render_image(stage, make_view(camera, Exterior(3.0, -2.0, 60.0, 0.0, 0.0, kappa)), NOISELESS, _rng())
+        for kappa in (0.0, 180.0)
+    ]
     turned = taken[1].pixels[::-1, ::-1].astype(float)
-    assert np.abs(taken[0].pixels - turned).mean() < 0.2
-    assert np.abs(np.roll(taken[0].pixels, 1, axis=1) - turned)[:, 1:].mean() > 3.0
+    difference = np.abs(taken[0].pixels - turned)
+    assert np.median(difference) <= 1.0
+    assert np.abs(np.roll(taken[0].pixels, 1, axis=1) - turned)[:, 1:].mean() > 2.0 * difference.mean() + 1.0
     np.testing.assert_allclose(taken[0].depth_m, taken[1].depth_m[::-1, ::-1], rtol=1e-6)
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(0)
 
 
 def test_sky_has_no_depth_and_no_place() -> None:
     scene = one_box()
     camera = Camera("SIMPLE_PINHOLE", 41, 41, (30.0, 20.0, 20.0))
-    level = flight.Exterior(0.0, -80.0, 30.0, 90.0, 0.0, 0.0).pose()
-    caster = RayCaster(scene)
-    truth = Truth(scene, caster, {"a": camera}, {"a": level})
+    level = Exterior(0.0, -80.0, 30.0, 90.0, 0.0, 0.0)
+    truth = make_truth(scene, camera, a=level)
     places, hidden = truth.transfer("a", np.array([[20.0, 0.0], [20.0, 40.0]]), "a")
     assert np.isnan(places[0]).all()
     np.testing.assert_allclose(places[1], [20.0, 40.0], atol=1e-9)
     assert hidden.tolist() == [True, False]
-    assert level.world_rotation is not None
-    picture = render_image(
-        scene, caster, ray_grid(camera), level.world_rotation, level.center_m,
-        exposure=1.0, noise_sigma=0.0, rng=np.random.default_rng(0),
-    )  # fmt: skip
+    picture = render_image(Stage(scene, truth.caster, NOON_WEST), make_view(camera, level), NOISELESS, _rng())
     assert np.isnan(picture.depth_m[0]).all()
+    assert (picture.surface[0] == 0).all()
     assert np.isfinite(picture.depth_m[40]).all()
+    assert (picture.surface[40] > 0).all()
+
+
+def test_relief_is_met_where_its_triangles_are() -> None:
+    """A slope of 1 in 5 towards the east: the place below a pixel follows from two lines that cross."""
+
+    class Slope(Flat):
+        def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+            return 0.2 * xy_m[:, 0]
+
+    scene = make_scene(terrain=Slope(cell_m=5.0))
+    camera = Camera("SIMPLE_PINHOLE", 101, 101, (100.0, 50.0, 50.0))
+    truth = make_truth(scene, camera, a=Exterior(0.0, 0.0, 100.0, 0.0, 0.0, 0.0))
+    points = truth.surface_points("a", np.array([[50.0, 50.0], [100.0, 50.0], [0.0, 50.0]]))
+    # z = 0.2 x and x = 0.5 (100 - z): x = 50 / 1.1; on the other side x = -50 / 0.9.
+    np.testing.assert_allclose(points[:, 0], [0.0, 50.0 / 1.1, -50.0 / 0.9], atol=1e-9)
+    np.testing.assert_allclose(points[:, 2], 0.2 * points[:, 0], atol=1e-9)
+
+
+def test_dem_holds_the_ground(folder: Path, truth: Truth) -> None:
+    import rasterio
+
+    with rasterio.open(folder / "dem.tif") as dem:
+        heights_m, transform = dem.read(1), dem.transform
+    ground = truth.scene.ground
+    for row, column in ((0, 0), (3, 5), (len(heights_m) - 1, heights_m.shape[1] - 1)):
+        x, y = transform.c + (column + 0.5) * transform.a, transform.f + (row + 0.5) * transform.e
+        i, j = np.argmin(np.abs(ground.y_m - y)), np.argmin(np.abs(ground.x_m - x))
+        assert (ground.x_m[j], ground.y_m[i]) == pytest.approx((x, y), abs=1e-9)
+        assert heights_m[row, column] == pytest.approx(ground.z_m[i, j], abs=1e-4)
+
+
+def test_ground_grid_is_closed_and_shared_between_areas() -> None:
+    class Waves(Flat):
+        def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+            return np.sin(xy_m[:, 0]) * np.cos(xy_m[:, 1])
+
+    small, large = (sample_terrain(Waves(cell_m=3.0), Area(-a, -a, a, 2 * a)) for a in (20.0, 50.0))
+    heights = {
+        (x, y): z for y, row in zip(large.y_m, large.z_m, strict=True) for x, z in zip(large.x_m, row, strict=True)
+    }
+    x0, y0, even = small.even_part()
+    assert all(
+        heights[(x0 + 3.0 * j, y0 + 3.0 * i)] == even[i, j] for i in range(len(even)) for j in range(even.shape[1])
+    )
+    triangles = small.triangles_m()
+    edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2, 3)
+    directed = {tuple(map(tuple, edge)) for edge in edges.round(9).tolist()}
+    unpaired = [edge for edge in directed if edge[::-1] not in directed]
+    assert len(unpaired) == 2 * (len(small.x_m) + len(small.y_m) - 2)  # only the rim
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert (normals[:, 2] > 0).all()
 
 
 def test_equal_seeds_give_equal_bytes_and_other_seeds_other_scenes(folder: Path, tmp_path: Path) -> None:
-    render_block(tmp_path / "again", "town", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3)
+    render_block(tmp_path / "again", "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3, jobs=2)
     written = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(written) == 3 + 3 + 4
+    assert len(written) == 3 + 3 * 3 + 5
     for path in written:
         assert (folder / path).read_bytes() == (tmp_path / "again" / path).read_bytes(), path
-    render_block(tmp_path / "other", "town", seed=4, width_px=WIDTH, height_px=HEIGHT, images=1)
-    picture, other = (cv2.imread(str(p / "images/town_0001.jpg"), 0) for p in (folder, tmp_path / "other"))
+    render_block(tmp_path / "other", "suburb", seed=4, width_px=WIDTH, height_px=HEIGHT, images=1)
+    picture, other = (cv2.imread(str(p / "images/suburb_0001.jpg"), 0) for p in (folder, tmp_path / "other"))
     assert np.abs(picture.astype(float) - other).mean() > 10
 
 
@@ -240,61 +309,30 @@ def test_poses_and_camera_round_trip(folder: Path, truth: Truth) -> None:
         np.testing.assert_allclose(to_omega_phi_kappa(rotation), angles, atol=1e-9)
         assert np.array_equal(truth.poses[row["image"]].world_rotation, rotation)
     lens = json.loads((folder / "block.json").read_text())["cameras"]["1"]
-    camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
-    assert camera == flight.make_camera(WIDTH, HEIGHT)
-    assert json.loads((folder / "block.json").read_text())["ground_z"]["p50"] == 0.0
+    assert {(c.model, c.width_px, c.height_px) for c in truth.cameras.values()} == {("SIMPLE_RADIAL", WIDTH, HEIGHT)}
+    assert all(list(colmap_params(camera)) == lens["params"] for camera in truth.cameras.values())
 
 
-def test_noise_of_poses_is_what_is_stated(folder: Path) -> None:
-    facts = json.loads((folder / "truth.json").read_text())
-    exact = flight.Exterior(1.0, 2.0, flight.HEIGHT_M, 1.0, -1.0, 90.0)
-    rng = np.random.default_rng(0)
-    drawn = [flight.noisy(exact, rng) for _ in range(2000)]
-    moved = np.array([[e.x_m - 1.0, e.y_m - 2.0, e.z_m - flight.HEIGHT_M] for e in drawn])
-    turned = np.array([[e.omega_deg - 1.0, e.phi_deg + 1.0, e.kappa_deg - 90.0] for e in drawn])
-    np.testing.assert_allclose(moved.std(axis=0), facts["pose_noise_sigma_position_m"], rtol=0.06)
-    np.testing.assert_allclose(turned.std(axis=0), facts["pose_noise_sigma_angle_deg"], rtol=0.06)
-    assert facts["pose_noise_sigma_position_m"] == pytest.approx(0.05 * facts["flying_height_m"])
-    differing = [a != b for a, b in zip(rows(folder / "poses.csv"), rows(folder / "poses_noisy.csv"), strict=True)]
-    assert all(differing)
-
-
-def test_flight_has_the_stated_overlaps() -> None:
-    camera = flight.make_camera(1000, 750)
-    flown = flight.plan_flight(camera, 12, np.random.default_rng(1))
-    x, y = (np.array([getattr(e, k) for e in flown]).reshape(3, 4) for k in ("x_m", "y_m"))
-    ground_m = flight.HEIGHT_M / focal_px(camera)
-    assert 1 - np.abs(np.diff(y, axis=1)).mean() / (750 * ground_m) == pytest.approx(0.70, abs=0.02)
-    assert 1 - np.diff(x.mean(axis=1)).mean() / (1000 * ground_m) == pytest.approx(0.60, abs=0.02)
-    kappa = np.array([e.kappa_deg for e in flown]).reshape(3, 4)
-    assert (np.abs(kappa[[0, 2]]) < 15).all()
-    assert (np.abs(kappa[1]) > 165).all()
-
-
-@pytest.mark.parametrize(
-    "surfaces",
-    [
-        box(Footprint(3.0, 4.0, 5.0, 6.0, 30.0), 0.0, 7.0, PLAIN, PLAIN),
-        gabled_house(Footprint(3.0, 4.0, 5.0, 6.0, 30.0), 4.0, 7.0, PLAIN, PLAIN),
-        [crown(np.array([3.0, 4.0, 3.5]), 2.0, np.random.default_rng(0), (1, 1, 1))],
-    ],
-    ids=["box", "gabled house", "crown"],
-)
-def test_solids_face_outwards(surfaces: list[Surface]) -> None:
-    triangles = np.concatenate([s.triangles_m for s in surfaces])
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    outwards = triangles.mean(axis=1) - [3.0, 4.0, 2.5]
-    assert (np.einsum("ij,ij->i", normals, outwards) > 0).all()
-    for surface in surfaces:
-        assert surface.u_axis @ surface.v_axis == pytest.approx(0.0, abs=1e-12)
-
-
-def test_a_larger_extent_changes_no_solid_of_the_smaller() -> None:
-    small, large = build_scene("town", 5, 60.0), build_scene("town", 5, 120.0)
-    centres = {tuple(t) for t in large.triangles_m.mean(axis=1).round(6).tolist()}
-    of_solids = small.triangles_m[small.surface_idx > 0].mean(axis=1).round(6).tolist()
-    assert len(large.triangles_m) > 1.5 * len(small.triangles_m)
-    assert all(tuple(t) in centres for t in of_solids)
+@pytest.mark.parametrize("lens", MODELS)
+def test_any_lens_model_is_rendered_exactly(lens: str, tmp_path: Path) -> None:
+    render_block(tmp_path, "grass", width_px=64, height_px=48, images=1, lens=lens)
+    truth = load_truth(tmp_path)
+    (name,) = truth.poses
+    facts = json.loads((tmp_path / "block.json").read_text())["cameras"]["1"]
+    assert facts["model"] == lens
+    given = dict(zip(MODELS[lens], facts["params"], strict=True))
+    pixels = np.array([[1.0, 2.0], [60.0, 5.0], [30.0, 45.0]])
+    surface, pose = truth.surface_points(name, pixels), truth.poses[name]
+    x, y, z = ((surface - pose.center_m) @ np.asarray(pose.world_rotation).T).T
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    k1, k2, p1, p2 = (given.get(k, 0.0) for k in ("k1", "k2", "p1", "p2"))
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+    fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+    places = np.stack([fx * du + given["cx"] - 0.5, fy * dv + given["cy"] - 0.5], axis=1)
+    assert np.abs(places - pixels).max() < 1e-6
 
 
 def test_texture_fades_out_where_it_cannot_be_sampled() -> None:
@@ -314,27 +352,64 @@ def test_texture_fades_out_where_it_cannot_be_sampled() -> None:
     )
 
 
+def test_light_darkens_reddens_and_turns_with_the_sun() -> None:
+    high, low = Light(180.0, 60.0), Light(180.0, 15.0)
+    assert high.to_sun == pytest.approx([0.0, -0.5, np.sqrt(0.75)], abs=1e-12)
+    assert (low.sun < high.sun).all()
+    assert low.sun[2] / low.sun[0] < high.sun[2] / high.sun[0]
+    disc = high.disc(200)
+    angles = np.rad2deg(np.arccos(np.clip(disc @ high.to_sun, -1.0, 1.0)))
+    assert angles.max() < 0.2665
+    assert np.sqrt((angles**2).mean()) == pytest.approx(0.2665 / np.sqrt(2.0), rel=0.02)  # even over the disc
+    light = np.full((2, 3), 0.1, dtype=np.float32)
+    seen = Light(180.0, 60.0, haze_per_km=0.5).through_air(light, np.array([0.0, 2000.0], dtype=np.float32))
+    assert seen[0] == pytest.approx(light[0])
+    assert seen[1, 2] > seen[1, 0] > 0.2
+
+
+def test_pictures_as_ground_texture(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    checker = (np.indices((200, 300)).sum(axis=0) // 20 % 2 * 200 + 20).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "pictures" / "checker.png"), checker)
+    sizes = {"width_px": 96, "height_px": 72, "images": 1, "height_m": 30.0}
+    render_block(tmp_path / "plain", "grass", **sizes)
+    render_block(tmp_path / "laid", "grass", texture=tmp_path / "pictures", **sizes)
+    plain, laid = (cv2.imread(str(tmp_path / k / "images/grass_0001.jpg"), 0).std() for k in ("plain", "laid"))
+    assert laid > 2.0 * plain
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no pictures"):
+        render_block(tmp_path / "none", "grass", texture=tmp_path / "empty", **sizes)
+
+
 def test_arguments_that_cannot_be_used_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with pytest.raises(ConfigError, match=r"'villlage'.*use one of: town"):
+    with pytest.raises(ConfigError, match=r"'villlage'.*use one of: city, suburb"):
         render_block(out, "villlage")
-    with pytest.raises(ConfigError, match="at least 1 image"):
-        render_block(out, "town", images=0)
+    with pytest.raises(ConfigError, match="images"):
+        render_block(out, "city", images=0)
     with pytest.raises(ConfigError, match="16 px"):
-        render_block(out, "town", width_px=8)
+        render_block(out, "city", width_px=8)
     with pytest.raises(ConfigError, match="seed"):
-        render_block(out, "town", seed=-1)
+        render_block(out, "city", seed=-1)
+    with pytest.raises(ConfigError, match=r"'loop'.*nadir, oblique"):
+        render_block(out, "city", flight="loop")
+    with pytest.raises(ConfigError, match="FISHEYE"):
+        render_block(out, "city", lens="FISHEYE")
+    with pytest.raises(ConfigError, match="elevation"):
+        render_block(out, "city", sun_deg=(10.0, 2.0))
+    with pytest.raises(ConfigError, match="flying height"):
+        render_block(out, "city", height_m=0.0)
     assert not out.exists()
 
 
 def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(WorkspaceError, match=r"cannot be written to .*file"):
-        render_block(tmp_path / "file" / "block", "town", width_px=32, height_px=24, images=1)
+        render_block(tmp_path / "file" / "block", "grass", width_px=32, height_px=24, images=1)
     (tmp_path / "mine" / "images").mkdir(parents=True)
     (tmp_path / "mine" / "images" / "holiday.jpg").write_bytes(b"dear")
     with pytest.raises(ConfigError, match=r"holiday\.jpg"):
-        render_block(tmp_path / "mine", "town", width_px=32, height_px=24, images=1)
+        render_block(tmp_path / "mine", "grass", width_px=32, height_px=24, images=1)
     assert (tmp_path / "mine" / "images" / "holiday.jpg").read_bytes() == b"dear"
 
 
@@ -343,6 +418,9 @@ def test_truth_that_cannot_be_trusted_is_refused(folder: Path, truth: Truth, tmp
         load_truth(tmp_path)
     for name in ("truth.json", "block.json", "poses.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
+    bare = load_truth(tmp_path)
+    with pytest.raises(InputError, match=r"suburb_0001\.depth\.tif cannot be read"):
+        bare.depth_m("suburb_0001.jpg")
     facts = json.loads((folder / "truth.json").read_text())
     (tmp_path / "truth.json").write_text(json.dumps(facts | {"scene_version": 0}))
     with pytest.raises(InputError, match="another version"):
@@ -351,17 +429,5 @@ def test_truth_that_cannot_be_trusted_is_refused(folder: Path, truth: Truth, tmp
     (tmp_path / "truth.json").write_text(json.dumps(facts))
     with pytest.raises(InputError, match="damaged"):
         load_truth(tmp_path)
-    with pytest.raises(InputError, match="depth of town_0001"):
-        read_depth(tmp_path, "town_0001.jpg")
     with pytest.raises(ConfigError, match=r"'x\.jpg' is no image"):
-        truth.transfer("x.jpg", np.zeros((1, 2)), "town_0001.jpg")
-
-
-def test_progress_is_reported(tmp_path: Path) -> None:
-    calls: list[tuple[int, int]] = []
-    summary = render_block(
-        tmp_path, "town", width_px=32, height_px=24, images=2, progress=lambda done, total: calls.append((done, total))
-    )
-    assert calls == [(1, 2), (2, 2)]
-    assert summary.images == ("town_0001.jpg", "town_0002.jpg")
-    assert summary.gsd_m == pytest.approx(85.0 / 28.8)
+        truth.transfer("x.jpg", np.zeros((1, 2)), "suburb_0001.jpg")

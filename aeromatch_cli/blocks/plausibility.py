@@ -26,10 +26,10 @@ _LOW_GROUND_M = -40.0
 _RELATIVE_ALTITUDE_M = 1500.0
 
 
-def warnings_of(block: Block, unpaired: Collection[str] = (), guessed_cameras: Collection[str] = ()) -> tuple[str, ...]:
+def warnings_of(block: Block, unpaired: Collection[str] = ()) -> tuple[str, ...]:
     """Every warning about a block, the gravest first.
 
-    unpaired: names of the images that no pair holds. guessed_cameras: camera ids whose focal length is a guess.
+    unpaired: names of the images that no pair holds.
     """
     ids = [i.image_id for i in block.images if i.image_id in block.poses]
     names_by_id = {image.image_id: image.name for image in block.images}
@@ -40,12 +40,6 @@ def warnings_of(block: Block, unpaired: Collection[str] = (), guessed_cameras: C
         *_height_warnings(block, names, centers),
         *_attitude_warnings(block, ids, names),
     ]
-    guessed = [image.name for image in block.images if image.camera_id in set(guessed_cameras)]
-    if guessed:
-        found.append(
-            f"the focal length of {_some(guessed)} is a guess: pairs, views and verification depend on it; give "
-            "--cameras"
-        )
     if unpaired:
         found.append(f"{_some(list(unpaired))} in no pair: check the poses, or lower pairs.min_overlap")
     return tuple(found)

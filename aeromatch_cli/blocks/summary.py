@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -88,10 +88,10 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def summarise(block: Block, pairs: Sequence[Pair] | None = None, guessed_cameras: Collection[str] = ()) -> BlockSummary:
+def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary:
     """Figures and plausibility of a block.
 
-    pairs: the chosen pairs, or None before they are chosen. guessed_cameras: camera ids whose focal length is a guess.
+    pairs: the chosen pairs, or None before they are chosen.
     """
     names = {image.image_id: image.name for image in block.images}
     poses = {i: block.poses[i] for i in names if i in block.poses and np.isfinite(block.poses[i].center_m).all()}
@@ -124,7 +124,7 @@ def summarise(block: Block, pairs: Sequence[Pair] | None = None, guessed_cameras
         pairs_by_reason=tuple((reason, sum(pair.reason == reason for pair in pairs or ())) for reason in reasons),
         best_overlap=float(np.mean(list(best.values()))) if best else float("nan"),
         unpaired=unpaired,
-        warnings=warnings_of(block, unpaired, guessed_cameras),
+        warnings=warnings_of(block, unpaired),
     )
 
 

@@ -23,6 +23,7 @@ from aeromatch_cli.stages import report_figures as figures
 from aeromatch_cli.stages import report_map
 from aeromatch_cli.stages.common import Context, StageReport
 from aeromatch_cli.stages.filter import WEAK_MATCHES, match_points, summarise
+from aeromatch_cli.stages.report_evaluation import evaluation_figures
 from aeromatch_cli.stages.report_rows import NOT_JUDGED, ImageRow, PairRow, StageRow, failure_rows, gather, stage_rows
 from aeromatch_cli.workspace import fingerprint, read_json, write_text
 
@@ -96,6 +97,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         map=_map(context, images, pairs, contradictions),
         pair_histogram=_histogram([row.verified for row in verified], "verified matches per verified pair", "pairs"),
         image_histogram=_histogram([row.verified_matches for row in images], "verified matches per image", "images"),
+        evaluation=evaluation_figures(context.workspace),
         previews=_previews(context, pairs),
         error_limits_px=figures.ERROR_LIMITS_PX,
         pairs=_worst_pairs(pairs),

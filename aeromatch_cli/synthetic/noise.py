@@ -45,12 +45,42 @@ def _noise_tile(seed: int) -> NDArray[np.float32]:
     return np.pad((tile / tile.std()).astype(np.float32), ((0, 1), (0, 1)), mode="wrap")
 
 
+@lru_cache(maxsize=4)
+def _slope_tile(seed: int) -> NDArray[np.float32]:
+    """(1025, 1025, 2) slope of the noise tile along its columns and rows, periodic, root mean square length 1."""
+    spectrum = np.fft.fft2(_noise_tile(seed)[:-1, :-1])
+    frequency = 2j * np.pi * np.fft.fftfreq(_TILE_PX)
+    along_x, along_y = np.fft.ifft2(spectrum * frequency).real, np.fft.ifft2(spectrum * frequency[:, None]).real
+    slope = np.stack([along_x, along_y], axis=2) / np.sqrt(np.mean(along_x**2 + along_y**2))
+    return np.pad(slope.astype(np.float32), ((0, 1), (0, 1), (0, 0)), mode="wrap")
+
+
 def octave(u_m: FloatArray, v_m: FloatArray, wavelength_m: float, seed: int, number: int) -> FloatArray:
     """One octave of noise (N,) float32, unit variance; `number` turns and shifts the tile so octaves never align."""
+    return _sampled(_noise_tile(seed), u_m, v_m, wavelength_m, number)[:, 0]
+
+
+def octave_slope(u_m: FloatArray, v_m: FloatArray, wavelength_m: float, seed: int, number: int) -> FloatArray:
+    """Slope (N, 2) along u and v of the same octave taken as a height, scaled to a root mean square length of 1."""
+    sampled = _sampled(_slope_tile(seed), u_m, v_m, wavelength_m, number)
+    angle = _angle(number)
+    c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    slope = np.empty_like(sampled)
+    slope[:, 0] = c * sampled[:, 0] + s * sampled[:, 1]
+    slope[:, 1] = c * sampled[:, 1] - s * sampled[:, 0]
+    return slope
+
+
+def _angle(number: int) -> float:
+    return 0.7 + 2.4 * number
+
+
+def _sampled(
+    tile: NDArray[np.float32], u_m: FloatArray, v_m: FloatArray, wavelength_m: float, number: int
+) -> NDArray[np.float32]:
     import cv2
 
-    tile = _noise_tile(seed)
-    angle = 0.7 + 2.4 * number
+    angle = _angle(number)
     scale = _TEXELS_PER_WAVELENGTH / wavelength_m
     c, s = np.float32(np.cos(angle) * scale), np.float32(np.sin(angle) * scale)
     x, y = c * u_m - s * v_m + np.float32(311.7 * number), s * u_m + c * v_m + np.float32(173.3 * number)
@@ -61,7 +91,7 @@ def octave(u_m: FloatArray, v_m: FloatArray, wavelength_m: float, seed: int, num
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, rows, _ROW_PX)
     sampled: NDArray[Any] = cv2.remap(tile, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return sampled.reshape(-1)[: len(x)]
+    return sampled.reshape(rows * _ROW_PX, -1)[: len(x)]
 
 
 def octaves(
@@ -73,9 +103,32 @@ def octaves(
     for i, wavelength_m in enumerate(wavelengths_m):
         if wavelength_m <= 2.0 * finest:
             continue
-        weight = np.clip(np.float32(0.5 * wavelength_m) / footprint_m - np.float32(1.0), 0.0, 1.0)
-        total += weight * octave(u_m, v_m, wavelength_m, seed, first + i)
+        total += fading(wavelength_m, footprint_m) * octave(u_m, v_m, wavelength_m, seed, first + i)
     return total / np.float32(np.sqrt(len(wavelengths_m)))
+
+
+def slopes(
+    u_m: FloatArray,
+    v_m: FloatArray,
+    footprint_m: FloatArray,
+    bands: tuple[tuple[float, float], ...],
+    seed: int,
+    first: int,
+) -> FloatArray:
+    """Slope (N, 2) of a rough surface, from bands of (wavelength, root mean square slope), faded out as octaves."""
+    total = np.zeros((len(u_m), 2), dtype=np.float32)
+    finest = float(footprint_m.min(initial=np.inf))
+    for i, (wavelength_m, steepness) in enumerate(bands):
+        if wavelength_m <= 2.0 * finest:
+            continue
+        weight = np.float32(steepness) * fading(wavelength_m, footprint_m)
+        total += weight[:, None] * octave_slope(u_m, v_m, wavelength_m, seed, first + i)
+    return total
+
+
+def fading(wavelength_m: float, footprint_m: FloatArray) -> FloatArray:
+    """How much (N,), 0-1, of a wavelength is kept: all from 4 samples to a wavelength on, nothing below 2."""
+    return np.clip(np.float32(0.5 * wavelength_m) / footprint_m - np.float32(1.0), 0.0, 1.0)
 
 
 def stripes(coordinate_m: FloatArray, period_m: float, width_m: float, footprint_m: FloatArray) -> FloatArray:

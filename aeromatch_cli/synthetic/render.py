@@ -1,4 +1,4 @@
-"""One picture of a scene and its depth, from an exact camera and pose."""
+"""One picture of a scene with its depth, surfaces and sunlight, from an exact camera and pose."""
 
 from __future__ import annotations
 
@@ -7,134 +7,154 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import normalise
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.scene import Scene
-from aeromatch_cli.synthetic.texture import albedo
+from aeromatch_cli.synthetic.light import HORIZON
+from aeromatch_cli.synthetic.raycast import Hits
+from aeromatch_cli.synthetic.sensor import Development, develop
+from aeromatch_cli.synthetic.shade import Stage, radiance, sun_at, sun_share
 
 # Colour is the mean of a 2 x 2 grid of samples in each pixel.
 _SAMPLE_OFFSETS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 _SAMPLES_PER_PX = 2.0
 _BAND_PX = 65_536  # pixels worked on at a time: bounds the memory at any image size and keeps it in the cache
-
-_SUN = np.array([1.00, 0.95, 0.86], dtype=np.float32) * np.float32(2.3)
-_SKY = np.array([0.62, 0.74, 0.95], dtype=np.float32) * np.float32(0.55)
-_BOUNCED = np.array([0.14, 0.13, 0.11], dtype=np.float32)
-_SKY_BEYOND = np.array([0.55, 0.68, 0.85], dtype=np.float32)
-_VIGNETTING = 0.16
+# A slanted surface is sampled more coarsely along the slant; textures are filtered by the mean of both directions.
+_FLATTEST_COSINE = 0.06
+NO_SURFACE = 0
 
 
 @dataclass(frozen=True, eq=False)
-class RayGrid:
-    """Normalised coordinates of every pixel centre of a camera and their change from pixel to pixel.
+class View:
+    """Where a picture is taken. world_rotation: (3, 3) of cam_from_world; center_m: (3,). moment: its number."""
 
-    uv: (H, W, 2) float64, exact. per_column, per_row: (H, W, 2), only used to place the colour samples.
-    """
+    camera: Camera
+    world_rotation: FloatArray
+    center_m: FloatArray
+    moment: int
 
-    uv: FloatArray
-    per_column: FloatArray
-    per_row: FloatArray
-
-
-def ray_grid(camera: Camera) -> RayGrid:
-    """The rays of a camera, once for all its pictures."""
-    x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
-    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
-    uv = np.concatenate([normalise(camera, part) for part in np.array_split(pixels, max(1, len(pixels) // _BAND_PX))])
-    grid = uv.reshape(camera.height_px, camera.width_px, 2)
-    return RayGrid(grid, np.gradient(grid, axis=1).astype(np.float32), np.gradient(grid, axis=0).astype(np.float32))
+    def directions(self, uv: FloatArray) -> FloatArray:
+        """World directions (N, 3), one metre long along the optical axis, of normalised coordinates (N, 2)."""
+        rotation = self.world_rotation.astype(uv.dtype)
+        along: FloatArray = uv[:, :1] * rotation[0] + uv[:, 1:] * rotation[1] + rotation[2]
+        return along
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """pixels: (H, W, 3) uint8 RGB. depth_m: (H, W) float32 along the optical axis at pixel centres, NaN for sky."""
+    """A picture and, at every pixel centre, the truth.
+
+    pixels: (H, W, 3) uint8 RGB. depth_m: (H, W) float32 along the optical axis, NaN for sky.
+    surface: (H, W) uint32, one more than the index of the triangle seen, 0 for sky. sun: (H, W) uint8, 255 times the
+    share of the sun's disc in view, 0 for sky and where the surface faces away.
+    """
 
     pixels: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
+    surface: NDArray[np.uint32]
+    sun: NDArray[np.uint8]
 
 
-def render_image(
-    scene: Scene,
-    caster: RayCaster,
-    rays: RayGrid,
-    world_rotation: FloatArray,
-    center_m: FloatArray,
-    *,
-    exposure: float,
-    noise_sigma: float,
-    rng: np.random.Generator,
-) -> Rendered:
-    """Take the picture. world_rotation, center_m: the pose; noise_sigma: Gaussian, in grey levels of 0-255."""
-    height, width = rays.uv.shape[:2]
+def render_image(stage: Stage, view: View, settings: Development, rng: np.random.Generator) -> Rendered:
+    """Take the picture."""
+    width, height = view.camera.width_px, view.camera.height_px
     depth_m = np.empty((height, width), dtype=np.float32)
+    surface = np.empty((height, width), dtype=np.uint32)
+    sun = np.empty((height, width), dtype=np.uint8)
     linear = np.empty((height, width, 3), dtype=np.float32)
+    radius2 = np.empty((height, width), dtype=np.float32)
     rows = max(1, _BAND_PX // width)
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
-        uv = rays.uv[band].reshape(-1, 2)
-        depth_m[band] = _depth(caster, uv, world_rotation, center_m).reshape(-1, width)
-        per_column, per_row = rays.per_column[band].reshape(-1, 2), rays.per_row[band].reshape(-1, 2)
-        uv32 = uv.astype(np.float32)
-        samples = np.concatenate([uv32 + dx * per_column + dy * per_row for dx, dy in _SAMPLE_OFFSETS_PX])
-        # Spacing of the samples at unit depth.
-        spacing = np.sqrt(np.abs(per_column[:, 0] * per_row[:, 1] - per_column[:, 1] * per_row[:, 0])) / _SAMPLES_PER_PX
-        light = _light(scene, caster, samples, np.tile(spacing, len(_SAMPLE_OFFSETS_PX)), world_rotation, center_m)
-        linear[band] = light.reshape(len(_SAMPLE_OFFSETS_PX), -1, width, 3).mean(axis=0)
-    return Rendered(_develop(linear, rays, exposure, noise_sigma, rng), depth_m)
+        patch = _look(stage, view, top, band.stop)
+        shape = (band.stop - top, width)
+        depth_m[band], surface[band] = patch.depth_m.reshape(shape), patch.surface.reshape(shape)
+        sun[band], radius2[band] = patch.sun.reshape(shape), patch.radius2.reshape(shape)
+        linear[band] = patch.linear.reshape(*shape, 3)
+    return Rendered(develop(linear, radius2, settings, rng), depth_m, surface, sun)
 
 
-def _depth(caster: RayCaster, uv: FloatArray, world_rotation: FloatArray, center_m: FloatArray) -> FloatArray:
-    directions = _directions(uv, world_rotation)
-    # In units of such a direction the distance is the depth.
-    distances = caster.first_hits(center_m, directions).distances
-    return np.where(np.isfinite(distances), distances, np.nan)
+def look_at(stage: Stage, view: View) -> FloatArray:
+    """Linear RGB (N, 3) of a picture without its truth and development: what a light meter sees."""
+    height = view.camera.height_px
+    return _look(stage, view, 0, height).linear
 
 
-def _directions(uv: FloatArray, world_rotation: FloatArray) -> FloatArray:
-    """World directions (N, 3), one metre long along the optical axis, of normalised coordinates (N, 2)."""
-    return uv[:, :1] * world_rotation[0] + uv[:, 1:] * world_rotation[1] + world_rotation[2]
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """Some rows of a picture, pixel by pixel: linear (P, 3), the others (P,)."""
+
+    linear: FloatArray
+    depth_m: FloatArray
+    surface: IntArray
+    sun: IntArray
+    radius2: FloatArray
+
+
+def _look(stage: Stage, view: View, top: int, bottom: int) -> _Patch:
+    uv, per_column, per_row = _ray_grid(view.camera, top, bottom)
+    centre = stage.caster.first_hits(view.center_m, view.directions(uv))
+    samples_uv = np.stack(
+        [uv + dx * per_column + dy * per_row for dx, dy in _SAMPLE_OFFSETS_PX]
+    ).astype(np.float32)  # fmt: skip
+    # Spacing of the samples at unit depth.
+    spacing = np.sqrt(np.abs(per_column[:, 0] * per_row[:, 1] - per_column[:, 1] * per_row[:, 0])) / _SAMPLES_PER_PX
+    directions = view.directions(samples_uv.reshape(-1, 2))
+    # Colour does not need the float64 that depth does: 0.1 mm is far below the finest texture.
+    hits = stage.caster.rough_hits(view.center_m, directions)
+    shape = samples_uv.shape[:2]
+    reach = np.where(hits.triangle_idx >= 0, hits.distances, np.float32(0.0)).astype(np.float32)
+    points = (view.center_m.astype(np.float32) + reach[:, None] * directions).reshape(*shape, 3)
+    direct = sun_share(stage, hits.triangle_idx.reshape(shape), points)
+    light = _light(stage, view, hits, directions, points.reshape(-1, 3), np.tile(spacing, shape[0]), direct.ravel())
+    return _Patch(
+        linear=light.reshape(*shape, 3).mean(axis=0),
+        depth_m=np.where(np.isfinite(centre.distances), centre.distances, np.nan),
+        surface=(centre.triangle_idx.astype(np.int64) + 1).astype(np.uint32),
+        sun=_sun_at_centres(stage, view, uv, centre, direct),
+        radius2=(uv**2).sum(axis=1),
+    )
+
+
+def _ray_grid(camera: Camera, top: int, bottom: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normalised coordinates (P, 2) float64 of the pixel centres of rows top to bottom, exact, and their change from
+    column to column and from row to row, which only places the colour samples."""
+    x, y = np.meshgrid(np.arange(camera.width_px + 1.0), np.arange(top, bottom + 1.0))
+    uv = normalise(camera, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(*x.shape, 2)
+    middle = uv[:-1, :-1]
+    return tuple(part.reshape(-1, 2) for part in (middle, uv[:-1, 1:] - middle, uv[1:, :-1] - middle))  # type: ignore[return-value]
+
+
+def _sun_at_centres(stage: Stage, view: View, uv: FloatArray, centre: Hits, direct: FloatArray) -> IntArray:
+    """Where all samples around a pixel's centre agree, so does the centre; elsewhere it is asked itself."""
+    facing = stage.scene.normals[centre.triangle_idx] @ stage.light.to_sun > 0.0
+    share = np.where((centre.triangle_idx >= 0) & facing, direct[0], 0.0)
+    unsure = np.flatnonzero((direct.min(axis=0) != direct.max(axis=0)) & (centre.triangle_idx >= 0))
+    points = view.center_m + centre.distances[unsure, None] * view.directions(uv[unsure])
+    share[unsure] = sun_at(stage, centre.triangle_idx[unsure], points.astype(np.float32))
+    return np.rint(255.0 * share).astype(np.uint8)
 
 
 def _light(
-    scene: Scene,
-    caster: RayCaster,
-    uv: FloatArray,
+    stage: Stage,
+    view: View,
+    hits: Hits,
+    directions: FloatArray,
+    points_m: FloatArray,
     spacing: FloatArray,
-    world_rotation: FloatArray,
-    center_m: FloatArray,
+    direct: FloatArray,
 ) -> FloatArray:
-    """Linear RGB (N, 3) float32 that arrives along normalised image coordinates uv (N, 2)."""
-    # Colour does not need the float64 that depth does: 0.1 mm is far below the finest texture.
-    directions = _directions(uv, world_rotation.astype(np.float32))
-    hits = caster.rough_hits(center_m, directions)
-    light = np.broadcast_to(_SKY_BEYOND, (len(uv), 3)).copy()
+    """Linear RGB (N, 3) float32 that arrives along directions (N, 3)."""
+    sky = HORIZON * np.float32(stage.light.sky)
+    light = np.broadcast_to(sky, (len(directions), 3)).copy()
     seen = np.flatnonzero(hits.triangle_idx >= 0)
     if not len(seen):
         return light
-    triangle_idx, distances, directions = hits.triangle_idx[seen], hits.distances[seen], directions[seen]
-    points = center_m.astype(np.float32) + distances[:, None] * directions
-    normals = scene.normals.astype(np.float32)[triangle_idx]
-    cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / np.sqrt(np.einsum("ij,ij->i", directions, directions))
-    # A slanted surface is sampled more coarsely along the slant; the cap keeps grazing facades from going blank.
-    footprint = spacing[seen] * distances / np.maximum(cosine, 0.2)
-    to_sun = normals @ scene.to_sun.astype(np.float32)
-    facing = np.flatnonzero(to_sun > 0.0)
-    direct = np.zeros(len(seen), dtype=np.float32)
-    direct[facing] = to_sun[facing] * caster.is_free(points[facing], normals[facing], scene.to_sun)
-    open_sky = 0.5 + 0.5 * normals[:, 2:3]
-    arriving = direct[:, None] * _SUN + open_sky * _SKY + (1.0 - open_sky) * _BOUNCED
-    light[seen] = albedo(scene, scene.surface_idx[triangle_idx], points, footprint) * arriving
+    triangle_idx, along, distances = hits.triangle_idx[seen], directions[seen], hits.distances[seen]
+    lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
+    to_camera = along / -lengths[:, None]
+    normals = stage.normals32[triangle_idx]
+    cosine = np.maximum(np.abs(np.einsum("ij,ij->i", normals, to_camera)), _FLATTEST_COSINE)
+    footprint = spacing[seen].astype(np.float32) * distances / np.sqrt(cosine)
+    leaving = radiance(stage, triangle_idx, points_m[seen], to_camera, footprint, direct[seen], view.moment)
+    light[seen] = stage.light.through_air(leaving, distances * lengths)
     return light
-
-
-def _develop(
-    linear: FloatArray, rays: RayGrid, exposure: float, noise_sigma: float, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Vignetting, exposure, the tone curve of sRGB (IEC 61966-2-1), noise, 8 bits."""
-    radius2 = (rays.uv**2).sum(axis=2).astype(np.float32)
-    vignetting = 1.0 - _VIGNETTING * radius2 / radius2.max(initial=1e-9)
-    exposed = np.clip(linear * (exposure * vignetting)[..., None], 0.0, 1.0)
-    toned = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * np.power(exposed, np.float32(1.0 / 2.4)) - 0.055)
-    noisy = 255.0 * toned + noise_sigma * rng.standard_normal(toned.shape, dtype=np.float32)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

@@ -1,17 +1,19 @@
-"""Triangle soups of simple solids: boxes, gabled houses, tree crowns. Closed except for the side on the ground."""
+"""Surfaces and the primitives they are made of: patches, boxes, soups. Closed except for the side on the ground."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import FloatArray, IntArray
+
+Tint = tuple[float, float, float]
 
 
 class Material(IntEnum):
-    """What a surface is made of; `texture.albedo` has one painter for each."""
+    """What a surface is made of; there is one painter for each (`materials.py`, the scene's own for the ground)."""
 
     GROUND = 0
     FACADE = 1
@@ -20,6 +22,9 @@ class Material(IntEnum):
     PAINT = 4
     GLASS = 5
     LEAVES = 6
+    WATER = 7
+    PLASTER = 8
+    SHEET = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,7 @@ class Surface:
     v_axis: FloatArray
     size_m: tuple[float, float]
     material: Material
-    tint: tuple[float, float, float]
+    tint: Tint
 
 
 @dataclass(frozen=True)
@@ -52,82 +57,116 @@ class Footprint:
     def corners_m(self) -> FloatArray:
         """(4, 2) corners, counter-clockwise from the one at (-x, -y) of its own frame."""
         half = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.5
+        return self.at(half * [self.length_x_m, self.length_y_m])
+
+    def at(self, own_m: FloatArray) -> FloatArray:
+        """Plan points (N, 2) of points (N, 2) in the rectangle's own frame, whose origin is its centre."""
         a = np.deg2rad(self.heading_deg)
         turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
-        return (half * [self.length_x_m, self.length_y_m]) @ turn.T + [self.x_m, self.y_m]
+        moved: FloatArray = np.asarray(own_m) @ turn.T + [self.x_m, self.y_m]
+        return moved
 
 
-def _patch(corners_m: FloatArray, material: Material, tint: tuple[float, float, float]) -> Surface:
-    """A planar convex patch (3 or 4 corners, counter-clockwise); u runs along the first edge from corner 0."""
-    edge = corners_m[1] - corners_m[0]
-    u_axis = edge / np.linalg.norm(edge)
-    across = corners_m[2] - corners_m[0]
+def patch(corners_m: FloatArray, material: Material, tint: Tint) -> Surface:
+    """A planar convex patch of corners (K, 3), counter-clockwise; u runs along the first edge, from corner 0."""
+    edge, across = corners_m[1] - corners_m[0], corners_m[2] - corners_m[0]
+    length = float(np.sqrt(edge @ edge))
+    u_axis = edge / length
     v_axis = across - (across @ u_axis) * u_axis
-    height = float(np.linalg.norm(v_axis))
+    height = float(np.sqrt(v_axis @ v_axis))
     fan = np.stack([corners_m[[0, i, i + 1]] for i in range(1, len(corners_m) - 1)])
-    size_m = (float(np.linalg.norm(edge)), height)
-    return Surface(fan, corners_m[0], u_axis, v_axis / height, size_m, material, tint)
+    return Surface(fan, corners_m[0], u_axis, v_axis / height, (length, height), material, tint)
 
 
-def _at(xy_m: FloatArray, z_m: float) -> FloatArray:
+def soup(triangles_m: FloatArray, material: Material, tint: Tint) -> Surface:
+    """Triangles (T, 3, 3) of any direction as one surface, for materials whose pattern has no direction.
+
+    The texture is projected along a slanted line, so that neither level nor upright faces are stretched.
+    """
+    lo, hi = triangles_m.min(axis=(0, 1)), triangles_m.max(axis=(0, 1))
+    size_m = (float(hi[0] - lo[0]), float(hi[1] - lo[1]))
+    return Surface(triangles_m, lo, _SLANT_U, _SLANT_V, size_m, material, tint)
+
+
+_SLANT_U = np.array([0.80, -0.25, 0.545])
+_SLANT_V = np.array([0.15, 0.85, 0.505])
+_SLANT_U, _SLANT_V = _SLANT_U / np.linalg.norm(_SLANT_U), _SLANT_V / np.linalg.norm(_SLANT_V)
+
+
+def shrunk(corners_m: FloatArray, by_m: list[float]) -> FloatArray:
+    """(K, 2) corners of a convex polygon (K, 2), counter-clockwise, each side moved inwards by its own distance."""
+    start, end = corners_m, np.roll(corners_m, -1, axis=0)
+    along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    inward = np.column_stack([-along[:, 1], along[:, 0]])
+    offset = np.einsum("ij,ij->i", inward, start) + by_m
+    before = np.roll(np.arange(len(start)), 1)
+    return np.stack([np.linalg.solve(inward[[k, p]], offset[[k, p]]) for k, p in enumerate(before.tolist())])
+
+
+def raised(xy_m: FloatArray, z_m: float) -> FloatArray:
+    """(N, 3): plan points (N, 2) at one height."""
     return np.column_stack([xy_m, np.full(len(xy_m), z_m)])
 
 
+def walls(corners_m: FloatArray, bottom_m: float, top_m: float, materials: list[Material], tint: Tint) -> list[Surface]:
+    """The upright sides over a plan polygon (K, 2), counter-clockwise; one material for each side."""
+    low, high = raised(corners_m, bottom_m), raised(corners_m, top_m)
+    sides = [(k, (k + 1) % len(corners_m)) for k in range(len(corners_m))]
+    return [
+        patch(np.stack([low[i], low[j], high[j], high[i]]), m, tint) for (i, j), m in zip(sides, materials, strict=True)
+    ]
+
+
 def box(
-    plan: Footprint,
-    bottom_m: float,
-    top_m: float,
-    wall: tuple[Material, tuple[float, float, float]],
-    roof: tuple[Material, tuple[float, float, float]],
+    plan: Footprint, bottom_m: float, top_m: float, wall: tuple[Material, Tint], roof: tuple[Material, Tint]
 ) -> list[Surface]:
     """Four walls and a flat top."""
-    low, high = _at(plan.corners_m(), bottom_m), _at(plan.corners_m(), top_m)
-    walls = [_patch(np.stack([low[i], low[j], high[j], high[i]]), *wall) for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))]
-    return [*walls, _patch(high, *roof)]
+    corners = plan.corners_m()
+    return [*walls(corners, bottom_m, top_m, [wall[0]] * 4, wall[1]), patch(raised(corners, top_m), *roof)]
 
 
-def gabled_house(
-    plan: Footprint,
-    eaves_m: float,
-    ridge_m: float,
-    wall: tuple[Material, tuple[float, float, float]],
-    roof: tuple[Material, tuple[float, float, float]],
-) -> list[Surface]:
-    """Four walls, two gables and two slopes; the ridge runs along the plan's own x."""
-    low, high = _at(plan.corners_m(), 0.0), _at(plan.corners_m(), eaves_m)
-    ridge = 0.5 * (high[[0, 1]] + high[[3, 2]])
-    ridge[:, 2] = ridge_m
-    walls = [_patch(np.stack([low[i], low[j], high[j], high[i]]), *wall) for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))]
-    gables = [
-        _patch(np.stack([high[1], high[2], ridge[1]]), *wall),
-        _patch(np.stack([high[3], high[0], ridge[0]]), *wall),
+# A unit box, counter-clockwise seen from outside: four sides and the top, then the bottom.
+_BOX_FACES = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7], [3, 2, 1, 0]])
+BOX_TRIANGLES: IntArray = np.concatenate([_BOX_FACES[:, [0, 1, 2]], _BOX_FACES[:, [0, 2, 3]]])
+
+
+def hexahedra(corners_m: FloatArray) -> FloatArray:
+    """Triangles (12 N, 3, 3) of N solids with eight corners (N, 8, 3): four below, four above, counter-clockwise."""
+    return corners_m[:, BOX_TRIANGLES].reshape(-1, 3, 3)
+
+
+def boxes(
+    centers_m: FloatArray, lengths_m: FloatArray, heading_deg: float, bottom_m: FloatArray, top_m: FloatArray
+) -> FloatArray:
+    """Triangles (12 N, 3, 3) of N closed boxes: plan centres and lengths (N, 2), one heading, heights (N,)."""
+    plan = Footprint(0.0, 0.0, 1.0, 1.0, 0.0).corners_m()
+    own = plan[None] * np.asarray(lengths_m)[:, None]
+    flat = Footprint(0.0, 0.0, 1.0, 1.0, heading_deg).at(own.reshape(-1, 2)).reshape(-1, 4, 2)
+    flat = flat + np.asarray(centers_m)[:, None]
+    heights = np.stack([np.broadcast_to(bottom_m, len(flat)), np.broadcast_to(top_m, len(flat))], axis=1)
+    corners = np.empty((len(flat), 8, 3))
+    corners[:, :4, :2], corners[:, 4:, :2] = flat, flat
+    corners[:, :4, 2], corners[:, 4:, 2] = heights[:, :1], heights[:, 1:]
+    return hexahedra(corners)
+
+
+def turned(surfaces: list[Surface], heading_deg: float) -> list[Surface]:
+    """The same solids, turned around the world's z axis, counter-clockwise."""
+    a = np.deg2rad(heading_deg)
+    turn = np.array([[np.cos(a), np.sin(a), 0.0], [-np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    if not surfaces:
+        return []
+    triangles = np.concatenate([s.triangles_m for s in surfaces]) @ turn
+    frames = np.stack([np.stack([s.origin_m, s.u_axis, s.v_axis]) for s in surfaces]) @ turn
+    parts = np.split(triangles, np.cumsum([len(s.triangles_m) for s in surfaces])[:-1])
+    return [
+        replace(s, triangles_m=part, origin_m=frame[0], u_axis=frame[1], v_axis=frame[2])
+        for s, part, frame in zip(surfaces, parts, frames, strict=True)
     ]
-    slopes = [
-        _patch(np.stack([high[0], high[1], ridge[1], ridge[0]]), *roof),
-        _patch(np.stack([high[2], high[3], ridge[0], ridge[1]]), *roof),
-    ]
-    return [*walls, *gables, *slopes]
 
 
-def crown(center_m: FloatArray, radius_m: float, rng: np.random.Generator, tint: tuple[float, float, float]) -> Surface:
-    """A tree crown: an octahedron refined twice (128 triangles), its corners pushed in and out at random."""
-    corners = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
-    faces = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]]
-    triangles = corners[np.array(faces)]
-    for _ in range(2):
-        a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-        ab, bc, ca = a + b, b + c, c + a
-        triangles = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-        triangles /= np.linalg.norm(triangles, axis=2, keepdims=True)
-    unique, index = np.unique(triangles.reshape(-1, 3).round(6), axis=0, return_inverse=True)
-    bumpy = unique * (radius_m * rng.uniform(0.72, 1.12, size=(len(unique), 1))) * [1.0, 1.0, 0.85]
-    shape = bumpy[index.reshape(-1)].reshape(-1, 3, 3) + center_m
-    size_m = (2.0 * radius_m, 2.0 * radius_m)
-    return Surface(shape, center_m, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), size_m, Material.LEAVES, tint)
-
-
-def ground_square(half_extent_m: float, heading_deg: float) -> Surface:
-    """The plane z = 0 as a square around the origin; texture coordinates are those of the turned street grid."""
-    plan = Footprint(0.0, 0.0, 2.0 * half_extent_m, 2.0 * half_extent_m, heading_deg)
-    flat = _patch(_at(plan.corners_m(), 0.0), Material.GROUND, (1.0, 1.0, 1.0))
-    return Surface(flat.triangles_m, np.zeros(3), flat.u_axis, flat.v_axis, flat.size_m, flat.material, flat.tint)
+def shade(rng: np.random.Generator, tints: tuple[Tint, ...], spread: float = 0.2) -> Tint:
+    """One of the tints, somewhat brighter or darker and a little off in hue."""
+    factor = rng.uniform(1.0 - spread, 1.0 + spread) * rng.uniform(0.97, 1.03, size=3)
+    r, g, b = np.array(tints[int(rng.integers(len(tints)))]) * factor
+    return float(r), float(g), float(b)

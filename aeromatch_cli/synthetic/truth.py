@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.cameras import from_colmap, normalise, project
-from aeromatch_cli.synthetic.flight import Exterior
+from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
-from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path
+from aeromatch_cli.synthetic.terrain import Area
+from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path, sun_path, surface_path
 
 # A surface point counts as seen when nothing stands more than this in front of it.
 _TOLERANCE_M = 2e-3
@@ -26,12 +27,29 @@ _TOLERANCE_M = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A rendered block's scene, and the exact camera and pose of each image by name."""
+    """A rendered block's scene, and the exact camera and pose of each image by name.
 
+    folder: the block. sorties: which flight of the day took an image.
+    """
+
+    folder: Path
     scene: Scene
     caster: RayCaster
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
+    sorties: Mapping[str, int]
+
+    def sun(self, image: str) -> NDArray[np.uint8]:
+        """(H, W) 255 times the share of the sun's disc in view at pixel centres; below 128 is shadow."""
+        return read_raster(sun_path(self.folder, self._known(image)))
+
+    def depth_m(self, image: str) -> NDArray[np.float32]:
+        """(H, W) metres along the optical axis at pixel centres, NaN for sky."""
+        return read_raster(depth_path(self.folder, self._known(image)))
+
+    def surface(self, image: str) -> NDArray[np.uint32]:
+        """(H, W) 1 + the index of the triangle that a pixel's centre sees, 0 for sky."""
+        return read_raster(surface_path(self.folder, self._known(image)))
 
     def surface_points(self, image: str, points_px: FloatArray) -> FloatArray:
         """World points (N, 3) that an image shows at stored pixels (N, 2); NaN where it shows sky or has no ray."""
@@ -64,12 +82,15 @@ class Truth:
         hidden[asked] = hits.distances < 1.0 - _TOLERANCE_M / np.linalg.norm(directions, axis=1)
         return places, hidden
 
-    def _view(self, image: str) -> tuple[Camera, FloatArray, FloatArray]:
+    def _known(self, image: str) -> str:
         if image not in self.poses:
             raise ConfigError(
                 f"{image!r} is no image of this rendered block; it has {', '.join(list(self.poses)[:3])} ..."
             )
-        pose = self.poses[image]
+        return image
+
+    def _view(self, image: str) -> tuple[Camera, FloatArray, FloatArray]:
+        pose = self.poses[self._known(image)]
         assert pose.world_rotation is not None
         return self.cameras[image], pose.world_rotation, pose.center_m
 
@@ -86,15 +107,16 @@ def load_truth(folder: Path) -> Truth:
         )
     block = _read_json(folder / "block.json")
     try:
-        scene = build_scene(facts["preset"], facts["seed"], facts["half_extent_m"])
+        scene = build_scene(facts["scene"], facts["seed"], Area(**facts["area_m"]))
         same = facts["scene_version"] == SCENE_VERSION and facts["scene_sha256"] == scene_digest(scene)
-        camera = _camera(block["cameras"]["1"])
-        poses = _read_poses(folder / "poses.csv")
+        lenses = {camera_id: _camera(lens) for camera_id, lens in block["cameras"].items()}
+        poses, cameras = _read_poses(folder / "poses.csv", lenses)
+        sorties = {image["name"]: int(image["sortie"]) for image in facts["images"]}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the truth in {folder} is damaged ({error!r}); render the block again") from error
     if not same:
         raise InputError(f"the block in {folder} was rendered by another version; render it again")
-    return Truth(scene, RayCaster(scene), dict.fromkeys(poses, camera), poses)
+    return Truth(folder, scene, RayCaster(scene), cameras, poses, sorties)
 
 
 def transfer(truth: Truth | Path, image0: str, points_px: FloatArray, image1: str) -> tuple[FloatArray, BoolArray]:
@@ -102,16 +124,17 @@ def transfer(truth: Truth | Path, image0: str, points_px: FloatArray, image1: st
     return (truth if isinstance(truth, Truth) else load_truth(truth)).transfer(image0, points_px, image1)
 
 
-def read_depth(folder: Path, image: str) -> NDArray[np.float32]:
-    """Depth (H, W) float32 of a rendered image, metres along the optical axis at pixel centres, NaN for sky."""
+def read_raster(path: Path) -> NDArray[Any]:
+    """A truth raster as it was written. Raises InputError where it is missing or damaged."""
+    import cv2
+
     try:
-        with np.load(depth_path(folder, image), allow_pickle=False) as arrays:
-            depth_m: NDArray[np.float32] = arrays["depth_m"]
-            return depth_m
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(
-            f"the depth of {image} in {folder} cannot be read ({error}); render the block again"
-        ) from error
+        raster = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error) as error:
+        raise InputError(f"{path} cannot be read ({error}); render the block again") from error
+    if raster is None:
+        raise InputError(f"{path} is no raster; render the block again")
+    return raster
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -128,9 +151,9 @@ def _camera(lens: dict[str, Any]) -> Camera:
     return from_colmap(lens["model"], int(lens["width"]), int(lens["height"]), tuple(lens["params"]))
 
 
-def _read_poses(path: Path) -> dict[str, Pose]:
+def _read_poses(path: Path, lenses: Mapping[str, Camera]) -> tuple[dict[str, Pose], dict[str, Camera]]:
     with path.open(encoding="utf-8", newline="") as stream:
-        return {
-            row[POSE_COLUMNS[0]]: Exterior(*(float(row[column]) for column in POSE_COLUMNS[1:])).pose()
-            for row in csv.DictReader(stream)
-        }
+        rows = list(csv.DictReader(stream))
+    numbers = POSE_COLUMNS[1:-1]
+    poses = {row["image"]: Exterior(*(float(row[column]) for column in numbers)).pose() for row in rows}
+    return poses, {row["image"]: lenses[row["camera"]] for row in rows}

@@ -1,107 +1,60 @@
 """A rendered block on disk: pictures as a user would have them, and the truth beside them.
 
-OUT/images/town_0001.jpg ...   the pictures
-OUT/poses.csv                  exact: image,x,y,z,omega_deg,phi_deg,kappa_deg; metres, degrees
-OUT/poses_noisy.csv            the same with Gaussian noise, whose sigmas truth.json states
-OUT/block.json                 camera (COLMAP's names and corner origin), crs, percentiles of the surface heights
-OUT/truth/town_0001.npz        depth_m: (H, W) float32, metres along the optical axis at pixel centres, NaN for sky
-OUT/truth.json                 preset, seed and what else rebuilds the scene; written last
+OUT/images/city_0001.jpg ...         the pictures
+OUT/poses.csv                        exact: image,x,y,z,omega_deg,phi_deg,kappa_deg,camera; metres, degrees
+OUT/poses_noisy.csv                  the same with Gaussian noise, whose sigmas truth.json states
+OUT/block.json                       cameras (COLMAP's names and corner origin), crs, percentiles of the surface heights
+OUT/dem.tif                          bare ground, float32 metres at cell centres, in the block's local frame
+OUT/truth/city_0001.depth.tif        (H, W) float32, metres along the optical axis at pixel centres, NaN for sky
+OUT/truth/city_0001.surface.tif      (H, W) uint32, what is visible: 1 + the index of the triangle, 0 for sky
+OUT/truth/city_0001.sun.png          (H, W) uint8, 255 x the share of the sun's disc in view; 0 also where the surface
+                                     faces away from the sun. In shadow: below 128
+OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last
+All rasters are lossless (TIFF: deflate with predictor; PNG).
 """
 
 from __future__ import annotations
 
-import io
 import json
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, WorkspaceError
-from aeromatch_cli.geometry.cameras import colmap_params, focal_px
-from aeromatch_cli.synthetic import flight
-from aeromatch_cli.synthetic.flight import Exterior
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.render import RayGrid, Rendered, ray_grid, render_image
-from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
+from aeromatch_cli.geometry.cameras import colmap_params
+from aeromatch_cli.synthetic.flights import Exterior, Flight
+from aeromatch_cli.synthetic.render import Rendered
+from aeromatch_cli.synthetic.terrain import GroundGrid
 
 TRUTH_FORMAT = "aeromatch rendered block"
-POSE_COLUMNS = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg")
-SMALLEST_PX = 16
-IMAGE_NOISE_SIGMA, JPEG_QUALITY = 1.5, 95
-_EXPOSURE, _EXPOSURE_SIGMA = 0.8, 0.03
-# Independent random streams of one seed; build_scene uses 1 and 2.
-_FLIGHT_STREAM, _POSE_NOISE_STREAM, _IMAGE_STREAM = 3, 4, 5
+POSE_COLUMNS = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "camera")
+IN_SHADOW_BELOW = 128
 
 
-@dataclass(frozen=True)
-class SynthSummary:
-    """What was rendered. images: names below OUT/images. gsd_m: ground sampling distance at the image centre."""
-
-    out: Path
-    preset: str
-    seed: int
-    images: tuple[str, ...]
-    width_px: int
-    height_px: int
-    gsd_m: float
-    solids: Mapping[str, int]
-    seconds: float
+def depth_path(out: Path, name: str) -> Path:
+    """Where the depth of an image lies in a rendered block."""
+    return out / "truth" / f"{Path(name).stem}.depth.tif"
 
 
-def render_block(
-    out: Path,
-    preset: str,
-    *,
-    seed: int = 0,
-    width_px: int = 1000,
-    height_px: int = 750,
-    images: int = 12,
-    progress: Callable[[int, int], None] | None = None,
-) -> SynthSummary:
-    """Render a block into the folder `out`; equal arguments give equal files, byte for byte.
+def surface_path(out: Path, name: str) -> Path:
+    """Where the visible surfaces of an image lie in a rendered block."""
+    return out / "truth" / f"{Path(name).stem}.surface.tif"
 
-    progress: called with (done, total) after each image. Raises ConfigError on an unknown preset, an impossible size or
-    number, or a folder that holds another block; WorkspaceError where `out` cannot be written.
+
+def sun_path(out: Path, name: str) -> Path:
+    """Where the sunlight of an image lies in a rendered block."""
+    return out / "truth" / f"{Path(name).stem}.sun.png"
+
+
+def prepare(out: Path, names: tuple[str, ...]) -> None:
+    """Make the folders; an interrupted block is gone over again, another block is not mixed with this one.
+
+    Raises ConfigError where the folder holds other pictures.
     """
-    started = time.monotonic()
-    if images < 1:
-        raise ConfigError(f"a block needs at least 1 image, got {images}")
-    if width_px < SMALLEST_PX or height_px < SMALLEST_PX:
-        raise ConfigError(
-            f"rendered images must be at least {SMALLEST_PX} px wide and high, got {width_px}x{height_px}"
-        )
-    camera = flight.make_camera(width_px, height_px)
-    if seed < 0:
-        raise ConfigError(f"the seed of a rendered block must be 0 or larger, got {seed}")
-    flown = flight.plan_flight(camera, images, np.random.default_rng([seed, _FLIGHT_STREAM]))
-    scene = build_scene(preset, seed, flight.reach_m(camera, flown))
-    names = tuple(f"{preset}_{i + 1:04d}.jpg" for i in range(images))
-    try:
-        _prepare(out, names)
-        heights_m = _write_images(out, names, scene, camera, flown, progress)
-        noise = np.random.default_rng([seed, _POSE_NOISE_STREAM])
-        _write(out / "poses.csv", _pose_table(names, flown))
-        _write(out / "poses_noisy.csv", _pose_table(names, tuple(flight.noisy(e, noise) for e in flown)))
-        _write(out / "block.json", _json(_block_facts(camera, names, heights_m)))
-        _write(out / "truth.json", _json(_truth_facts(scene, camera, names)))
-    except OSError as error:
-        where = error.filename or out
-        raise WorkspaceError(
-            f"the rendered block cannot be written to {where}: {error.strerror}; choose a folder that can be written"
-        ) from error
-    gsd_m = flight.HEIGHT_M / focal_px(camera)
-    seconds = time.monotonic() - started
-    return SynthSummary(out, preset, seed, names, width_px, height_px, gsd_m, dict(scene.solids), seconds)
-
-
-def _prepare(out: Path, names: tuple[str, ...]) -> None:
-    """Make the folders; an interrupted block is gone over again, another block is not mixed with this one."""
     (out / "images").mkdir(parents=True, exist_ok=True)
     (out / "truth").mkdir(exist_ok=True)
     foreign = sorted(p.name for p in (out / "images").iterdir() if p.name not in names and not p.name.startswith("."))
@@ -113,115 +66,70 @@ def _prepare(out: Path, names: tuple[str, ...]) -> None:
     (out / "truth.json").unlink(missing_ok=True)
 
 
-def _write_images(
-    out: Path,
-    names: tuple[str, ...],
-    scene: Scene,
-    camera: Camera,
-    flown: tuple[Exterior, ...],
-    progress: Callable[[int, int], None] | None,
-) -> FloatArray:
-    """Render and write every image; returns surface heights (N,) of a sample of all pixels."""
-    caster, rays = RayCaster(scene), ray_grid(camera)
-    heights_m = []
-    for i, (name, exterior) in enumerate(zip(names, flown, strict=True)):
-        rendered = _take(scene, caster, rays, exterior, i)
-        _write(out / "images" / name, _jpeg(rendered.pixels))
-        _write(depth_path(out, name), _npz(depth_m=rendered.depth_m))
-        heights_m.append(_heights(rays, exterior, rendered))
-        if progress is not None:
-            progress(i + 1, len(names))
-    return np.concatenate(heights_m)
-
-
-def _take(scene: Scene, caster: RayCaster, rays: RayGrid, exterior: Exterior, image_idx: int) -> Rendered:
-    rng = np.random.default_rng([scene.seed, _IMAGE_STREAM, image_idx])
-    exposure = _EXPOSURE * float(np.exp(_EXPOSURE_SIGMA * rng.standard_normal()))
-    pose = exterior.pose()
-    assert pose.world_rotation is not None
-    return render_image(
-        scene, caster, rays, pose.world_rotation, pose.center_m,
-        exposure=exposure, noise_sigma=IMAGE_NOISE_SIGMA, rng=rng,
-    )  # fmt: skip
-
-
-def _heights(rays: RayGrid, exterior: Exterior, rendered: Rendered) -> FloatArray:
-    """World z of every 16th pixel's surface."""
-    pose = exterior.pose()
-    assert pose.world_rotation is not None
-    uv, depth_m = rays.uv.reshape(-1, 2)[::16], rendered.depth_m.reshape(-1)[::16]
-    down = uv @ pose.world_rotation[:2, 2] + pose.world_rotation[2, 2]
-    heights: FloatArray = (pose.center_m[2] + depth_m * down)[np.isfinite(depth_m)]
-    return heights
-
-
-def depth_path(out: Path, name: str) -> Path:
-    """Where the depth of an image lies in a rendered block."""
-    return out / "truth" / f"{Path(name).stem}.npz"
-
-
-def _block_facts(camera: Camera, names: tuple[str, ...], heights_m: FloatArray) -> dict[str, Any]:
-    lens = {
-        "model": camera.model,
-        "width": camera.width_px,
-        "height": camera.height_px,
-        "params": list(colmap_params(camera)),
-    }
-    ground_z = {f"p{p}": round(float(np.percentile(heights_m, p)), 3) + 0.0 for p in (5, 50, 95)}
-    return {"crs": "local", "cameras": {"1": lens}, "ground_z": ground_z, "registered": len(names)}
-
-
-def _truth_facts(scene: Scene, camera: Camera, names: tuple[str, ...]) -> dict[str, Any]:
-    x, y, z = scene.to_sun
-    return {
-        "format": TRUTH_FORMAT,
-        "scene_version": SCENE_VERSION,
-        "preset": scene.preset,
-        "seed": scene.seed,
-        "half_extent_m": scene.half_extent_m,
-        "scene_sha256": scene_digest(scene),
-        "solids": dict(scene.solids),
-        "sun_azimuth_deg": round(float(np.rad2deg(np.arctan2(x, y)) % 360.0), 6),
-        "sun_elevation_deg": round(float(np.rad2deg(np.arcsin(z))), 6),
-        "flying_height_m": flight.HEIGHT_M,
-        "forward_overlap": flight.FORWARD_OVERLAP,
-        "side_overlap": flight.SIDE_OVERLAP,
-        "gsd_m": round(flight.HEIGHT_M / focal_px(camera), 6),
-        "pose_noise_sigma_position_m": flight.NOISE_SHARE_OF_HEIGHT * flight.HEIGHT_M,
-        "pose_noise_sigma_angle_deg": flight.NOISE_ANGLE_DEG,
-        "image_noise_sigma": IMAGE_NOISE_SIGMA,
-        "jpeg_quality": JPEG_QUALITY,
-        "images": list(names),
-    }
-
-
-def _pose_table(names: tuple[str, ...], flown: tuple[Exterior, ...]) -> bytes:
-    """repr() of a float64 is its shortest text that reads back to the same bits."""
-    rows = [",".join(POSE_COLUMNS)]
-    rows += [",".join([name, *(repr(v) for v in asdict(e).values())]) for name, e in zip(names, flown, strict=True)]
-    return ("\n".join(rows) + "\n").encode()
-
-
-def _json(facts: dict[str, Any]) -> bytes:
-    return (json.dumps(facts, indent=1) + "\n").encode()
-
-
-def _jpeg(pixels: NDArray[np.uint8]) -> bytes:
+def write_rendered(out: Path, name: str, rendered: Rendered, jpeg_quality: int) -> None:
+    """One picture and its truth."""
     import cv2
 
-    done, encoded = cv2.imencode(".jpg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    deflate = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR]
+    floating, horizontal = cv2.IMWRITE_TIFF_PREDICTOR_FLOATINGPOINT, cv2.IMWRITE_TIFF_PREDICTOR_HORIZONTAL
+    write_file(depth_path(out, name), _encoded(".tif", rendered.depth_m, [*deflate, floating]))
+    write_file(surface_path(out, name), _encoded(".tif", rendered.surface, [*deflate, horizontal]))
+    write_file(sun_path(out, name), _encoded(".png", rendered.sun, []))
+    bgr = np.ascontiguousarray(rendered.pixels[..., ::-1])
+    write_file(out / "images" / name, _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]))
+
+
+def _encoded(suffix: str, raster: NDArray[Any], options: list[int]) -> bytes:
+    import cv2
+
+    done, encoded = cv2.imencode(suffix, raster, options)
     if not done:
-        raise WorkspaceError(f"OpenCV cannot encode a JPEG of shape {pixels.shape}")
+        raise WorkspaceError(f"OpenCV cannot encode a {suffix} file of shape {raster.shape}; use a smaller --size")
     return bytes(encoded)
 
 
-def _npz(**arrays: NDArray[Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    return buffer.getvalue()
+def write_dem(path: Path, ground: GroundGrid) -> None:
+    """The bare ground as GeoTIFF: exact at the centres of its cells, which are crossings of the scene's triangles."""
+    from rasterio.io import MemoryFile
+    from rasterio.transform import from_origin
+
+    x_m, y_m, z_m = ground.even_part()
+    half = 0.5 * ground.cell_m
+    transform = from_origin(x_m - half, y_m + (len(z_m) - 1) * ground.cell_m + half, ground.cell_m, ground.cell_m)
+    with MemoryFile() as memory:
+        with memory.open(
+            driver="GTiff", width=z_m.shape[1], height=z_m.shape[0], count=1, dtype="float32", transform=transform,
+            compress="deflate", predictor=3,
+        ) as raster:  # fmt: skip
+            raster.write(z_m[::-1].astype(np.float32), 1)
+        write_file(path, memory.read())
 
 
-def _write(path: Path, content: bytes) -> None:
+def pose_table(names: tuple[str, ...], exteriors: tuple[Exterior, ...], cameras: tuple[str, ...]) -> bytes:
+    """repr() of a float64 is its shortest text that reads back to the same bits."""
+    rows = [",".join(POSE_COLUMNS)]
+    for name, exterior, camera in zip(names, exteriors, cameras, strict=True):
+        rows.append(",".join([name, *(repr(v) for v in asdict(exterior).values()), camera]))
+    return ("\n".join(rows) + "\n").encode()
+
+
+def block_facts(flight: Flight, names: tuple[str, ...], heights_m: NDArray[Any]) -> dict[str, Any]:
+    """What block.json holds."""
+    ground_z = {f"p{p}": round(float(np.percentile(heights_m, p)), 3) + 0.0 for p in (5, 50, 95)}
+    cameras = {camera_id: _lens(camera) for camera_id, camera in flight.cameras.items()}
+    return {"crs": "local", "cameras": cameras, "ground_z": ground_z, "registered": len(names)}
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    params = list(colmap_params(camera))
+    return {"model": camera.model, "width": camera.width_px, "height": camera.height_px, "params": params}
+
+
+def json_bytes(facts: dict[str, Any]) -> bytes:
+    return (json.dumps(facts, indent=1) + "\n").encode()
+
+
+def write_file(path: Path, content: bytes) -> None:
     """All of the file or none of it."""
     partial = path.with_name(f".{path.name}.partial")
     try:

@@ -37,6 +37,9 @@ class Sift(Strategy):
         description="Descriptors per image over all its views: exactly so many, fewer only where fewer exist. "
         "As in OpenCV and COLMAP, a point with two orientations counts twice.",
     )
+    budget: Literal["image", "view"] = Field(
+        "image", description="What `keypoints` is for: the whole image over all its views, or each view by itself."
+    )
     contrast_threshold: float = Field(0.01, gt=0.0, description="Smallest contrast, divided by octave_layers inside.")
     edge_threshold: float = Field(10.0, gt=1.0, description="Largest ratio of the two curvatures.")
     octave_layers: int = Field(3, ge=1, description="Scales per octave.")
@@ -51,16 +54,26 @@ class Sift(Strategy):
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
         # Detect, select, describe: describing every point of a forest costs more than detecting it.
         found = [_in_source(camera, view, self._detect(view, index)) for index, view in enumerate(views)]
+        budget = self.keypoints
+        if self.budget == "view" and len(views) > 1:
+            budget *= len(views)
+            found = [self._cut(part, view) for part, view in zip(found, views, strict=True)]
         raw = _concatenate(found)
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
         points = raw.take(standing)
         strengths = self._strengths(points)
         costs = np.bincount(keypoint_idx, minlength=len(standing))
         size_px = (camera.width_px, camera.height_px)
-        chosen = even_selection(points.source_px, strengths, costs, size_px, self.keypoints, self.per_cell)
-        described, numbers = _within_budget(raw, keypoint_idx, chosen, self.keypoints)
+        chosen = even_selection(points.source_px, strengths, costs, size_px, budget, self.per_cell)
+        described, numbers = _within_budget(raw, keypoint_idx, chosen, budget)
         descriptors = self._describe(described, views)
         return _features(points.take(chosen), described, numbers, descriptors, views)
+
+    def _cut(self, raw: _Raw, view: ViewPixels) -> _Raw:
+        """The features of one view that its own budget buys, each orientation by itself."""
+        ones, size_px = np.ones(len(raw.view_idx), np.int64), (view.view.width_px, view.view.height_px)
+        strengths = self._strengths(raw)
+        return raw.take(even_selection(raw.points_px, strengths, ones, size_px, self.keypoints, self.per_cell))
 
     def _strengths(self, points: _Raw) -> FloatArray:
         if self.selection == "scale":

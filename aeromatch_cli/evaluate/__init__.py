@@ -1,0 +1,23 @@
+"""Matches against truth: the metrics, and who knows the truth of a block.
+
+    metrics, scores, texture -> surfaces, rendered | reference -> opening -> work -> totals, mapping -> output, plots
+
+Errors are in px of the images that were matched; a pair is judged from both sides.
+"""
+
+from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
+from aeromatch_cli.evaluate.reference import ReferenceTruth
+from aeromatch_cli.evaluate.rendered import RenderedTruth
+from aeromatch_cli.evaluate.scores import Conditions, PairScore
+from aeromatch_cli.evaluate.work import Evaluation, evaluate_workspace
+
+__all__ = [
+    "BlockTruth",
+    "Conditions",
+    "Evaluation",
+    "PairScore",
+    "ReferenceTruth",
+    "RenderedTruth",
+    "evaluate_workspace",
+    "open_truth",
+]

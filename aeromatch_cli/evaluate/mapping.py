@@ -1,0 +1,61 @@
+"""What a consumer gets from an exported database: pycolmap's incremental mapping, in a process of its own.
+
+Run as a module: DATABASE IMAGES OUT.json. A process of its own, since pycolmap stops the whole process on a fault.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+
+def map_database(database: Path, images_folder: Path | None) -> dict[str, Any]:
+    """Figures of the largest model: registered, models, points, track_length, reprojection_error_px.
+
+    The database is copied first. {"skipped": reason} where there is no database or mapping fails.
+    """
+    if not database.is_file():
+        return {"skipped": f"no {database.name} in {database.parent}: run `aeromatch export` with the colmap exporter"}
+    with tempfile.TemporaryDirectory() as scratch:
+        copy, out = Path(scratch) / "database.db", Path(scratch) / "mapping.json"
+        shutil.copy(database, copy)
+        command = [sys.executable, "-m", __name__, str(copy), str(images_folder or scratch), str(out)]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        if done.returncode or not out.is_file():
+            said = (done.stderr or done.stdout).strip().splitlines()[-1:]
+            return {"skipped": f"pycolmap's mapping failed with exit code {done.returncode}: {' '.join(said)}"}
+        found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
+    return found
+
+
+def _map(database: Path, images_folder: Path, out: Path) -> None:
+    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = 0
+    sparse = out.with_name("sparse")
+    sparse.mkdir()
+    models = pycolmap.incremental_mapping(database, images_folder, sparse, options=options)
+    facts: dict[str, Any] = {"registered": 0, "models": len(models)}
+    if models:
+        best = max(models.values(), key=lambda model: model.num_reg_images())
+        facts = {
+            "registered": best.num_reg_images(),
+            "models": len(models),
+            "points": best.num_points3D(),
+            "track_length": best.compute_mean_track_length(),
+            "reprojection_error_px": best.compute_mean_reprojection_error(),
+        }
+    out.write_text(json.dumps(facts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    _map(*map(Path, sys.argv[1:4]))

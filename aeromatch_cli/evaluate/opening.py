@@ -1,0 +1,66 @@
+"""Which truth a folder holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.errors import InputError
+from aeromatch_cli.evaluate.reference import load_reference
+from aeromatch_cli.evaluate.rendered import RenderedTruth
+from aeromatch_cli.evaluate.scores import Conditions, PairScore
+
+_REFERENCE_FILES = ("poses.csv", "block.json")
+
+
+class BlockTruth(Protocol):
+    """Who judges the pairs of a block. Images go by name; points are stored pixels."""
+
+    @property
+    def kind(self) -> str:
+        """ "rendered" or "reference"."""
+        ...
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]: ...
+
+    @property
+    def images_folder(self) -> Path | None: ...
+
+    def overlap_at_most(self, name0: str, name1: str) -> float: ...
+
+    def conditions(self, name0: str, name1: str) -> Conditions: ...
+
+    def judge(
+        self,
+        name0: str,
+        name1: str,
+        keypoints0_px: FloatArray,
+        keypoints1_px: FloatArray,
+        points0_px: FloatArray,
+        points1_px: FloatArray,
+        scores: FloatArray,
+    ) -> PairScore: ...
+
+
+def open_truth(folder: Path) -> BlockTruth:
+    """The truth in a folder: a rendered block (truth.json), or reference poses (poses.csv and block.json, there or in
+    its subfolder reference). Raises InputError where it holds neither, or something damaged.
+    """
+    if (folder / "truth.json").is_file():
+        from aeromatch_cli.synthetic.truth import load_truth
+
+        return RenderedTruth(load_truth(folder), _existing(folder / "images"))
+    for place in (folder, folder / "reference"):
+        if all((place / name).is_file() for name in _REFERENCE_FILES):
+            return load_reference(place, _existing(folder / "images") or _existing(place.parent / "images"))
+    raise InputError(
+        f"{folder} holds no truth: give the folder that synth wrote (truth.json), or one with reference poses "
+        f"({' and '.join(_REFERENCE_FILES)})"
+    )
+
+
+def _existing(folder: Path) -> Path | None:
+    return folder if folder.is_dir() else None

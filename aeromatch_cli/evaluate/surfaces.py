@@ -1,0 +1,102 @@
+"""Which surfaces a keypoint may mean, and whether another image sees them: rays through a rendered scene.
+
+A corner of a roof is found within a pixel of it, on the roof or on the street beside it. So a keypoint stands for every
+surface visible within 1 px of it, each met by the keypoint's own exact ray.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.cameras import focal_px, normalise
+
+if TYPE_CHECKING:
+    from aeromatch_cli.synthetic.truth import Truth
+
+# The centre ray and 8 around it.
+_REACH_PX = 1.0
+_ANGLES = np.arange(8) * (np.pi / 4.0)
+_RING_PX = np.concatenate([[[0.0, 0.0]], _REACH_PX * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])])
+# A surface may be extended along the ray by this many pixel footprints, and counts as the same within them.
+_FOOTPRINTS = 3.0
+# A point counts as seen when nothing stands more than this in front of it.
+_IN_FRONT_M = 2e-3
+
+
+def view(truth: Truth, image: str, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions (N, 3) in the world with depth 1, NaN where the lens has no ray, and the projection centre (3,)."""
+    pose = truth.poses[image]
+    assert pose.world_rotation is not None
+    uv = normalise(truth.cameras[image], points_px)
+    return np.column_stack([uv, np.ones(len(uv))]) @ pose.world_rotation, pose.center_m
+
+
+def first_hits(truth: Truth, center_m: FloatArray, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Triangle index (N,), -1 for none, and distance (N,) in units of the direction, infinite for none."""
+    triangle_idx, distances = np.full(len(directions), -1), np.full(len(directions), np.inf)
+    usable = np.flatnonzero(np.isfinite(directions).all(axis=1))
+    if len(usable):
+        hits = truth.caster.first_hits(center_m, directions[usable])
+        triangle_idx[usable], distances[usable] = hits.triangle_idx, hits.distances
+    return triangle_idx, distances
+
+
+def surfaces(truth: Truth, image: str, points_px: FloatArray) -> FloatArray:
+    """World places (N, 9, 3) that stored pixels (N, 2) may show: what is visible within 1 px, straight ahead first.
+
+    For every distinct triangle that the centre ray or one of 8 rays around it meets: the place where the keypoint's
+    exact ray meets the triangle's plane, or, where that lies more than 3 pixel footprints nearer or farther than the
+    triangle was met, the place on the exact ray at the depth where it was met. NaN for sky and repetitions.
+    """
+    count, rays = len(points_px), len(_RING_PX)
+    around = (np.asarray(points_px, dtype=np.float64)[:, None] + _RING_PX).reshape(-1, 2)
+    directions, center_m = view(truth, image, around)
+    hits = first_hits(truth, center_m, directions)
+    triangle_idx, depth_m = hits[0].reshape(count, rays), hits[1].reshape(count, rays)
+    exact = directions.reshape(count, rays, 3)[:, 0]
+    has_ray = np.asarray(np.isfinite(exact).all(axis=1))
+    candidate = (triangle_idx >= 0) & has_ray[:, None]
+    for j in range(1, rays):
+        candidate[:, j] &= (triangle_idx[:, :j] != triangle_idx[:, j : j + 1]).all(axis=1)
+    k, ring = np.nonzero(candidate)
+    met_m, met_idx = depth_m[k, ring], triangle_idx[k, ring]
+    normals, corners_m = truth.scene.normals[met_idx], truth.scene.triangles_m[met_idx, 0]
+    along = (normals * exact[k]).sum(axis=1)
+    height = (normals * (corners_m - center_m)).sum(axis=1)
+    extended_m = np.divide(height, along, out=np.full(len(k), np.inf), where=np.abs(along) > 1e-9)
+    footprint_m = met_m / focal_px(truth.cameras[image])
+    reached_m = np.where(np.abs(extended_m - met_m) <= _FOOTPRINTS * footprint_m, extended_m, met_m)
+    points_m = np.full((count, rays, 3), np.nan)
+    points_m[k, ring] = center_m + reached_m[:, None] * exact[k]
+    return points_m
+
+
+def in_open_view(truth: Truth, image: str, points_m: FloatArray) -> BoolArray:
+    """Whether nothing stands between an image's projection centre and world points (N, 3), finite ones."""
+    center_m = truth.poses[image].center_m
+    directions = points_m - center_m
+    _, distances = first_hits(truth, center_m, directions)
+    # In units of these directions the point itself lies at 1.
+    return np.asarray(distances >= 1.0 - _IN_FRONT_M / np.linalg.norm(directions, axis=1))
+
+
+def visible_within_reach(truth: Truth, image: str, points_m: FloatArray, places_px: FloatArray) -> BoolArray:
+    """Whether an image sees world points (N, 3), which project to places (N, 2) on it, or their surface within 1 px."""
+    seen = in_open_view(truth, image, points_m)
+    behind = np.flatnonzero(~seen)
+    if len(behind):
+        shown_m = surfaces(truth, image, places_px[behind])
+        apart_m = np.linalg.norm(shown_m - points_m[behind, None], axis=2)
+        depth_m = (points_m[behind] - truth.poses[image].center_m) @ _optical_axis(truth, image)
+        near_m = _FOOTPRINTS * depth_m / focal_px(truth.cameras[image])
+        seen[behind] = (np.where(np.isnan(apart_m), np.inf, apart_m) <= near_m[:, None]).any(axis=1)
+    return seen
+
+
+def _optical_axis(truth: Truth, image: str) -> FloatArray:
+    rotation = truth.poses[image].world_rotation
+    assert rotation is not None
+    return np.asarray(rotation[2])

@@ -1,0 +1,149 @@
+"""evaluate: every pair of a workspace against the truth of its block."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray, Image
+from aeromatch_cli.errors import InputError
+from aeromatch_cli.evaluate.mapping import map_database
+from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
+from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
+from aeromatch_cli.executor import Progress, SilentProgress
+from aeromatch_cli.formats import VerifiedEntry, read_images, read_keypoints, read_pairs, read_verified_row
+from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.workspace import Workspace
+
+# Pairs that truly share this much count, whether they were tried or not.
+MIN_OVERLAP = 0.20
+# The quick estimate is of a coarse grid: pairs somewhat below are looked at properly.
+_QUICK_OVERLAP = 0.15
+_NAMED = 5
+_NOTHING: FloatArray = np.zeros((0, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A workspace against truth.
+
+    truth_kind: "rendered" or "reference". images: that were judged; left_out: names without reference pose. pairs:
+    sorted by image ids. consumer: figures of pycolmap's mapping, or {"skipped": reason}.
+    """
+
+    work: Path
+    truth_folder: Path
+    truth_kind: str
+    images: int
+    left_out: tuple[str, ...]
+    pairs: tuple[PairRow, ...]
+    consumer: Mapping[str, Any]
+    seconds: float
+
+
+def evaluate_workspace(
+    work: Path, truth_folder: Path, *, mapping: bool = True, progress: Progress | None = None
+) -> Evaluation:
+    """Judge all pairs that are verified in a workspace, and all others that overlap by 20 % in truth, as found nothing.
+
+    mapping: also run pycolmap's mapping from the exported database. Raises InputError where workspace and truth do not
+    belong together, BrokenFileError where a file of the workspace is missing or damaged.
+    """
+    started, progress = time.monotonic(), progress or SilentProgress()
+    workspace = Workspace(work)
+    workspace.check_version()
+    if not workspace.images.is_file():
+        raise InputError(f"{work} is no workspace (it has no images.csv): give the folder that `aeromatch run` wrote")
+    truth = open_truth(truth_folder)
+    images, left_out = _judged(read_images(workspace.images), truth, truth_folder)
+    entries = _verified(workspace)
+    keypoints = _Keypoints(workspace)
+    candidates = list(combinations(sorted(images, key=lambda image: image.image_id), 2))
+    rows = []
+    progress.start("evaluate", len(candidates))
+    try:
+        for image0, image1 in candidates:
+            row = _judge(truth, image0, image1, entries.get((image0.image_id, image1.image_id)), keypoints)
+            rows += [row] if row is not None else []
+            progress.advance()
+    finally:
+        progress.stop()
+    consumer: Mapping[str, Any] = {"skipped": "not asked for"}
+    if mapping:
+        consumer = map_database(workspace.export("colmap") / "database.db", truth.images_folder)
+    seconds = time.monotonic() - started
+    return Evaluation(work, truth_folder, truth.kind, len(images), left_out, tuple(rows), consumer, seconds)
+
+
+class _Keypoints:
+    """Keypoints of the images of a workspace, read once; none where an image has no features."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._read: dict[str, FloatArray] = {}
+
+    def __getitem__(self, image_id: str) -> FloatArray:
+        if image_id not in self._read:
+            path = self._workspace.features(image_id)
+            self._read[image_id] = read_keypoints(path)[0] if path.is_file() else _NOTHING
+        return self._read[image_id]
+
+
+def _judged(
+    images: Sequence[Image], truth: BlockTruth, truth_folder: Path
+) -> tuple[tuple[Image, ...], tuple[str, ...]]:
+    """Images that the truth knows, and names of the others. Raises InputError where both are not of one block."""
+    known = tuple(image for image in images if image.name in truth.cameras)
+    unknown = tuple(image.name for image in images if image.name not in truth.cameras)
+    # Every image of a rendered block has its truth; an adjustment may have left some out.
+    if len(known) < 2 or (unknown and truth.kind == "rendered"):
+        more = f" and {len(unknown) - _NAMED} more" if len(unknown) > _NAMED else ""
+        raise InputError(
+            f"{len(unknown)} of the {len(images)} images of the workspace are not in the truth {truth_folder} "
+            f"({', '.join(unknown[:_NAMED])}{more}): give the truth of the same block"
+        )
+    for image in known:
+        camera = truth.cameras[image.name]
+        if (image.width_px, image.height_px) != (camera.width_px, camera.height_px):
+            raise InputError(
+                f"image {image.name} has {image.width_px}x{image.height_px} px in the workspace and "
+                f"{camera.width_px}x{camera.height_px} px in the truth {truth_folder}: give that of the same images"
+            )
+    return known, unknown
+
+
+def _verified(workspace: Workspace) -> dict[tuple[str, str], VerifiedEntry]:
+    """Verdicts of the pairs on the list: what an older list left behind does not count."""
+    found, rows = {}, dict[str, dict[str, VerifiedEntry]]()
+    for pair in read_pairs(workspace.pairs):
+        if pair.image_id0 not in rows:
+            rows[pair.image_id0] = read_verified_row(workspace.verified(pair.image_id0))
+        entry = rows[pair.image_id0].get(pair.image_id1)
+        if entry is not None:
+            found[pair.image_id0, pair.image_id1] = entry
+    return found
+
+
+def _judge(
+    truth: BlockTruth, image0: Image, image1: Image, entry: VerifiedEntry | None, keypoints: _Keypoints
+) -> PairRow | None:
+    """The row of one pair, None where it is neither verified nor overlaps."""
+    state = NOT_TRIED if entry is None else str(entry.verdict.state)
+    verified = entry is not None and state == "verified"
+    if not verified and truth.overlap_at_most(image0.name, image1.name) < _QUICK_OVERLAP:
+        return None
+    conditions = truth.conditions(image0.name, image1.name)
+    if not verified and conditions.overlap < MIN_OVERLAP:
+        return None
+    all0, all1 = keypoints[image0.image_id], keypoints[image1.image_id]
+    sides, scores = (_NOTHING, _NOTHING), np.zeros(0)
+    if verified and entry is not None:
+        sides, scores = match_points(entry.matches, all0, all1), np.asarray(entry.matches.scores)
+    score = truth.judge(image0.name, image1.name, all0, all1, *sides, scores)
+    return PairRow(image0.name, image1.name, state, conditions, score)

@@ -1,0 +1,274 @@
+"""render_block: plan the flight, build the scene, take every picture, write it all down."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
+from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.geometry.cameras import resized
+from aeromatch_cli.synthetic import flights, presets, write
+from aeromatch_cli.synthetic.flights import Flight, Station
+from aeromatch_cli.synthetic.imagery import GroundImagery, load_imagery
+from aeromatch_cli.synthetic.light import Light
+from aeromatch_cli.synthetic.presets import PRESETS
+from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.render import Rendered, View, look_at, render_image
+from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
+from aeromatch_cli.synthetic.sensor import Development, meter
+from aeromatch_cli.synthetic.shade import Stage
+from aeromatch_cli.synthetic.terrain import Area
+
+SMALLEST_PX = 16
+# Room around the pictures' footprints for what throws its shadow in from outside.
+_MARGIN_M = 40.0
+_TEXTURE_GSD_M = 0.08
+_METER_PX, _METERED = 64, 3
+_FLIGHT_STREAM, _POSE_NOISE_STREAM = 103, 104
+
+
+@dataclass(frozen=True)
+class SynthSummary:
+    """What was rendered. images: names below OUT/images. gsd_m: ground sampling distance at the image centre."""
+
+    out: Path
+    preset: str
+    flight: str
+    seed: int
+    images: tuple[str, ...]
+    width_px: int
+    height_px: int
+    gsd_m: float
+    solids: Mapping[str, int]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _SceneKey:
+    """What rebuilds a scene under its light; equal in every process."""
+
+    scene: str
+    seed: int
+    area: Area
+    texture: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Shot:
+    """One picture to take. moment: its number in the block."""
+
+    out: Path
+    name: str
+    key: _SceneKey
+    light: Light
+    flight: Flight
+    station: Station
+    moment: int
+    settings: Development
+
+
+def render_block(
+    out: Path,
+    preset: str,
+    *,
+    seed: int = 0,
+    width_px: int = 1000,
+    height_px: int = 750,
+    images: int = 12,
+    flight: str = "nadir",
+    lens: str = "SIMPLE_RADIAL",
+    height_m: float | None = None,
+    sun_deg: tuple[float, float] | None = None,
+    texture: Path | None = None,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> SynthSummary:
+    """Render a block into the folder `out`; equal arguments give equal files, byte for byte, whatever the jobs.
+
+    flight: one of flights.FLIGHTS. lens: one of geometry.cameras.MODELS. height_m: flying height above the datum
+    instead of the preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture:
+    folder of pictures to lay over the ground. Raises ConfigError on an unknown name, an impossible size or number, or
+    a folder that holds another block; WorkspaceError where `out` cannot be written.
+    """
+    started = time.monotonic()
+    chosen = _checked(preset, seed, width_px, height_px, height_m, sun_deg)
+    planned = flights.plan_flight(
+        flight, images=images, width_px=width_px, height_px=height_px, height_m=height_m or chosen.height_m, lens=lens,
+        rng=np.random.default_rng([seed, _FLIGHT_STREAM]),
+    )  # fmt: skip
+    names = tuple(f"{preset}_{i + 1:04d}.jpg" for i in range(images))
+    lights = presets.lights(chosen, seed)
+    if sun_deg is not None:
+        lights = (Light(*sun_deg, lights[0].haze_per_km, lights[0].sky, lights[0].season), lights[1])
+    key = _SceneKey(chosen.scene, seed, flights.ground_area(planned, _MARGIN_M), str(texture or ""))
+    try:
+        write.prepare(out, names)
+        shots = _shots(out, names, key, lights, planned)
+        heights_m = _take_all(shots, jobs, progress)
+        _write_tables(out, names, planned, seed, heights_m)
+        scene = _scene(key).scene
+        write.write_dem(out / "dem.tif", scene.ground)
+        facts = _truth_facts(preset, scene, planned, lights, names, shots)
+        write.write_file(out / "truth.json", write.json_bytes(facts))
+    except OSError as error:
+        raise _unwritable(out, error) from error
+    seconds = time.monotonic() - started
+    gsd_m = flights.gsd_m(planned)
+    return SynthSummary(out, preset, flight, seed, names, width_px, height_px, gsd_m, dict(scene.solids), seconds)
+
+
+def _checked(
+    preset: str, seed: int, width_px: int, height_px: int, height_m: float | None, sun_deg: tuple[float, float] | None
+) -> presets.Preset:
+    if preset not in PRESETS:
+        raise ConfigError(f"unknown preset {preset!r} for a rendered block; use one of: {', '.join(PRESETS)}")
+    if width_px < SMALLEST_PX or height_px < SMALLEST_PX:
+        raise ConfigError(
+            f"rendered images must be at least {SMALLEST_PX} px wide and high, got {width_px}x{height_px}"
+        )
+    if seed < 0:
+        raise ConfigError(f"the seed of a rendered block must be 0 or larger, got {seed}")
+    if height_m is not None and not 1.0 <= height_m <= 10_000.0:
+        raise ConfigError(f"the flying height of a rendered block must be 1 to 10000 m, got {height_m:g}")
+    if sun_deg is not None and not (0.0 <= sun_deg[0] <= 360.0 and 5.0 <= sun_deg[1] <= 90.0):
+        raise ConfigError(f"the sun must stand at azimuth 0-360 and elevation 5-90 degrees, got {sun_deg}")
+    return PRESETS[preset]
+
+
+@dataclass(frozen=True, eq=False)
+class _Built:
+    scene: Scene
+    caster: RayCaster
+    imagery: GroundImagery | None
+
+
+@lru_cache(maxsize=1)
+def _scene(key: _SceneKey) -> _Built:
+    """The scene of a block, built once per process."""
+    scene = build_scene(key.scene, key.seed, key.area)
+    imagery = load_imagery(Path(key.texture), _TEXTURE_GSD_M, key.seed) if key.texture else None
+    return _Built(scene, RayCaster(scene), imagery)
+
+
+@lru_cache(maxsize=2)
+def _stage(key: _SceneKey, light: Light) -> Stage:
+    built = _scene(key)
+    return Stage(built.scene, built.caster, light, built.imagery)
+
+
+def _shots(
+    out: Path, names: tuple[str, ...], key: _SceneKey, lights: tuple[Light, Light], flight: Flight
+) -> list[_Shot]:
+    metered = {
+        sortie: _metered(key, lights[sortie], flight, [s for s in flight.stations if s.sortie == sortie])
+        for sortie in sorted({s.sortie for s in flight.stations})
+    }
+    return [
+        _Shot(
+            out, name, key, lights[station.sortie], flight, station, i,
+            presets.development(key.seed, i, station.sortie, metered[station.sortie]),
+        )
+        for i, (name, station) in enumerate(zip(names, flight.stations, strict=True))
+    ]  # fmt: skip
+
+
+def _metered(key: _SceneKey, light: Light, flight: Flight, stations: list[Station]) -> float:
+    """One exposure for a sortie, from small looks at a few of its pictures."""
+    seen = []
+    for station in stations[:: max(1, len(stations) // _METERED)][:_METERED]:
+        view = _view(flight, station, 0)
+        scale = _METER_PX / view.camera.width_px
+        height = max(1, round(view.camera.height_px * scale))
+        small = resized(view.camera, scale, _METER_PX, height)
+        seen.append(look_at(_stage(key, light), View(small, view.world_rotation, view.center_m, 0)))
+    return meter(np.concatenate(seen))
+
+
+def _view(flight: Flight, station: Station, moment: int) -> View:
+    pose = station.exterior.pose()
+    assert pose.world_rotation is not None
+    return View(flight.cameras[station.camera_id], pose.world_rotation, pose.center_m, moment)
+
+
+def _take_all(shots: list[_Shot], jobs: int, progress: Progress | None) -> FloatArray:
+    """Render and write every image; returns surface heights (N,) of a sample of all pixels."""
+    with Executor("processes", jobs, progress) as executor:
+        outcomes = executor.run(_take, shots, "synth")
+    for outcome in outcomes:
+        if outcome.value is None:
+            raise AeromatchError(outcome.error)
+    return np.concatenate([outcome.value for outcome in outcomes if outcome.value is not None])
+
+
+def _take(shot: _Shot) -> FloatArray:
+    view = _view(shot.flight, shot.station, shot.moment)
+    rng = presets.image_rng(shot.key.seed, shot.moment)
+    rendered = render_image(_stage(shot.key, shot.light), view, shot.settings, rng)
+    try:
+        write.write_rendered(shot.out, shot.name, rendered, shot.settings.jpeg_quality)
+    except OSError as error:
+        raise _unwritable(shot.out, error) from error
+    return _heights(_scene(shot.key).scene, rendered)
+
+
+def _heights(scene: Scene, rendered: Rendered) -> FloatArray:
+    """World z of the middle of the triangle that every 16th pixel sees."""
+    seen = rendered.surface.reshape(-1)[::16].astype(np.int64)
+    heights: FloatArray = scene.triangles_m[seen[seen > 0] - 1, :, 2].mean(axis=1)
+    return heights
+
+
+def _write_tables(out: Path, names: tuple[str, ...], flight: Flight, seed: int, heights_m: FloatArray) -> None:
+    rng = np.random.default_rng([seed, _POSE_NOISE_STREAM])
+    exact = tuple(station.exterior for station in flight.stations)
+    noisy = tuple(flights.noisy(station.exterior, rng, station.height_m) for station in flight.stations)
+    cameras = tuple(station.camera_id for station in flight.stations)
+    write.write_file(out / "poses.csv", write.pose_table(names, exact, cameras))
+    write.write_file(out / "poses_noisy.csv", write.pose_table(names, noisy, cameras))
+    write.write_file(out / "block.json", write.json_bytes(write.block_facts(flight, names, heights_m)))
+
+
+def _truth_facts(
+    preset: str,
+    scene: Scene,
+    flight: Flight,
+    lights: tuple[Light, Light],
+    names: tuple[str, ...],
+    shots: list[_Shot],
+) -> dict[str, Any]:
+    return {
+        "format": write.TRUTH_FORMAT,
+        "scene_version": SCENE_VERSION,
+        "preset": preset,
+        "scene": scene.name,
+        "seed": scene.seed,
+        "area_m": asdict(scene.area),
+        "scene_sha256": scene_digest(scene),
+        "solids": dict(scene.solids),
+        "flight": flight.name,
+        "gsd_m": round(flights.gsd_m(flight), 6),
+        "pose_noise": {
+            "share_of_height": flights.NOISE_SHARE_OF_HEIGHT,
+            "angle_deg": flights.NOISE_ANGLE_DEG,
+        },
+        "lights": [asdict(light) for light in lights],
+        "images": [
+            {"name": name, "sortie": shot.station.sortie, "height_m": shot.station.height_m} | asdict(shot.settings)
+            for name, shot in zip(names, shots, strict=True)
+        ],
+    }
+
+
+def _unwritable(out: Path, error: OSError) -> WorkspaceError:
+    where = error.filename or out
+    return WorkspaceError(
+        f"the rendered block cannot be written to {where}: {error.strerror}; choose a folder that can be written"
+    )

@@ -1,0 +1,170 @@
+"""evaluate on whole workspaces: figures, files, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import HEIGHT, IMAGES, WIDTH
+
+from aeromatch_cli.errors import InputError
+from aeromatch_cli.evaluate import evaluate_workspace
+from aeromatch_cli.evaluate.mapping import map_database
+from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
+from aeromatch_cli.evaluate.totals import total
+from aeromatch_cli.evaluate.work import Evaluation
+from aeromatch_cli.formats import read_features, read_verified_row, write_features, write_verified_row
+
+
+@pytest.fixture(scope="module")
+def work(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace of its own, which evaluations may write into."""
+    copy = tmp_path_factory.mktemp("evaluated") / "work"
+    shutil.copytree(finished / "work", copy)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def evaluation(work: Path, rendered: Path) -> Evaluation:
+    return evaluate_workspace(work, rendered)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_finished_run_is_nearly_all_correct(evaluation: Evaluation) -> None:
+    figures = total(evaluation.pairs)
+    assert figures["pairs_verified"] >= 4
+    assert figures["kept"] > 100
+    assert figures["correctness"] > 0.9
+    assert 0.0 < figures["recall"] <= 1.0
+    assert figures["median_error_px"] < 1.0
+    assert figures["rotation_error_deg"] < 2.0
+    for row in evaluation.pairs:
+        assert row.state == "verified" or (row.score.kept == 0 and row.conditions.overlap >= 0.2)
+        assert row.score.possible > 0
+    assert 2 <= evaluation.consumer["registered"] <= IMAGES
+    assert evaluation.consumer["reprojection_error_px"] < 1.0
+
+
+def test_shifted_keypoints_are_nearly_all_wrong(work: Path, rendered: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "work"
+    shutil.copytree(work, copy)
+    path = sorted((copy / "features").iterdir())[0]
+    features = read_features(path)
+    with path.open("wb") as stream:
+        write_features(stream, replace(features, keypoints_px=features.keypoints_px + np.float32(12.0)), "moved")
+    found = evaluate_workspace(copy, rendered, mapping=False)
+    name = next(row["name"] for row in rows(copy / "images.csv") if row["image_id"] == path.stem)
+    moved = [row for row in found.pairs if name in (row.name0, row.name1)]
+    assert sum(row.score.kept for row in moved) > 50
+    assert total(moved)["correctness"] < 0.05
+    assert total(moved)["median_error_px"] > 10
+    assert found.consumer == {"skipped": "not asked for"}
+
+
+def test_pairs_that_were_rejected_or_never_tried_count_as_found_nothing(
+    work: Path, rendered: Path, tmp_path: Path, evaluation: Evaluation
+) -> None:
+    copy = tmp_path / "work"
+    shutil.copytree(work, copy)
+    path = max((copy / "verified").iterdir(), key=lambda p: len(read_verified_row(p)))
+    entries = list(read_verified_row(path).values())
+    assert len(entries) >= 2
+    entries[0] = replace(entries[0], verdict=replace(entries[0].verdict, state="rejected"))
+    with path.open("wb") as stream:
+        write_verified_row(stream, entries[:1])
+    found = evaluate_workspace(copy, rendered, mapping=False)
+    before = {(row.name0, row.name1): row for row in evaluation.pairs}
+    after = {(row.name0, row.name1): row for row in found.pairs}
+    changed = [key for key in before if key not in after or after[key].state != before[key].state]
+    assert len(changed) == len(entries)
+    for key in set(changed) & set(after):
+        assert after[key].state in ("rejected", "not tried")
+        assert after[key].score.kept == 0
+        assert after[key].score.possible == before[key].score.possible
+    assert total(found.pairs)["recall"] < total(evaluation.pairs)["recall"]
+
+
+def test_files_hold_what_was_found(work: Path, evaluation: Evaluation) -> None:
+    written = write_evaluation(evaluation)
+    assert {path.name for path in written} == {
+        "evaluation.json", "pairs.csv", "conditions.csv", "errors.png", "view_angles.png", "coverage.png",
+    }  # fmt: skip
+    folder = work / "evaluation"
+    found = json.loads((folder / "evaluation.json").read_text())
+    assert found == json.loads(json.dumps(facts(evaluation)))
+    assert found["totals"]["correct"] == sum(row.score.correct for row in evaluation.pairs)
+    pairs = rows(folder / "pairs.csv")
+    assert len(pairs) == len(evaluation.pairs)
+    assert sum(int(row["kept"]) for row in pairs) == found["totals"]["kept"]
+    assert {row["texture_class"] for row in pairs} <= {"poor", "medium", "rich"}
+    angles = [row for row in rows(folder / "conditions.csv") if row["condition"] == "view angle"]
+    assert sum(int(row["pairs"]) for row in angles) == len(pairs)
+    for path in written[3:]:
+        assert cv2.imread(str(path)).std() > 5
+    again = {path: path.read_bytes() for path in written}
+    write_evaluation(evaluation)
+    assert {path: path.read_bytes() for path in written} == again
+    shown = dict(summary_rows(evaluation))
+    assert shown["mapping"] == f"{evaluation.consumer['registered']} of {IMAGES} images in one model"
+    assert shown["pairs with 30 correct"] == str(found["totals"]["pairs_with_30_correct"])
+    assert len({len(row) for row in condition_rows(evaluation)}) == 1
+    table = lines(evaluation)[len(shown) + 1 :]
+    assert len({len(line) for line in table}) == 1  # columns stand below each other
+    assert table[0].split()[:3] == ["condition", "class", "pairs"]
+
+
+def test_a_workspace_judged_by_poses_alone(work: Path, rendered: Path, tmp_path: Path, evaluation: Evaluation) -> None:
+    """The exact poses of a rendered block, taken as reference poses of a real one."""
+    for name in ("poses.csv", "block.json"):
+        shutil.copy(rendered / name, tmp_path / name)
+    found = evaluate_workspace(work, tmp_path, mapping=False)
+    figures = total(found.pairs)
+    assert found.truth_kind == "reference"
+    assert figures["correctness"] >= total(evaluation.pairs)["correctness"]
+    assert np.isnan(figures["recall"])
+    assert facts(found)["totals"]["recall"] is None
+    assert dict(summary_rows(found))["recall"] == "- of - possible"
+    # An image without reference pose is left out, and said so.
+    *listed, last = (tmp_path / "poses.csv").read_text().splitlines()
+    (tmp_path / "poses.csv").write_text("\n".join(listed) + "\n")
+    assert evaluate_workspace(work, tmp_path, mapping=False).left_out == (last.split(",")[0],)
+
+
+def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no workspace.*images\.csv"):
+        evaluate_workspace(tmp_path, rendered)
+    with pytest.raises(InputError, match="holds no truth"):
+        evaluate_workspace(work, tmp_path)
+    copy = tmp_path / "work"
+    shutil.copytree(work, copy)
+    text = (copy / "images.csv").read_text()
+    name = rows(copy / "images.csv")[0]["name"]
+    (copy / "images.csv").write_text(text.replace(name, "holiday.jpg"))
+    with pytest.raises(InputError, match=rf"1 of the {IMAGES} images .*holiday\.jpg"):
+        evaluate_workspace(copy, rendered)
+    (copy / "images.csv").write_text(text.replace(f",{WIDTH},{HEIGHT},", f",{2 * WIDTH},{HEIGHT},"))
+    with pytest.raises(InputError, match=rf"{2 * WIDTH}x{HEIGHT} px in the workspace and {WIDTH}x{HEIGHT} px"):
+        evaluate_workspace(copy, rendered)
+
+
+def test_a_mapping_that_fails_says_so(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_bytes(b"no database")
+    assert "exit code" in map_database(tmp_path / "database.db", None)["skipped"]
+
+
+def test_without_export_mapping_is_skipped_with_a_reason(work: Path, rendered: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "work"
+    shutil.copytree(work, copy, ignore=shutil.ignore_patterns("export"))
+    found = evaluate_workspace(copy, rendered)
+    assert "aeromatch export" in found.consumer["skipped"]
+    assert dict(summary_rows(found))["mapping"].startswith("skipped: ")
