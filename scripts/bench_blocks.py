@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import write_readme
 
 from aeromatch_cli.blocks.read import read_block_inputs
 from aeromatch_cli.geometry.cameras import undistort
@@ -228,15 +229,6 @@ def table(rows: list[dict[str, Any]]) -> str:
         cells += [row["pairs"], row["matches"], row["unique_matches"], row["within_3px"], registered]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines) + "\n"
-
-
-def write_readme(text: str, name: str) -> None:
-    """Replace what stands between the README's markers of this name."""
-    path = Path(__file__).parent.parent / "README.md"
-    start, end = f"<!-- {name}:start -->", f"<!-- {name}:end -->"
-    before, _, rest = path.read_text(encoding="utf-8").partition(start)
-    _, _, after = rest.partition(end)
-    path.write_text(f"{before}{start}\n{text}{end}{after}", encoding="utf-8")
 
 
 def main() -> None:

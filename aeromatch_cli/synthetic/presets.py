@@ -32,7 +32,7 @@ PRESETS: Mapping[str, Preset] = {
     "suburb": Preset("suburb", 110.0, (50.0, 62.0)),
     "farmland": Preset("farmland", 120.0),
     "grass": Preset("grass", 80.0),
-    "desert": Preset("desert", 120.0, (30.0, 50.0)),
+    "desert": Preset("desert", 120.0, (28.0, 42.0)),
     "hills": Preset("hills", 180.0, (30.0, 50.0)),
     "water-edge": Preset("water-edge", 100.0),
 }

@@ -1,0 +1,196 @@
+"""This project's presets beside the peers: same pairs, images, size and budget, seeds fixed, judged by truth.
+
+A method is a peer or a preset, with settings in brackets as in `--set`: 'opencv-sift,baseline,fusion[enhance=none]'.
+Rendered scenes (one block with the `mixed` flight each) are judged by their exact geometry, real blocks
+(DATA/BLOCK/images, DATA/BLOCK/reference) by the epipolar lines of their reference poses. A pair is hard where the
+shadow share is 20 % or more or the view angle 30 degrees or more (in a real block also where one image is 1.6 times as
+bright as the other), and overlaps by a fifth at least.
+
+Every method runs in a process of its own per scene, two threads. A row's seconds are those of both images' features
+(decoding included), matching and verification; start-up is not timed. peak_mb is the largest resident memory meanwhile.
+Writes OUT/results.json row by row and OUT/table.md. OUT/scenes keeps rendered blocks, reduced images and every row that
+was ever made: what depends on nothing that changed is not made again, so that a killed run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from importlib import metadata
+from pathlib import Path
+
+from common import write_readme
+from methods import worker
+from methods.base import Options
+from methods.results import Row, make_row, read_rows, tables, write_rows
+from methods.scenes import MIN_OVERLAP, Judged, Selection, real, rendered
+from methods.table import NEED_WEIGHTS, PEERS, method, split_methods
+
+import aeromatch_cli
+from aeromatch_cli.errors import AeromatchError, ConfigError
+from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.workspace import file_digest, fingerprint, write_text
+
+THREADS = 2
+REAL_MAX_SIZE_PX = 1000
+LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")
+# What a plain run and --quick do where an option is not given.
+FULL = {"scenes": ",".join(PRESETS), "pairs": 16, "size": "1000x750", "images": 24, "keypoints": 2048}
+QUICK = {"scenes": "city,grass", "pairs": 4, "size": "480x360", "images": 12, "keypoints": 512}
+
+
+def code_digest(*places: str) -> str:
+    """Digest of source files below the package or this folder."""
+    roots = [Path(aeromatch_cli.__file__).parent, Path(__file__).parent]
+    files = [path for root in roots for place in places for path in sorted((root / place).rglob("*.py"))]
+    return fingerprint([(path.name, file_digest(path)) for path in files])
+
+
+def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
+    """One after the other, each made when it is needed."""
+    width, _, height = args.size.partition("x")
+    folder = args.out / "scenes"
+    folder.mkdir(parents=True, exist_ok=True)
+    code = code_digest("synthetic")
+    for preset in filter(None, args.scenes.split(",")):
+        size = int(width), int(height)
+        yield rendered(folder, preset, selection, size_px=size, images=args.images, jobs=THREADS, code=code)
+    for block in filter(None, args.blocks.split(",")):
+        yield real(folder, args.data, block, selection, max_size_px=args.max_size)
+
+
+def measure(name: str, judged: Judged, options: Options, known: dict[str, Row]) -> Iterator[Row]:
+    """Rows of one method on one scene, as they come; those in `known` (by key) are given back as they are."""
+    # Peers do not read the rest of the package: their rows outlive a change of it.
+    places = ("evaluate", "synthetic", "geometry", "methods") if name in PEERS else (".",)
+    versions = [metadata.version(library) for library in LIBRARIES]
+    basis = [name, judged.key, vars(options) | {"weights": None}, code_digest(*places), versions]
+    keys = [fingerprint(basis, pair.images)[:16] for pair in judged.pairs]
+    if all(key in known for key in keys):
+        yield from (known[key] for key in keys)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, worker.start, (name, judged.scene, options)) as process:
+        for pair, key in zip(judged.pairs, keys, strict=True):
+            if key in known:
+                yield known[key]
+                continue
+            try:
+                measured = process.submit(worker.run_pair, pair.images).result()
+            except BrokenProcessPool as error:
+                raise SystemExit(f"{name} on {judged.scene.name}: its process died ({error})") from error
+            found = measured.found
+            score = judged.truth.judge(
+                *pair.images, found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+            )
+            yield make_row(name, judged.scene.name, pair, score, measured, options, key)
+
+
+def run(args: argparse.Namespace) -> list[Row]:
+    """All rows, written as they come."""
+    options = Options(args.keypoints, args.budget, THREADS, args.seed, args.reference_weights)
+    selection = Selection(args.condition, args.pairs, args.seed, args.noisy_poses)
+    store = args.out / "scenes" / "rows.json"
+    known = {row["key"]: row for row in read_rows(store)}
+    rows: list[Row] = []
+    names = split_methods(args.methods)
+    total = len(list(filter(None, args.scenes.split(",") + args.blocks.split(",")))) * len(names)
+    started, done = time.monotonic(), 0
+    for judged in scenes(args, selection):
+        if len(judged.pairs) < args.pairs:
+            found = f"{len(judged.pairs)} {args.condition} pairs with overlap >= {MIN_OVERLAP:.0%}"
+            print(f"{judged.scene.name} has only {found}, {args.pairs} were asked for", file=sys.stderr)
+        for name in names if judged.pairs else ():
+            before = time.monotonic()
+            for row in measure(name, judged, options, known):
+                rows.append(row)
+                known[row["key"]] = row
+                write_rows(store, list(known.values()))
+                write_rows(args.out / "results.json", rows)
+            done += 1
+            left = (time.monotonic() - started) / done * (total - done)
+            print(
+                f"{judged.scene.name} {name}: {len(judged.pairs)} pairs, {time.monotonic() - before:.0f} s; "
+                f"{done} of {total}, about {left / 60:.0f} min left",
+                file=sys.stderr,
+            )
+    return rows
+
+
+def command(args: argparse.Namespace) -> str:
+    """This run's command line without machine paths."""
+    parts = [f"scripts/bench_methods --methods '{args.methods}' --scenes {args.scenes or repr('')}"]
+    parts += [f"--condition {args.condition} --pairs {args.pairs} --seed {args.seed} --keypoints {args.keypoints}"]
+    parts += [f"--budget {args.budget} --size {args.size} --images {args.images}"]
+    if args.blocks:
+        parts.append(f"--data DIR --blocks {args.blocks} --max-size {args.max_size}")
+    if args.reference_weights:
+        parts.append("--reference-weights DIR")
+    if args.noisy_poses:
+        parts.append("--noisy-poses")
+    return " ".join([*parts, "--out DIR"])
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--methods", help=f"comma-separated: {', '.join(PEERS)}, or presets; default: all classical peers and baseline")
+    add("--scenes", help=f"comma-separated presets of rendered blocks: {', '.join(PRESETS)}; '' for none")
+    add("--condition", choices=("hard", "easy", "all"), default="all", help="all: half hard, half easy")
+    add("--pairs", type=int, help="judged pairs of each scene")
+    add("--seed", type=int, default=0, help="another seed gives other scenes, pairs and samples")
+    add("--keypoints", type=int, help="descriptors per image (or view), exactly")
+    add("--budget", choices=("image", "view"), default="image", help="what --keypoints is counted over")
+    add("--size", metavar="WxH", help="of rendered images")
+    add("--images", type=int, help="of each rendered block")
+    add("--quick", action="store_true", help="small images, few pairs: two minutes")
+    add("--noisy-poses", action="store_true", help="presets get poses_noisy.csv instead of exact poses")
+    add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
+    add("--data", type=Path, metavar="DIR", help="folder of real blocks")
+    add("--blocks", default="", help="names of real blocks, comma-separated")
+    add("--max-size", type=int, default=REAL_MAX_SIZE_PX, help="longer side of real images, px")
+    add("--readme", action="store_true", help="write the tables into the README")
+    add("--out", type=Path, required=True)
+    args = parser.parse_args()
+    for key, value in (QUICK if args.quick else FULL).items():
+        if getattr(args, key) is None:
+            setattr(args, key, value)
+    if args.methods is None:
+        args.methods = ",".join(name for name in (*PEERS, "baseline") if name not in NEED_WEIGHTS)
+    if args.blocks and args.data is None:
+        parser.error("--blocks needs --data: the folder that holds BLOCK/images and BLOCK/reference")
+    if args.pairs < 1 or args.keypoints < 1:
+        parser.error("--pairs and --keypoints must be at least 1")
+    return args
+
+
+def main() -> None:
+    args = parse()
+    worker.limit_threads(THREADS)
+    os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
+    try:
+        for name in split_methods(args.methods):
+            method(name)
+            if name in NEED_WEIGHTS and args.reference_weights is None:
+                raise ConfigError(f"{name} needs --reference-weights DIR")
+        rows = run(args)
+        if not rows:
+            raise ConfigError(f"no scene has a pair of condition {args.condition}: give another --seed or --condition")
+    except AeromatchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error
+    text = tables(rows)
+    write_text(args.out / "table.md", text)
+    print(text)
+    if args.readme:
+        write_readme(f"    {command(args)}\n\n{text}", "bench_methods")
+
+
+if __name__ == "__main__":
+    main()

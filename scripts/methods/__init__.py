@@ -1,0 +1,11 @@
+"""The methods that scripts/bench_methods compares: peers, one file each, and this project's presets.
+
+base      what a method is given and what it answers
+matching  nearest neighbours and MAGSAC++, as users of OpenCV and kornia call them
+opencv_sift, opencv_asift, colmap, aliked, keynet   the peers
+ours      a preset of this project, with settings in brackets
+table     name -> method
+scenes    rendered scenes and real blocks, and which of their pairs are judged
+worker    one method on one scene in a process of its own, timed
+results   rows, their file, and the tables made from it
+"""

@@ -1,0 +1,76 @@
+"""A preset of this project, with settings in brackets, run stage by stage in one process."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import Features, Pair
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.formats import read_features
+from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.stages import filter as filtering
+from aeromatch_cli.strategies.filters import apply_chain
+from methods.base import Found, Options, Scene
+
+
+class Preset:
+    """Poses and cameras of the block are given, pairs are the judged ones; everything else is the preset's.
+
+    An image's features are made by the extract stage (decoding, enhancement, views, writing and reading of its file
+    included), a pair's matches by the preset's matcher and its chain of filters, on verified pairs only. Nothing runs
+    in other processes; libraries use the benchmark's threads.
+    """
+
+    def __init__(self, scene: Scene, options: Options, *, preset: str, settings: tuple[str, ...]) -> None:
+        self._folder = tempfile.TemporaryDirectory()  # lives as long as this object
+        work = Path(self._folder.name)
+        listed = work / "pairs.txt"
+        listed.write_text("".join(f"{a},{b}\n" for a, b in scene.pairs), encoding="utf-8")
+        budget = [] if options.budget == "image" else [f"extract.budget={options.budget}"]
+        own = ["pairs=file", f"pairs.path={listed}", f"extract.keypoints={options.keypoints}", *budget]
+        block = {"images": str(scene.images), "poses": str(scene.poses), "cameras": str(scene.block)}
+        run = {"executor": "serial", "jobs": 1}
+        tree = load(preset, [*own, *settings], block, workspace=str(work / "work"), run=run, seed=options.seed)
+        self.context, _ = pairs.prepare(tree, Executor("serial", 1))
+        self.id_of = {image.name: image.image_id for image in self.context.block.images}
+        self.pair_of = {(pair.image_id0, pair.image_id1): pair for pair in self.context.pairs}
+
+    def features(self, image: str) -> Features:
+        task = extract.task_of(self.context, self.id_of[image])
+        extract.run_task(task)
+        return read_features(task.path)
+
+    def match(self, image0: str, image1: str, features0: Features, features1: Features) -> Found:
+        ids = self.id_of[image0], self.id_of[image1]
+        if ids not in self.pair_of:  # ids sort otherwise than names
+            return _turned(self.match(image1, image0, features1, features0))
+        pair: Pair = self.pair_of[ids]
+        geometry = self.context.geometry(pair)
+        matches = self.context.settings.match(features0, features1, geometry)
+        points = filtering.match_points(matches, features0.keypoints_px, features1.keypoints_px)
+        seed = filtering.pair_seed(self.context, pair)
+        verdict = apply_chain(self.context.settings.filter, *points, geometry, seed)
+        keep = verdict.keep if verdict.state == "verified" else np.zeros_like(verdict.keep)
+        return Found(
+            points0_px=points[0][keep],
+            points1_px=points[1][keep],
+            scores=matches.scores[keep].astype(np.float64),
+            keypoints0_px=features0.keypoints_px.astype(np.float64),
+            keypoints1_px=features1.keypoints_px.astype(np.float64),
+            descriptors=(len(features0.descriptors) + len(features1.descriptors)) / 2,
+        )
+
+
+def _turned(found: Found) -> Found:
+    return Found(
+        points0_px=found.points1_px,
+        points1_px=found.points0_px,
+        scores=found.scores,
+        keypoints0_px=found.keypoints1_px,
+        keypoints1_px=found.keypoints0_px,
+        descriptors=found.descriptors,
+    )
