@@ -191,7 +191,9 @@ def synth(
     height: Annotated[
         float | None, typer.Option("--height", metavar="METRES", help="Flying height; each scene has its own.")
     ] = None,
-    lens: Annotated[str, typer.Option("--lens", metavar="MODEL", help="COLMAP's camera model.")] = "SIMPLE_RADIAL",
+    lens: Annotated[
+        str, typer.Option("--lens", metavar="MODEL", help="Camera model, COLMAP's name: PINHOLE, RADIAL, OPENCV ...")
+    ] = "SIMPLE_RADIAL",
     sun: Annotated[
         str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first sortie, degrees.")
     ] = None,
@@ -211,8 +213,9 @@ def synth(
 
         width_px, height_px = _parse_size(size)
         summary = render_block(
-            out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images, flight=flight, lens=lens,
-            height_m=height, sun_deg=_parse_sun(sun), texture=texture, jobs=jobs or 0, progress=_progress(quiet),
+            out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images, flight=flight,
+            lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture, jobs=jobs or 0,
+            progress=_progress(quiet),
         )  # fmt: skip
         return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), _texts(asdict(summary)))
 

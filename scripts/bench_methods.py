@@ -8,8 +8,8 @@ bright as the other), and overlaps by a fifth at least.
 
 Every method runs in a process of its own per scene, two threads. A row's seconds are those of both images' features
 (decoding included), matching and verification; start-up is not timed. peak_mb is the largest resident memory meanwhile.
-Writes OUT/results.json row by row and OUT/table.md. OUT/scenes keeps rendered blocks, reduced images and every row that
-was ever made: what depends on nothing that changed is not made again, so that a killed run goes on where it was.
+Writes OUT/results.json row by row and OUT/table.md. OUT/scenes keeps rendered blocks, reduced images and what every
+method answered: what depends on nothing that changed is not made again, so that a killed run goes on where it was.
 """
 
 from __future__ import annotations
@@ -28,17 +28,34 @@ from pathlib import Path
 from common import write_readme
 from methods import worker
 from methods.base import Options
-from methods.results import Row, make_row, read_rows, tables, write_rows
-from methods.scenes import MIN_OVERLAP, Judged, Selection, real, rendered
+from methods.results import Row, make_row, tables, write_rows
+from methods.scenes import MIN_OVERLAP, Judged, JudgedPair, Selection, real, rendered
+from methods.store import read_measured, write_measured
 from methods.table import NEED_WEIGHTS, PEERS, method, split_methods
+from methods.worker import Measured
 
 import aeromatch_cli
+from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import AeromatchError, ConfigError
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import file_digest, fingerprint, write_text
 
 THREADS = 2
 REAL_MAX_SIZE_PX = 1000
+_PEERS = ("aliked", "base", "colmap", "keynet", "matching", "opencv_asift", "opencv_sift", "worker")
+# Source that answers depend on, below the package or this folder.
+PEER_CODE = ("geometry", *(f"methods/{module}.py" for module in _PEERS))
+OUR_CODE = (
+    "blocks",
+    "geometry",
+    "nets",
+    "stages",
+    "strategies",
+    "data.py",
+    "formats.py",
+    "images.py",
+    "methods/ours.py",
+)
 LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")
 # What a plain run and --quick do where an option is not given.
 FULL = {"scenes": ",".join(PRESETS), "pairs": 16, "size": "1000x750", "images": 24, "keypoints": 2048}
@@ -46,9 +63,10 @@ QUICK = {"scenes": "city,grass", "pairs": 4, "size": "480x360", "images": 12, "k
 
 
 def code_digest(*places: str) -> str:
-    """Digest of source files below the package or this folder."""
+    """Digest of source files and folders below the package or this folder."""
     roots = [Path(aeromatch_cli.__file__).parent, Path(__file__).parent]
-    files = [path for root in roots for place in places for path in sorted((root / place).rglob("*.py"))]
+    paths = [root / place for root in roots for place in places]
+    files = [file for path in paths for file in ([path] if path.is_file() else sorted(path.rglob("*.py")))]
     return fingerprint([(path.name, file_digest(path)) for path in files])
 
 
@@ -65,39 +83,45 @@ def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
         yield real(folder, args.data, block, selection, max_size_px=args.max_size)
 
 
-def measure(name: str, judged: Judged, options: Options, known: dict[str, Row]) -> Iterator[Row]:
-    """Rows of one method on one scene, as they come; those in `known` (by key) are given back as they are."""
-    # Peers do not read the rest of the package: their rows outlive a change of it.
-    places = ("evaluate", "synthetic", "geometry", "methods") if name in PEERS else (".",)
+def measure(name: str, judged: Judged, options: Options, store: Path) -> Iterator[tuple[str, Measured]]:
+    """Key and answer of one method for every pair of a scene, in order; what the store has is not made again."""
+    # What an answer depends on, the judge left out. Peers read nothing of stages, strategies and presets.
+    code, settings = (
+        (PEER_CODE, None) if name in PEERS else (OUR_CODE, load(*parse_method(name)).model_dump(mode="json"))
+    )
     versions = [metadata.version(library) for library in LIBRARIES]
-    basis = [name, judged.key, vars(options) | {"weights": None}, code_digest(*places), versions]
+    basis = [name, settings, judged.key, vars(options) | {"weights": None}, code_digest(*code), versions]
     keys = [fingerprint(basis, pair.images)[:16] for pair in judged.pairs]
-    if all(key in known for key in keys):
-        yield from (known[key] for key in keys)
+    if all((store / f"{key}.npz").is_file() for key in keys):
+        yield from ((key, read_measured(store / f"{key}.npz")) for key in keys)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, context, worker.start, (name, judged.scene, options)) as process:
         for pair, key in zip(judged.pairs, keys, strict=True):
-            if key in known:
-                yield known[key]
-                continue
-            try:
-                measured = process.submit(worker.run_pair, pair.images).result()
-            except BrokenProcessPool as error:
-                raise SystemExit(f"{name} on {judged.scene.name}: its process died ({error})") from error
-            found = measured.found
-            score = judged.truth.judge(
-                *pair.images, found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
-            )
-            yield make_row(name, judged.scene.name, pair, score, measured, options, key)
+            path = store / f"{key}.npz"
+            if not path.is_file():
+                try:
+                    write_measured(path, process.submit(worker.run_pair, pair.images).result())
+                except BrokenProcessPool as error:
+                    raise SystemExit(f"{name} on {judged.scene.name}: its process died ({error})") from error
+            yield key, read_measured(path)
+
+
+def judged_row(name: str, judged: Judged, pair: JudgedPair, options: Options, key: str, measured: Measured) -> Row:
+    """The row of one pair."""
+    found = measured.found
+    score = judged.truth.judge(
+        *pair.images, found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+    )
+    return make_row(name, judged.scene.name, pair, score, measured, options, key)
 
 
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written as they come."""
     options = Options(args.keypoints, args.budget, THREADS, args.seed, args.reference_weights)
     selection = Selection(args.condition, args.pairs, args.seed, args.noisy_poses)
-    store = args.out / "scenes" / "rows.json"
-    known = {row["key"]: row for row in read_rows(store)}
+    store = args.out / "scenes" / "found"
+    store.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     names = split_methods(args.methods)
     total = len(list(filter(None, args.scenes.split(",") + args.blocks.split(",")))) * len(names)
@@ -108,10 +132,9 @@ def run(args: argparse.Namespace) -> list[Row]:
             print(f"{judged.scene.name} has only {found}, {args.pairs} were asked for", file=sys.stderr)
         for name in names if judged.pairs else ():
             before = time.monotonic()
-            for row in measure(name, judged, options, known):
-                rows.append(row)
-                known[row["key"]] = row
-                write_rows(store, list(known.values()))
+            answers = measure(name, judged, options, store)
+            for pair, (key, measured) in zip(judged.pairs, answers, strict=True):
+                rows.append(judged_row(name, judged, pair, options, key, measured))
                 write_rows(args.out / "results.json", rows)
             done += 1
             left = (time.monotonic() - started) / done * (total - done)

@@ -294,7 +294,7 @@ def test_ground_grid_is_closed_and_shared_between_areas() -> None:
 def test_equal_seeds_give_equal_bytes_and_other_seeds_other_scenes(folder: Path, tmp_path: Path) -> None:
     render_block(tmp_path / "again", "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3, jobs=2)
     written = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(written) == 3 + 3 * 3 + 5
+    assert len(written) == 3 + 3 * 3 + 6
     for path in written:
         assert (folder / path).read_bytes() == (tmp_path / "again" / path).read_bytes(), path
     render_block(tmp_path / "other", "suburb", seed=4, width_px=WIDTH, height_px=HEIGHT, images=1)
@@ -377,7 +377,7 @@ def test_pictures_as_ground_texture(tmp_path: Path) -> None:
     plain, laid = (cv2.imread(str(tmp_path / k / "images/grass_0001.jpg"), 0).std() for k in ("plain", "laid"))
     assert laid > 2.0 * plain
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no pictures"):
+    with pytest.raises(ConfigError, match="holds no pictures"):
         render_block(tmp_path / "none", "grass", texture=tmp_path / "empty", **sizes)
 
 
@@ -399,6 +399,10 @@ def test_arguments_that_cannot_be_used_are_refused_before_anything_is_written(tm
         render_block(out, "city", sun_deg=(10.0, 2.0))
     with pytest.raises(ConfigError, match="flying height"):
         render_block(out, "city", height_m=0.0)
+    with pytest.raises(ConfigError, match="square kilometres"):
+        render_block(out, "city", height_m=10_000.0)
+    with pytest.raises(ConfigError, match="seed"):
+        render_block(out, "city", seed=2**40)
     assert not out.exists()
 
 
@@ -413,11 +417,33 @@ def test_folders_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     assert (tmp_path / "mine" / "images" / "holiday.jpg").read_bytes() == b"dear"
 
 
+def test_an_interrupted_block_goes_on_and_another_is_not_mixed_in(tmp_path: Path) -> None:
+    sizes = {"width_px": 64, "height_px": 48, "images": 3}
+    render_block(tmp_path, "grass", **sizes)
+    whole = {p: p.read_bytes() for p in sorted(tmp_path.rglob("*")) if p.is_file()}
+    (tmp_path / "truth.json").unlink()
+    (tmp_path / "images" / "grass_0003.jpg").unlink()
+    kept = (tmp_path / "images" / "grass_0001.jpg").stat().st_mtime_ns
+    render_block(tmp_path, "grass", **sizes)
+    assert {p: p.read_bytes() for p in sorted(tmp_path.rglob("*")) if p.is_file()} == whole
+    assert (tmp_path / "images" / "grass_0001.jpg").stat().st_mtime_ns == kept
+    for other in ({"seed": 1}, {"flight": "orbit"}, {"height_m": 70.0}, {"sun_deg": (10.0, 40.0)}):
+        with pytest.raises(ConfigError, match="rendered otherwise"):
+            render_block(tmp_path, "grass", **sizes, **other)
+    with pytest.raises(ConfigError, match="holds no pictures"):
+        render_block(tmp_path, "grass", texture=tmp_path / "nowhere", **sizes)
+    assert {p: p.read_bytes() for p in sorted(tmp_path.rglob("*")) if p.is_file()} == whole
+
+
 def test_truth_that_cannot_be_trusted_is_refused(folder: Path, truth: Truth, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"truth\.json cannot be read"):
         load_truth(tmp_path)
     for name in ("truth.json", "block.json", "poses.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
+    (tmp_path / "poses.csv").rename(tmp_path / "hidden.csv")
+    with pytest.raises(InputError, match=r"poses\.csv cannot be read"):
+        load_truth(tmp_path)
+    (tmp_path / "hidden.csv").rename(tmp_path / "poses.csv")
     bare = load_truth(tmp_path)
     with pytest.raises(InputError, match=r"suburb_0001\.depth\.tif cannot be read"):
         bare.depth_m("suburb_0001.jpg")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
@@ -21,15 +22,19 @@ from aeromatch_cli.synthetic.imagery import GroundImagery, load_imagery
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.render import Rendered, View, look_at, render_image
+from aeromatch_cli.synthetic.render import View, look_at, render_image
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
 from aeromatch_cli.synthetic.sensor import Development, meter
 from aeromatch_cli.synthetic.shade import Stage
 from aeromatch_cli.synthetic.terrain import Area
+from aeromatch_cli.synthetic.write import read_raster
 
 SMALLEST_PX = 16
-# Room around the pictures' footprints for what throws its shadow in from outside.
-_MARGIN_M = 40.0
+# Room around the pictures' footprints for what leans into them, and for what throws its shadow in from outside.
+_MARGIN_M, _TALLEST_M = 40.0, 40.0
+# A square kilometre of city is two million triangles, about a gigabyte.
+_LARGEST_AREA_KM2 = 3.0
+_LARGEST_SEED = 2**31 - 1
 _TEXTURE_GSD_M = 0.08
 _METER_PX, _METERED = 64, 3
 _FLIGHT_STREAM, _POSE_NOISE_STREAM = 103, 104
@@ -95,8 +100,9 @@ def render_block(
 
     flight: one of flights.FLIGHTS. lens: one of geometry.cameras.MODELS. height_m: flying height above the datum
     instead of the preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture:
-    folder of pictures to lay over the ground. Raises ConfigError on an unknown name, an impossible size or number, or
-    a folder that holds another block; WorkspaceError where `out` cannot be written.
+    folder of pictures to lay over the ground. An interrupted call goes on where it was. Raises ConfigError on an
+    unknown name, an impossible size or number, or a folder that holds another block; WorkspaceError where `out` cannot
+    be written.
     """
     started = time.monotonic()
     chosen = _checked(preset, seed, width_px, height_px, height_m, sun_deg)
@@ -108,15 +114,15 @@ def render_block(
     lights = presets.lights(chosen, seed)
     if sun_deg is not None:
         lights = (Light(*sun_deg, lights[0].haze_per_km, lights[0].sky, lights[0].season), lights[1])
-    key = _SceneKey(chosen.scene, seed, flights.ground_area(planned, _MARGIN_M), str(texture or ""))
+    key = _SceneKey(chosen.scene, seed, _area(planned, lights), str(texture or ""))
+    shots = _shots(out, names, key, lights, planned)
+    scene = _scene(key).scene
+    facts = _truth_facts(preset, scene, planned, lights, names, shots)
     try:
-        write.prepare(out, names)
-        shots = _shots(out, names, key, lights, planned)
+        write.prepare(out, names, facts)
         heights_m = _take_all(shots, jobs, progress)
         _write_tables(out, names, planned, seed, heights_m)
-        scene = _scene(key).scene
         write.write_dem(out / "dem.tif", scene.ground)
-        facts = _truth_facts(preset, scene, planned, lights, names, shots)
         write.write_file(out / "truth.json", write.json_bytes(facts))
     except OSError as error:
         raise _unwritable(out, error) from error
@@ -134,13 +140,26 @@ def _checked(
         raise ConfigError(
             f"rendered images must be at least {SMALLEST_PX} px wide and high, got {width_px}x{height_px}"
         )
-    if seed < 0:
-        raise ConfigError(f"the seed of a rendered block must be 0 or larger, got {seed}")
+    if not 0 <= seed <= _LARGEST_SEED:
+        raise ConfigError(f"the seed of a rendered block must be 0 to {_LARGEST_SEED}, got {seed}")
     if height_m is not None and not 1.0 <= height_m <= 10_000.0:
         raise ConfigError(f"the flying height of a rendered block must be 1 to 10000 m, got {height_m:g}")
     if sun_deg is not None and not (0.0 <= sun_deg[0] <= 360.0 and 5.0 <= sun_deg[1] <= 90.0):
         raise ConfigError(f"the sun must stand at azimuth 0-360 and elevation 5-90 degrees, got {sun_deg}")
     return PRESETS[preset]
+
+
+def _area(flight: Flight, lights: tuple[Light, Light]) -> Area:
+    """Where solids stand: what the pictures show and what reaches into it. Raises ConfigError where it is too large."""
+    lowest_deg = min(lights[station.sortie].sun_elevation_deg for station in flight.stations)
+    area = flights.ground_area(flight, max(_MARGIN_M, _TALLEST_M / np.tan(np.deg2rad(lowest_deg))))
+    size_km2 = (area.x1_m - area.x0_m) * (area.y1_m - area.y0_m) * 1e-6
+    if size_km2 > _LARGEST_AREA_KM2:
+        raise ConfigError(
+            f"the pictures cover {size_km2:.1f} square kilometres, more than the {_LARGEST_AREA_KM2:g} that a scene "
+            "may have: use fewer --images, a lower --height, or another --flight"
+        )
+    return area
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +228,10 @@ def _take_all(shots: list[_Shot], jobs: int, progress: Progress | None) -> Float
 
 
 def _take(shot: _Shot) -> FloatArray:
+    """Make one picture and its truth, unless they are there already; returns heights as `_heights`."""
+    scene = _scene(shot.key).scene
+    if (shot.out / "images" / shot.name).is_file():  # written last, whole or not at all
+        return _heights(scene, read_raster(write.surface_path(shot.out, shot.name)))
     view = _view(shot.flight, shot.station, shot.moment)
     rng = presets.image_rng(shot.key.seed, shot.moment)
     rendered = render_image(_stage(shot.key, shot.light), view, shot.settings, rng)
@@ -216,12 +239,12 @@ def _take(shot: _Shot) -> FloatArray:
         write.write_rendered(shot.out, shot.name, rendered, shot.settings.jpeg_quality)
     except OSError as error:
         raise _unwritable(shot.out, error) from error
-    return _heights(_scene(shot.key).scene, rendered)
+    return _heights(scene, rendered.surface)
 
 
-def _heights(scene: Scene, rendered: Rendered) -> FloatArray:
+def _heights(scene: Scene, surface: NDArray[np.uint32]) -> FloatArray:
     """World z of the middle of the triangle that every 16th pixel sees."""
-    seen = rendered.surface.reshape(-1)[::16].astype(np.int64)
+    seen = surface.reshape(-1)[::16].astype(np.int64)
     heights: FloatArray = scene.triangles_m[seen[seen > 0] - 1, :, 2].mean(axis=1)
     return heights
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.synthetic.noise import hash01
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -93,7 +93,8 @@ def _sample(raster: NDArray[np.float32], x: FloatArray, y: FloatArray) -> FloatA
 def load_imagery(folder: Path, gsd_m: float, seed: int) -> GroundImagery:
     """The middle squares of the first pictures of a folder, by name, as ground texture.
 
-    gsd_m: ground size of a pixel. Raises InputError where the folder holds no readable picture.
+    gsd_m: ground size of a pixel. Raises ConfigError where the folder holds no picture, InputError where one cannot be
+    read.
     """
     import cv2
 
@@ -105,7 +106,7 @@ def load_imagery(folder: Path, gsd_m: float, seed: int) -> GroundImagery:
             raise InputError(f"{path} cannot be read as a picture; remove it from the texture folder")
         pyramids.append(_pyramid(stored))
     if not pyramids:
-        raise InputError(f"{folder} holds no pictures ({', '.join(SUFFIXES)}) for the ground; give another --texture")
+        raise ConfigError(f"{folder} holds no pictures ({', '.join(SUFFIXES)}) for the ground; give another --texture")
     return GroundImagery(tuple(pyramids), gsd_m, seed)
 
 

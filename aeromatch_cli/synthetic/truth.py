@@ -19,7 +19,7 @@ from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
 from aeromatch_cli.synthetic.terrain import Area
-from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path, sun_path, surface_path
+from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path, read_raster, sun_path, surface_path
 
 # A surface point counts as seen when nothing stands more than this in front of it.
 _TOLERANCE_M = 2e-3
@@ -124,19 +124,6 @@ def transfer(truth: Truth | Path, image0: str, points_px: FloatArray, image1: st
     return (truth if isinstance(truth, Truth) else load_truth(truth)).transfer(image0, points_px, image1)
 
 
-def read_raster(path: Path) -> NDArray[Any]:
-    """A truth raster as it was written. Raises InputError where it is missing or damaged."""
-    import cv2
-
-    try:
-        raster = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error) as error:
-        raise InputError(f"{path} cannot be read ({error}); render the block again") from error
-    if raster is None:
-        raise InputError(f"{path} is no raster; render the block again")
-    return raster
-
-
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -152,8 +139,11 @@ def _camera(lens: dict[str, Any]) -> Camera:
 
 
 def _read_poses(path: Path, lenses: Mapping[str, Camera]) -> tuple[dict[str, Pose], dict[str, Camera]]:
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); render the block again") from error
     numbers = POSE_COLUMNS[1:-1]
     poses = {row["image"]: Exterior(*(float(row[column]) for column in numbers)).pose() for row in rows}
     return poses, {row["image"]: lenses[row["camera"]] for row in rows}

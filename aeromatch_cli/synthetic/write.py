@@ -10,6 +10,7 @@ OUT/truth/city_0001.surface.tif      (H, W) uint32, what is visible: 1 + the ind
 OUT/truth/city_0001.sun.png          (H, W) uint8, 255 x the share of the sun's disc in view; 0 also where the surface
                                      faces away from the sun. In shadow: below 128
 OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last
+OUT/synth.json                       the same, written first: what an interrupted block goes on with
 All rasters are lossless (TIFF: deflate with predictor; PNG).
 """
 
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.errors import ConfigError, WorkspaceError
+from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.geometry.cameras import colmap_params
 from aeromatch_cli.synthetic.flights import Exterior, Flight
 from aeromatch_cli.synthetic.render import Rendered
@@ -50,20 +51,24 @@ def sun_path(out: Path, name: str) -> Path:
     return out / "truth" / f"{Path(name).stem}.sun.png"
 
 
-def prepare(out: Path, names: tuple[str, ...]) -> None:
-    """Make the folders; an interrupted block is gone over again, another block is not mixed with this one.
+def prepare(out: Path, names: tuple[str, ...], facts: dict[str, Any]) -> None:
+    """Make the folders and note what block they are for: an interrupted one goes on, another one is not mixed in.
 
-    Raises ConfigError where the folder holds other pictures.
+    facts: what truth.json will hold. Raises ConfigError where the folder holds another block or other pictures.
     """
+    plan, wanted = out / "synth.json", json_bytes(facts)
+    if plan.is_file() and plan.read_bytes() != wanted:
+        raise ConfigError(f"{out} holds a block that was rendered otherwise (synth.json); choose another folder")
     (out / "images").mkdir(parents=True, exist_ok=True)
     (out / "truth").mkdir(exist_ok=True)
-    foreign = sorted(p.name for p in (out / "images").iterdir() if p.name not in names and not p.name.startswith("."))
+    present = sorted(p.name for p in (out / "images").iterdir() if not p.name.startswith("."))
+    foreign = [name for name in present if name not in names or not plan.is_file()]
     if foreign:
         raise ConfigError(
             f"{out / 'images'} already holds other files ({foreign[0]} and {len(foreign) - 1} more); "
             "choose an empty folder for the rendered block"
         )
-    (out / "truth.json").unlink(missing_ok=True)
+    write_file(plan, wanted)
 
 
 def write_rendered(out: Path, name: str, rendered: Rendered, jpeg_quality: int) -> None:
@@ -77,6 +82,19 @@ def write_rendered(out: Path, name: str, rendered: Rendered, jpeg_quality: int) 
     write_file(sun_path(out, name), _encoded(".png", rendered.sun, []))
     bgr = np.ascontiguousarray(rendered.pixels[..., ::-1])
     write_file(out / "images" / name, _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]))
+
+
+def read_raster(path: Path) -> NDArray[Any]:
+    """A truth raster as it was written. Raises InputError where it is missing or damaged."""
+    import cv2
+
+    try:
+        raster = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except (OSError, cv2.error) as error:
+        raise InputError(f"{path} cannot be read ({error}); render the block again") from error
+    if raster is None:
+        raise InputError(f"{path} is no raster; render the block again")
+    return raster
 
 
 def _encoded(suffix: str, raster: NDArray[Any], options: list[int]) -> bytes:

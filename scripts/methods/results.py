@@ -58,12 +58,6 @@ def _plain(value: Any) -> Any:
     return round(float(value), 6) if math.isfinite(value) else None
 
 
-def read_rows(path: Path) -> list[Row]:
-    """Rows of an earlier run, none where there is no file."""
-    rows: list[Row] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    return rows
-
-
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """All of them at once, atomically: a killed run leaves the rows it had made."""
     write_text(path, "[\n" + ",\n".join(json.dumps(row, allow_nan=False) for row in rows) + "\n]\n")
