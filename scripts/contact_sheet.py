@@ -13,14 +13,17 @@ import numpy as np
 from aeromatch_cli.synthetic import PRESETS, render_block
 from aeromatch_cli.synthetic.write import sun_path
 
-TILE_PX, COLUMNS = (320, 240), 4
+TILE_PX, COLUMNS = (400, 300), 4
+# What shows the scene best beside the view from above: flight, pictures to plan, the one to show.
+_OBLIQUE, _ORBIT = ("oblique", 5, 2), ("orbit", 6, 2)
+SECOND = {"hills": _ORBIT, "water-edge": _ORBIT}
 
 
 def tiles(folder: Path, width_px: int, seed: int, jobs: int) -> list[np.ndarray]:
     """Labelled pictures, row by row."""
     found = []
     for preset in PRESETS:
-        for flight, images, number in (("nadir", 4, 2), ("oblique", 5, 2)):
+        for flight, images, number in (("nadir", 4, 2), SECOND.get(preset, _OBLIQUE)):
             out = render(folder, preset, flight, images, width_px, seed, jobs)
             found.append(tile(out / "images" / f"{preset}_{number:04d}.jpg", f"{preset}, {flight}"))
     out = render(folder, "city", "two-flights", 8, width_px, seed, jobs)
@@ -38,8 +41,9 @@ def render(folder: Path, preset: str, flight: str, images: int, width_px: int, s
 
 def tile(path: Path, label: str) -> np.ndarray:
     small = cv2.resize(cv2.imread(str(path)), TILE_PX, interpolation=cv2.INTER_AREA)
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(small, label, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+    (width, height), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+    cv2.rectangle(small, (0, 0), (width + 12, height + 12), (0, 0, 0), cv2.FILLED)
+    cv2.putText(small, label, (6, height + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return small
 
 

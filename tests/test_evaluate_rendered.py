@@ -36,6 +36,12 @@ class Lit(Truth):
         sun[:, self.dark.get(image, slice(0))] = 127
         return sun
 
+    def surface(self, image: str) -> np.ndarray:
+        """Ground everywhere but in the topmost row, which is sky."""
+        seen = np.ones(self.sun(image).shape, dtype=np.uint32)
+        seen[0] = 0
+        return seen
+
 
 def judged_by(scene: Scene, dark: Mapping[str, slice] | None = None, **exteriors: Exterior) -> RenderedTruth:
     truth = make_truth(scene, CAMERA, **exteriors)
@@ -75,7 +81,12 @@ def test_a_keypoint_beside_a_roof_edge_may_mean_the_roof(boxed: RenderedTruth) -
 
 
 def test_surfaces_within_reach_are_met_by_the_exact_ray(boxed: RenderedTruth) -> None:
-    shown = surfaces(boxed.truth, "a", columns(106.95))[0]
+    found = surfaces(boxed.truth, "a", columns(106.95))
+    np.testing.assert_allclose(found.met_m[0, 0], [6.95, 0, 0], atol=1e-9)
+    on_roof = found.met_m[0][np.abs(found.meant_m[0, :, 2] - 20.0) < 1e-6]
+    assert len(on_roof) >= 1
+    assert (on_roof[:, 0] <= 5.0 + 1e-9).all()  # met on the roof itself, meant beyond its edge
+    shown = found.meant_m[0]
     shown = shown[np.isfinite(shown[:, 0])]
     np.testing.assert_allclose(shown[0], [6.95, 0, 0], atol=1e-9)
     np.testing.assert_allclose(sorted({round(z, 6) for z in shown[:, 2]}), [0, 20])
@@ -87,19 +98,22 @@ def test_hidden_is_wrong_and_measured_to_the_projection_that_ignores_the_occlusi
     score = judge(boxed, columns(92.0), columns(12.0))
     assert (score.kept, score.correct, score.hidden, score.unseen) == (1, 0, 1, 0)
     np.testing.assert_allclose(score.errors_px, [20.0], atol=1e-9)
-    # Matched to the very place of that projection it is still wrong: b shows the wall there, at z = 100 - 55 / 0.68.
+    # Matched to the very place of that projection it is still wrong. b shows the wall there, which a does not see, and
+    # within 1 px the roof, which a does: extended to x = 5.6 it lies at 107 in a.
     score = judge(boxed, columns(92.0), columns(32.0))
     assert (score.correct, score.hidden) == (0, 1)
-    assert score.errors_px[0] == pytest.approx(100 + 5 / (55 / 0.68) * 100 - 92, abs=1e-6)
+    assert score.errors_px[0] == pytest.approx(107 - 92, abs=1e-6)
     # One column outside the hidden strip, which ends at x = -21.25, ground is seen again.
     score = judge(boxed, columns(77.0), columns(17.0))
     assert (score.correct, score.hidden) == (1, 0)
 
 
-def test_what_hides_by_less_than_a_pixel_does_not_count(boxed: RenderedTruth) -> None:
-    errors, hidden = boxed.errors("a", "b", columns(79.0, 80.4), columns(19.0, 20.4))
+def test_hidden_is_what_transfer_calls_hidden(boxed: RenderedTruth) -> None:
+    # Ground from x = -21.25 on is hidden from b: column 78.75 of a.
+    errors, hidden = boxed.errors("a", "b", columns(78.0, 79.0, 80.4), columns(18.0, 19.0, 20.4))
     np.testing.assert_allclose(errors[0], 0.0, atol=1e-9)
-    assert hidden.tolist() == [False, True]
+    assert hidden.tolist() == boxed.truth.transfer("a", columns(78.0, 79.0, 80.4), "b")[1].tolist()
+    assert hidden.tolist() == [False, True, True]
 
 
 def test_sky_and_what_lies_off_the_image_are_wrong_and_left_out_of_the_mean(boxed: RenderedTruth) -> None:
@@ -184,11 +198,19 @@ def test_shadow_is_counted_inside_and_along_its_border(flat: RenderedTruth) -> N
     assert judge(flat, columns(107.0), columns(30.0)).wrong_at_border == 1
 
 
+def test_sky_is_no_shadow(flat: RenderedTruth) -> None:
+    sky, below = np.array([[50.0, 0.0]]), np.array([[50.0, 1.0]])
+    assert judge(flat, sky, columns(5.0)).kept_in_shadow == 0
+    assert judge(flat, below, columns(5.0)).kept_in_shadow == 1
+    assert judge(flat, np.array([[150.0, 1.0]]), columns(5.0)).wrong_at_border == 0
+
+
 def test_a_pair_that_shares_nothing_is_judged_all_the_same() -> None:
     by = judged_by(make_scene(), a=ABOVE, b=Exterior(190.0, 0.0, 60.0, 0.0, 0.0, 0.0))
     found = by.conditions("a", "b")
     assert (found.overlap, by.overlap_at_most("a", "b")) == (0.0, 0.0)
     assert np.isnan(found.view_angle_deg)
+    assert (found.difficulty, found.hard) == ("unknown", False)
     score = judge(by, columns(20.0), columns(20.0))
     assert (score.kept, score.unseen) == (1, 1)
     assert np.isnan(score.coverage)

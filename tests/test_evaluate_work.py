@@ -157,6 +157,24 @@ def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tm
         evaluate_workspace(copy, rendered)
 
 
+def test_the_truth_of_another_block_of_the_same_names_is_refused(work: Path, rendered: Path, tmp_path: Path) -> None:
+    shutil.copytree(rendered, tmp_path / "other")
+    picture = sorted((tmp_path / "other" / "images").iterdir())[1]
+    cv2.imwrite(str(picture), 255 - cv2.imread(str(picture)))
+    assert evaluate_workspace(work, rendered, mapping=False).pairs
+    with pytest.raises(InputError, match=rf"{picture.name} is not the picture"):
+        evaluate_workspace(work, tmp_path / "other", mapping=False)
+
+
+def test_a_workspace_that_lost_its_files_says_so(work: Path, rendered: Path, tmp_path: Path) -> None:
+    shutil.copytree(work, tmp_path / "a", ignore=shutil.ignore_patterns("features"))
+    with pytest.raises(InputError, match=r"features of .* are gone"):
+        evaluate_workspace(tmp_path / "a", rendered, mapping=False)
+    shutil.copytree(work, tmp_path / "b", ignore=shutil.ignore_patterns("verified"))
+    with pytest.raises(InputError, match="has a verdict"):
+        evaluate_workspace(tmp_path / "b", rendered, mapping=False)
+
+
 def test_a_mapping_that_fails_says_so(tmp_path: Path) -> None:
     (tmp_path / "database.db").write_bytes(b"no database")
     assert "exit code" in map_database(tmp_path / "database.db", None)["skipped"]

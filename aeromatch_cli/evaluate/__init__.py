@@ -2,7 +2,8 @@
 
     metrics, scores, texture -> surfaces, rendered | reference -> opening -> work -> totals, mapping -> output, plots
 
-Errors are in px of the images that were matched; a pair is judged from both sides.
+Errors are in px of the stored images, also where matching reduced them (--max-size); a pair is judged from both sides.
+Masked ground counts as overlap like any other.
 """
 
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth

@@ -96,7 +96,8 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("coverage, median", _shown(figures["coverage"])),
         (
             "rotation, translation",
-            f"{_shown(figures['rotation_error_deg'])}, {_shown(figures['translation_error_deg'])} degrees",
+            f"{_shown(figures['rotation_error_deg'])}, {_shown(figures['translation_error_deg'])} degrees "
+            f"(medians of {figures['pairs_with_pose']:.0f} pairs with a pose)",
         ),
         ("AUC at 1, 3, 5, 10 deg", ", ".join(_shown(figures[f"auc_{t}deg"]) for t in (1, 3, 5, 10))),
         ("correct in shadow", _shown(figures["correct_in_shadow"])),

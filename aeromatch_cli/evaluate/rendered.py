@@ -14,7 +14,7 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.metrics import coverage, pose_error_deg, thin
 from aeromatch_cli.evaluate.overlap import OverlapFinder, place_on
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX, Conditions, PairScore
-from aeromatch_cli.evaluate.surfaces import in_open_view, surfaces, visible_within_reach
+from aeromatch_cli.evaluate.surfaces import in_open_view, surfaces
 
 if TYPE_CHECKING:
     from aeromatch_cli.synthetic.truth import Truth
@@ -182,12 +182,13 @@ class RenderedTruth:
         return int(within.any(axis=1).sum())
 
     def _places(self, name: str, points_px: FloatArray, other: str) -> _Places:
-        points_m = surfaces(self.truth, name, points_px)
-        places_px, on_image = place_on(self._sight, other, points_m.reshape(-1, 3))
+        """A surface counts as seen by the other image if it sees the very place where the first one met it."""
+        found = surfaces(self.truth, name, points_px)
+        places_px, on_image = place_on(self._sight, other, found.meant_m.reshape(-1, 3))
         visible = on_image.copy()
         asked = np.flatnonzero(on_image)
-        visible[asked] = visible_within_reach(self.truth, other, points_m.reshape(-1, 3)[asked], places_px[asked])
-        shape = points_m.shape[:2]
+        visible[asked] = in_open_view(self.truth, other, found.met_m.reshape(-1, 3)[asked])
+        shape = found.meant_m.shape[:2]
         return _Places(places_px.reshape(*shape, 2), on_image.reshape(shape), visible.reshape(shape))
 
     def _in_shadow(self, name: str, points_px: FloatArray) -> BoolArray:
@@ -197,26 +198,24 @@ class RenderedTruth:
         return _at(self._light(name).at_border, points_px)
 
     def _light(self, name: str) -> _Light:
-        light = self._lights.pop(name, None) or _light_of(self.truth.sun(name))
+        light = self._lights.pop(name, None) or _light_of(self.truth.sun(name), self.truth.surface(name))
         self._lights[name] = light  # last in, so that the first is the one not used for longest
         if len(self._lights) > _LIGHTS_KEPT:
             self._lights.pop(next(iter(self._lights)))
         return light
 
 
-def _light_of(sun: NDArray[np.uint8]) -> _Light:
-    """Shadow and its border in a map (H, W) of the sun's share x 255."""
+def _light_of(sun: NDArray[np.uint8], surface: NDArray[np.uint32]) -> _Light:
+    """Shadow and its border in a map (H, W) of the sun's share x 255; sky (surface 0) is neither lit nor in shadow."""
     import cv2
 
-    in_shadow: BoolArray = np.asarray(sun < LIT)
-    if in_shadow.all() or not in_shadow.any():
-        return _Light(in_shadow, np.zeros(sun.shape, dtype=bool))
-    # Each distance is zero on the other kind.
-    inside, outside = (
-        cv2.distanceTransform(kind.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        for kind in (in_shadow, ~in_shadow)
-    )
-    return _Light(in_shadow, np.asarray(inside + outside <= BORDER_PX))
+    lit, in_shadow = np.asarray(sun >= LIT), np.asarray((sun < LIT) & (surface > 0))
+    at_border = np.zeros(sun.shape, dtype=bool)
+    if lit.any() and in_shadow.any():
+        for kind, other in ((lit, in_shadow), (in_shadow, lit)):
+            apart = cv2.distanceTransform((~other).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            at_border |= kind & (apart <= BORDER_PX)
+    return _Light(in_shadow, at_border)
 
 
 def _at(picture: BoolArray, points_px: FloatArray) -> BoolArray:

@@ -55,6 +55,13 @@ class Conditions:
         """Shadow share of 20 % or more, or a view angle of 30 degrees or more."""
         return self.shadow_share >= HARD_SHADOW_SHARE or self.view_angle_deg >= HARD_VIEW_ANGLE_DEG
 
+    @property
+    def difficulty(self) -> str:
+        """ "hard", "easy", or "unknown" for images that share nothing."""
+        if self.hard:
+            return "hard"
+        return UNKNOWN if math.isnan(self.view_angle_deg) else "easy"
+
 
 @dataclass(frozen=True, eq=False)
 class PairScore:
@@ -98,7 +105,11 @@ class PairScore:
 
     @property
     def recall(self) -> float:
-        return ratio(self.correct, self.possible)
+        """Below 1 even for a perfect matcher: correct matches are thinned to 2 px, possible ones are not.
+
+        NaN where more is correct than keypoints allow: points that were measured without a detector.
+        """
+        return ratio(self.correct, self.possible) if not self.correct > self.possible else math.nan
 
     @property
     def mean_error_px(self) -> float:

@@ -6,6 +6,7 @@ surface visible within 1 px of it, each met by the keypoint's own exact ray.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 _REACH_PX = 1.0
 _ANGLES = np.arange(8) * (np.pi / 4.0)
 _RING_PX = np.concatenate([[[0.0, 0.0]], _REACH_PX * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])])
-# A surface may be extended along the ray by this many pixel footprints, and counts as the same within them.
+# A surface may be extended along the ray by this many pixel footprints.
 _FOOTPRINTS = 3.0
 # A point counts as seen when nothing stands more than this in front of it.
 _IN_FRONT_M = 2e-3
@@ -44,12 +45,24 @@ def first_hits(truth: Truth, center_m: FloatArray, directions: FloatArray) -> tu
     return triangle_idx, distances
 
 
-def surfaces(truth: Truth, image: str, points_px: FloatArray) -> FloatArray:
-    """World places (N, 9, 3) that stored pixels (N, 2) may show: what is visible within 1 px, straight ahead first.
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """What N keypoints may mean, world points (N, 9, 3), straight ahead first; NaN for sky and repetitions.
+
+    meant_m: on the keypoint's own ray. met_m: where the surface was met, within 1 px of the keypoint; straight ahead
+    both are the same.
+    """
+
+    meant_m: FloatArray
+    met_m: FloatArray
+
+
+def surfaces(truth: Truth, image: str, points_px: FloatArray) -> Surfaces:
+    """What stored pixels (N, 2) may show: every surface visible within 1 px.
 
     For every distinct triangle that the centre ray or one of 8 rays around it meets: the place where the keypoint's
     exact ray meets the triangle's plane, or, where that lies more than 3 pixel footprints nearer or farther than the
-    triangle was met, the place on the exact ray at the depth where it was met. NaN for sky and repetitions.
+    triangle was met, the place on the exact ray at the depth where it was met.
     """
     count, rays = len(points_px), len(_RING_PX)
     around = (np.asarray(points_px, dtype=np.float64)[:, None] + _RING_PX).reshape(-1, 2)
@@ -69,9 +82,10 @@ def surfaces(truth: Truth, image: str, points_px: FloatArray) -> FloatArray:
     extended_m = np.divide(height, along, out=np.full(len(k), np.inf), where=np.abs(along) > 1e-9)
     footprint_m = met_m / focal_px(truth.cameras[image])
     reached_m = np.where(np.abs(extended_m - met_m) <= _FOOTPRINTS * footprint_m, extended_m, met_m)
-    points_m = np.full((count, rays, 3), np.nan)
-    points_m[k, ring] = center_m + reached_m[:, None] * exact[k]
-    return points_m
+    meant_m, seen_m = np.full((2, count, rays, 3), np.nan)
+    meant_m[k, ring] = center_m + reached_m[:, None] * exact[k]
+    seen_m[k, ring] = center_m + met_m[:, None] * directions.reshape(count, rays, 3)[k, ring]
+    return Surfaces(meant_m, seen_m)
 
 
 def in_open_view(truth: Truth, image: str, points_m: FloatArray) -> BoolArray:
@@ -81,22 +95,3 @@ def in_open_view(truth: Truth, image: str, points_m: FloatArray) -> BoolArray:
     _, distances = first_hits(truth, center_m, directions)
     # In units of these directions the point itself lies at 1.
     return np.asarray(distances >= 1.0 - _IN_FRONT_M / np.linalg.norm(directions, axis=1))
-
-
-def visible_within_reach(truth: Truth, image: str, points_m: FloatArray, places_px: FloatArray) -> BoolArray:
-    """Whether an image sees world points (N, 3), which project to places (N, 2) on it, or their surface within 1 px."""
-    seen = in_open_view(truth, image, points_m)
-    behind = np.flatnonzero(~seen)
-    if len(behind):
-        shown_m = surfaces(truth, image, places_px[behind])
-        apart_m = np.linalg.norm(shown_m - points_m[behind, None], axis=2)
-        depth_m = (points_m[behind] - truth.poses[image].center_m) @ _optical_axis(truth, image)
-        near_m = _FOOTPRINTS * depth_m / focal_px(truth.cameras[image])
-        seen[behind] = (np.where(np.isnan(apart_m), np.inf, apart_m) <= near_m[:, None]).any(axis=1)
-    return seen
-
-
-def _optical_axis(truth: Truth, image: str) -> FloatArray:
-    rotation = truth.poses[image].world_rotation
-    assert rotation is not None
-    return np.asarray(rotation[2])

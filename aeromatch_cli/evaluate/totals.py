@@ -65,6 +65,7 @@ def total(rows: Sequence[PairRow]) -> dict[str, float]:
         "pairs": len(rows),
         "pairs_verified": sum(row.state == "verified" for row in rows),
         "pairs_not_tried": sum(row.state == NOT_TRIED for row in rows),
+        "pairs_with_pose": sum(not math.isnan(score.pose_error_deg) for score in scores),
         f"pairs_with_{ENOUGH_CORRECT}_correct": sum(score.correct >= ENOUGH_CORRECT for score in scores),
         **sums,
         "correctness": ratio(sums["correct"], sums["kept"]),
@@ -91,8 +92,8 @@ def by_condition(rows: Sequence[PairRow]) -> list[tuple[str, str, dict[str, floa
             own = [row for row in rows if getattr(row.conditions, attribute) == name]
             if own:
                 found.append((condition, name, total(own)))
-    for name, hard in (("easy", False), ("hard", True)):
-        own = [row for row in rows if row.conditions.hard is hard]
+    for name in ("easy", "hard", UNKNOWN):
+        own = [row for row in rows if row.conditions.difficulty == name]
         if own:
             found.append(("difficulty", name, total(own)))
     return found

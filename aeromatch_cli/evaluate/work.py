@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.evaluate.mapping import map_database
@@ -19,7 +20,7 @@ from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.formats import VerifiedEntry, read_images, read_keypoints, read_pairs, read_verified_row
 from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.workspace import Workspace
+from aeromatch_cli.workspace import Workspace, file_digest
 
 # Pairs that truly share this much count, whether they were tried or not.
 MIN_OVERLAP = 0.20
@@ -62,7 +63,11 @@ def evaluate_workspace(
         raise InputError(f"{work} is no workspace (it has no images.csv): give the folder that `aeromatch run` wrote")
     truth = open_truth(truth_folder)
     images, left_out = _judged(read_images(workspace.images), truth, truth_folder)
+    if truth.kind == "rendered":
+        _check_pictures(workspace, images, truth, truth_folder)
     entries = _verified(workspace)
+    if not entries:
+        raise InputError(f"no pair of {work} has a verdict: run `aeromatch run`, or match and filter, first")
     keypoints = _Keypoints(workspace)
     candidates = list(combinations(sorted(images, key=lambda image: image.image_id), 2))
     rows = []
@@ -79,6 +84,19 @@ def evaluate_workspace(
         consumer = map_database(workspace.export("colmap") / "database.db", truth.images_folder)
     seconds = time.monotonic() - started
     return Evaluation(work, truth_folder, truth.kind, len(images), left_out, tuple(rows), consumer, seconds)
+
+
+def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockTruth, truth_folder: Path) -> None:
+    """Raise InputError where the workspace matched other pictures of the same names; those that have moved may pass."""
+    settings = load(str(workspace.config)) if workspace.config.is_file() else None
+    for image in images:
+        matched = Path(settings.block.images) / image.name if settings else Path(image.name)
+        rendered = (truth.images_folder or truth_folder) / image.name
+        if matched.is_file() and rendered.is_file() and file_digest(matched) != file_digest(rendered):
+            raise InputError(
+                f"{matched} is not the picture of that name that the truth {truth_folder} belongs to: "
+                "give the truth of the block that was matched"
+            )
 
 
 class _Keypoints:
@@ -144,6 +162,10 @@ def _judge(
     all0, all1 = keypoints[image0.image_id], keypoints[image1.image_id]
     sides, scores = (_NOTHING, _NOTHING), np.zeros(0)
     if verified and entry is not None:
+        if not len(all0) or not len(all1):
+            raise InputError(
+                f"the features of {image0.name} or {image1.name} are gone from the workspace: run `aeromatch run` again"
+            )
         sides, scores = match_points(entry.matches, all0, all1), np.asarray(entry.matches.scores)
     score = truth.judge(image0.name, image1.name, all0, all1, *sides, scores)
     return PairRow(image0.name, image1.name, state, conditions, score)
