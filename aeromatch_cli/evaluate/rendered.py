@@ -14,12 +14,12 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.metrics import coverage, pose_error_deg, thin
 from aeromatch_cli.evaluate.overlap import OverlapFinder, place_on
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX, Conditions, PairScore
-from aeromatch_cli.evaluate.surfaces import in_open_view, surfaces
+from aeromatch_cli.evaluate.surfaces import surfaces
+from aeromatch_cli.synthetic.write import IN_SHADOW_BELOW
 
 if TYPE_CHECKING:
     from aeromatch_cli.synthetic.truth import Truth
 
-LIT = 128  # share of the sun's disc x 255: below, a pixel counts as shadow
 BORDER_PX = 8.0
 # Keypoints closer than this are one place (a detector may give a place two orientations).
 _SAME_PLACE_PX = 0.01
@@ -44,7 +44,7 @@ class _RenderedSight:
         return self.truth.surface_points(image, points_px)
 
     def unblocked(self, image: str, points_m: FloatArray) -> BoolArray:
-        return in_open_view(self.truth, image, points_m)
+        return self.truth.in_open_view(image, points_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ class RenderedTruth:
         places_px, on_image = place_on(self._sight, other, found.meant_m.reshape(-1, 3))
         visible = on_image.copy()
         asked = np.flatnonzero(on_image)
-        visible[asked] = in_open_view(self.truth, other, found.met_m.reshape(-1, 3)[asked])
+        visible[asked] = self.truth.in_open_view(other, found.met_m.reshape(-1, 3)[asked])
         shape = found.meant_m.shape[:2]
         return _Places(places_px.reshape(*shape, 2), on_image.reshape(shape), visible.reshape(shape))
 
@@ -209,7 +209,7 @@ def _light_of(sun: NDArray[np.uint8], surface: NDArray[np.uint32]) -> _Light:
     """Shadow and its border in a map (H, W) of the sun's share x 255; sky (surface 0) is neither lit nor in shadow."""
     import cv2
 
-    lit, in_shadow = np.asarray(sun >= LIT), np.asarray((sun < LIT) & (surface > 0))
+    lit, in_shadow = np.asarray(sun >= IN_SHADOW_BELOW), np.asarray((sun < IN_SHADOW_BELOW) & (surface > 0))
     at_border = np.zeros(sun.shape, dtype=bool)
     if lit.any() and in_shadow.any():
         for kind, other in ((lit, in_shadow), (in_shadow, lit)):

@@ -1,4 +1,4 @@
-"""Which surfaces a keypoint may mean, and whether another image sees them: rays through a rendered scene.
+"""Which surfaces a keypoint may mean: rays through a rendered scene.
 
 A corner of a roof is found within a pixel of it, on the roof or on the street beside it. So a keypoint stands for every
 surface visible within 1 px of it, each met by the keypoint's own exact ray.
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, normalise
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ _ANGLES = np.arange(8) * (np.pi / 4.0)
 _RING_PX = np.concatenate([[[0.0, 0.0]], _REACH_PX * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])])
 # A surface may be extended along the ray by this many pixel footprints.
 _FOOTPRINTS = 3.0
-# A point counts as seen when nothing stands more than this in front of it.
-_IN_FRONT_M = 2e-3
 
 
 def view(truth: Truth, image: str, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,12 +84,3 @@ def surfaces(truth: Truth, image: str, points_px: FloatArray) -> Surfaces:
     meant_m[k, ring] = center_m + reached_m[:, None] * exact[k]
     seen_m[k, ring] = center_m + met_m[:, None] * directions.reshape(count, rays, 3)[k, ring]
     return Surfaces(meant_m, seen_m)
-
-
-def in_open_view(truth: Truth, image: str, points_m: FloatArray) -> BoolArray:
-    """Whether nothing stands between an image's projection centre and world points (N, 3), finite ones."""
-    center_m = truth.poses[image].center_m
-    directions = points_m - center_m
-    _, distances = first_hits(truth, center_m, directions)
-    # In units of these directions the point itself lies at 1.
-    return np.asarray(distances >= 1.0 - _IN_FRONT_M / np.linalg.norm(directions, axis=1))

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.synthetic.noise import hash01
+from aeromatch_cli.synthetic.rasters import interpolated
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _MOST_PICTURES, _TILE_PX = 12, 1024
 # Neighbouring tiles blend over this share of a tile: no seam is there to be matched.
 _BLEND = 0.15
-_PIECE = 30_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +81,7 @@ def _sample(raster: NDArray[np.float32], x: FloatArray, y: FloatArray) -> FloatA
     import cv2
 
     side = len(raster)
-    places = [np.asarray(c * side - 0.5, dtype=np.float32) for c in (x, y)]
-    pieces = max(1, -(-len(x) // _PIECE))
-    parts = [
-        cv2.remap(raster, a[:, None], b[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)[:, 0]
-        for a, b in zip(*(np.array_split(place, pieces) for place in places), strict=True)
-    ]
-    return np.concatenate(parts)
+    return interpolated(raster, x * side - 0.5, y * side - 0.5, cv2.BORDER_REFLECT_101)
 
 
 def load_imagery(folder: Path, gsd_m: float, seed: int) -> GroundImagery:

@@ -32,6 +32,16 @@ def _tile(draw: Draw, seed: int, iu: int, iv: int) -> tuple[NDArray[np.float32],
     return tuple(np.ascontiguousarray(layers[..., k : k + 4]) for k in range(0, layers.shape[2], 4))
 
 
+def interpolated(raster: NDArray[np.float32], x: FloatArray, y: FloatArray, border: int) -> FloatArray:
+    """Values (N, C) float32 of a raster (H, W, C), C > 1, bilinear at places (N,) in cells; border: of OpenCV."""
+    import cv2
+
+    pieces = max(1, -(-len(x) // _PIECE))
+    maps = (np.array_split(np.ascontiguousarray(a, dtype=np.float32)[:, None], pieces) for a in (x, y))
+    parts = [cv2.remap(raster, a, b, cv2.INTER_LINEAR, borderMode=border) for a, b in zip(*maps, strict=True)]
+    return np.asarray(np.concatenate(parts)[:, 0], dtype=np.float32)
+
+
 def look_up(draw: Draw, s: Samples) -> FloatArray:
     """Layers (N, C) float32 of a drawn map at ground samples."""
     import cv2
@@ -46,10 +56,7 @@ def look_up(draw: Draw, s: Samples) -> FloatArray:
         tile = _tile(draw, s.seed, int(iu[first]), int(iv[first]))
         if not found.shape[1]:
             found = np.empty((len(x), 4 * len(tile)), dtype=np.float32)
-        for part in np.array_split(rows, -(-len(rows) // _PIECE)):
-            at = (x[part] - np.float32(iu[first] * _TILE_CELLS), y[part] - np.float32(iv[first] * _TILE_CELLS))
-            map_x, map_y = (np.ascontiguousarray(a, dtype=np.float32)[:, None] for a in at)
-            for k, layers in enumerate(tile):
-                looked = cv2.remap(layers, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                found[part, 4 * k : 4 * k + 4] = looked[:, 0]
+        at = (x[rows] - np.float32(iu[first] * _TILE_CELLS), y[rows] - np.float32(iv[first] * _TILE_CELLS))
+        for k, layers in enumerate(tile):
+            found[rows, 4 * k : 4 * k + 4] = interpolated(layers, *at, cv2.BORDER_REPLICATE)
     return found

@@ -20,7 +20,6 @@ _SAMPLES_PER_PX = 2.0
 _BAND_PX = 65_536  # pixels worked on at a time: bounds the memory at any image size and keeps it in the cache
 # A slanted surface is sampled more coarsely along the slant; textures are filtered by the mean of both directions.
 _FLATTEST_COSINE = 0.06
-NO_SURFACE = 0
 
 
 @dataclass(frozen=True, eq=False)

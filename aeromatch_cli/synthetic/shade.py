@@ -13,6 +13,7 @@ from aeromatch_cli.synthetic.light import HORIZON, Light, seasonal
 from aeromatch_cli.synthetic.materials import PAINTERS
 from aeromatch_cli.synthetic.noise import hash01
 from aeromatch_cli.synthetic.paint import Painted, Samples
+from aeromatch_cli.synthetic.rasters import interpolated
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import Scene
 from aeromatch_cli.synthetic.solids import Material
@@ -79,16 +80,7 @@ class Stage:
             return np.zeros((len(points_m), 2), dtype=np.float32)
         x0, y0, cell_m, slopes = known
         x, y = ((points_m[:, k] - first) / cell_m for k, first in ((0, x0), (1, y0)))
-        parts = [
-            cv2.remap(slopes, a[:, None], b[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[:, 0]
-            for a, b in zip(_short(x.astype(np.float32)), _short(y.astype(np.float32)), strict=True)
-        ]
-        return np.concatenate(parts)
-
-
-def _short(values: FloatArray) -> list[FloatArray]:
-    """Pieces that cv2.remap takes: both sides of its maps stay below 32768."""
-    return np.array_split(values, max(1, -(-len(values) // 30_000)))
+        return interpolated(slopes, x, y, cv2.BORDER_CONSTANT)
 
 
 def radiance(

@@ -76,11 +76,17 @@ class Truth:
         with np.errstate(invalid="ignore"):
             hidden: BoolArray = np.any(~((places >= -0.5) & (places <= last)), axis=1)
         asked = np.flatnonzero(~hidden)
-        directions = surface[asked] - center_m
+        hidden[asked] = ~self.in_open_view(image1, surface[asked])
+        return places, hidden
+
+    def in_open_view(self, image: str, points_m: FloatArray) -> BoolArray:
+        """Whether nothing stands between an image's projection centre and world points (N, 3), finite ones."""
+        _, _, center_m = self._view(image)
+        directions = points_m - center_m
         hits = self.caster.first_hits(center_m, directions)
         # In units of these directions the point itself lies at 1.
-        hidden[asked] = hits.distances < 1.0 - _TOLERANCE_M / np.linalg.norm(directions, axis=1)
-        return places, hidden
+        seen: BoolArray = hits.distances >= 1.0 - _TOLERANCE_M / np.linalg.norm(directions, axis=1)
+        return seen
 
     def _known(self, image: str) -> str:
         if image not in self.poses:
