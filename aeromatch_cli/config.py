@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from aeromatch_cli.config_faults import accidents, describe, nearest, root_faults
 from aeromatch_cli.errors import ConfigError
@@ -130,6 +130,13 @@ class Settings(_Section):
             evidence = next(name for name, strategy in FILTERS.items() if strategy.verifies)
             raise ValueError(f"{names} verifies nothing by itself; use {evidence}+{names}")
         return value
+
+    @model_validator(mode="after")
+    def _colours_for_filters(self) -> Settings:
+        readers = [getattr(one, "name", "") for one in self.filter if "colour" in one.needs]
+        if readers and not self.extract.colours:
+            raise ValueError(f"filter {'+'.join(readers)} compares colours that are not kept; set extract.colours=true")
+        return self
 
     @field_validator("export")
     @classmethod

@@ -120,6 +120,11 @@ class View:
 
     undistorted_from_view: (3, 3) float64; source pixel = distort(camera, undistorted_from_view . view pixel).
     angle_deg: angle between the image's own optical axis and the view's.
+    world_direction: (3,) unit vector along which the view looks, world frame, None where the attitude is unknown.
+    gsd_m: ground metres per view pixel, None where it is unknown or varies (perspective views).
+    ground_from_view: (3, 3) view pixel -> world x, y in metres on the plane that the view was made of, None for the
+    source. north_up: whether the view's axes follow the world's alone (a function of world_direction), so that things
+    on the ground have the same orientation in all views of like direction.
     """
 
     name: str
@@ -128,6 +133,23 @@ class View:
     undistorted_from_view: FloatArray
     is_source: bool
     angle_deg: float
+    world_direction: FloatArray | None = None
+    gsd_m: float | None = None
+    north_up: bool = False
+    ground_from_view: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """Another image that is paired with one: where else its ground is looked at from.
+
+    overlap: as in Pair, NaN where unknown. ground_z_m: world height of the ground under the neighbour, None if unknown.
+    """
+
+    camera: Camera
+    pose: Pose
+    overlap: float
+    ground_z_m: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +164,8 @@ class Features:
     view_idx: (D,) int32 into the view arrays; view_keypoints_px: (D, 2) float32 in that view's frame;
     view_size_px: (D,) float32 diameter in that view; view_orientation_deg: (D,) float32 in that view.
     view_sizes_px: (V, 2) int32 width, height of every view; view_angles_deg: (V,) float32.
+    view_directions: (V, 3) float32 and view_gsd_m: (V,) float32 as in View, NaN where unknown.
+    colours: (K, 3) uint8 RGB (gray thrice) of the enhanced image, averaged over each keypoint's blob, or None.
     """
 
     keypoints_px: FloatArray
@@ -155,6 +179,9 @@ class Features:
     view_orientation_deg: FloatArray
     view_sizes_px: IntArray
     view_angles_deg: FloatArray
+    view_directions: FloatArray
+    view_gsd_m: FloatArray
+    colours: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +213,28 @@ class PairGeometry:
     pose0: Pose | None
     pose1: Pose | None
     ground_z_m: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Matches of one pair as filters see them.
+
+    points0_px, points1_px: (M, 2) float64 stored pixels. colours0, colours1: (M, 3) uint8 RGB of both sides as in
+    Features, or None where the extractor kept none (extract.colours) or a point was measured without a detector.
+    """
+
+    points0_px: FloatArray
+    points1_px: FloatArray
+    colours0: NDArray[np.uint8] | None = None
+    colours1: NDArray[np.uint8] | None = None
+
+    def __len__(self) -> int:
+        return len(self.points0_px)
+
+    def take(self, which: IntArray | BoolArray) -> Candidates:
+        """Those of the given positions or mask."""
+        colours0, colours1 = (None if c is None else c[which] for c in (self.colours0, self.colours1))
+        return Candidates(self.points0_px[which], self.points1_px[which], colours0, colours1)
 
 
 State = Literal["verified", "rejected", "not verifiable"]

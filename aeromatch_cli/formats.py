@@ -31,7 +31,9 @@ features/<id>.npz            fingerprint ()str
   keypoints_px (K,2) float32 source frame, merged over views; sizes_px (K,) float32 diameter; responses (K,) float32
   descriptors (D,C) uint8 (RootSIFT x 512) or float32; descriptor_keypoint_idx (D,) int32
   view_idx (D,) int32; view_keypoints_px (D,2) float32, view_size_px (D,) float32, view_orientation_deg (D,) float32:
-  place, diameter and direction in the view's own frame; view_sizes_px (V,2) int32; view_angles_deg (V,) float32
+  place, diameter and direction in the view's own frame; view_sizes_px (V,2) int32; view_angles_deg (V,) float32;
+  view_directions (V,3) float32 unit vectors, world frame, and view_gsd_m (V,) float32, NaN where unknown
+  colours (K,3) uint8 RGB of the enhanced picture around each keypoint, present only with extract.colours
 
 matches/<id0>.npz            one row: all pairs of id0, concatenated; pair p owns entries offsets[p]:offsets[p+1]
   image_id1 (P,) str; fingerprint (P,) str; offsets (P+1,) int64
@@ -92,7 +94,7 @@ from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 from aeromatch_cli.geometry.rotations import from_quaternion, to_quaternion
 
 T = TypeVar("T")
-_FEATURE_ARRAYS = tuple(field.name for field in fields(Features))
+_FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
 # What numpy and zipfile raise on contents that are no sound archive, or not the arrays that it should hold.
 _ARCHIVE_FAULTS = (
     KeyError,
@@ -230,19 +232,20 @@ def _pair(row: Mapping[str, str]) -> Pair:
 
 def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> None:
     arrays: dict[str, Any] = {name: getattr(features, name) for name in _FEATURE_ARRAYS}
+    if features.colours is not None:
+        arrays["colours"] = features.colours
     np.savez(stream, fingerprint=np.array(fingerprint), **arrays)
 
 
 def read_features(path: Path) -> Features:
     """All arrays. Raises BrokenFileError when the file is missing or broken."""
-    arrays = _load(path, _FEATURE_ARRAYS)
-    return Features(**arrays)
+    return Features(**_load(path, _FEATURE_ARRAYS, ("colours",)))
 
 
-def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray]:
-    """keypoints_px (K, 2) and sizes_px (K,) only."""
-    arrays = _load(path, ("keypoints_px", "sizes_px"))
-    return arrays["keypoints_px"], arrays["sizes_px"]
+def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8] | None]:
+    """keypoints_px (K, 2), sizes_px (K,) and colours (K, 3) or None; the rest stays on disk."""
+    arrays = _load(path, ("keypoints_px", "sizes_px"), ("colours",))
+    return arrays["keypoints_px"], arrays["sizes_px"], arrays.get("colours")
 
 
 def features_fingerprint(path: Path) -> str | None:
@@ -253,9 +256,9 @@ def features_fingerprint(path: Path) -> str | None:
         return None
 
 
-def _load(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _load(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     with readable(path, *_ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in names}
+        return {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from aeromatch_cli.geometry.warps import area_scale
 # 16-bit and float pictures are stretched between these percentiles: a cast would leave a 12-bit sensor black.
 _STRETCH_PERCENTILES = (0.5, 99.5)
 _GRID_STEP_PX = 8
+_COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 _GRID_ERROR_PX = 0.015
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
@@ -111,12 +112,40 @@ def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     if pixels.ndim == 3:
         known = pixels.dtype in (np.uint8, np.uint16)  # those that OpenCV converts; exact in float32 for all others
         pixels = cv2.cvtColor(pixels if known else pixels.astype(np.float32), cv2.COLOR_RGB2GRAY)
+    return np.asarray(pixels) if pixels.dtype == np.uint8 else _stretched(pixels, pixels)
+
+
+def sample_colours(pixels: NDArray[Any], points_px: FloatArray, sizes_px: FloatArray) -> NDArray[np.uint8]:
+    """(N, 3) uint8 RGB around points (N, 2) of a picture, averaged over a square of half to all of each size (N,).
+
+    Gray pictures give it thrice; other depths are stretched as in `to_gray8`, all bands alike so that hue stays.
+    """
+    import cv2
+
+    levels = min(_COLOUR_LEVELS, int(np.log2(min(pixels.shape[:2]))) + 1)
+    level = np.clip(np.floor(np.log2(np.maximum(sizes_px, 1.0))), 0, levels - 1).astype(np.int64)
+    found = np.zeros((len(points_px), 3), np.float32)
+    reduced, scale = pixels, 1.0
+    for step in range(levels):
+        height, width = reduced.shape[:2]
+        of_level = np.flatnonzero(level == step)
+        places = np.rint((points_px[of_level].astype(np.float64) + 0.5) * scale - 0.5).astype(np.int64)
+        values = reduced[np.clip(places[:, 1], 0, height - 1), np.clip(places[:, 0], 0, width - 1)]
+        found[of_level] = values if values.ndim == 2 else values[:, None]
+        if not (level > step).any():
+            break
+        reduced, scale = cv2.resize(reduced, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), scale * 0.5
+    return _stretched(found, pixels)
+
+
+def _stretched(values: NDArray[Any], pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Values of a picture in 8 bits: as they are where it has 8, else between percentiles of the picture."""
     if pixels.dtype == np.uint8:
-        return np.asarray(pixels)
-    values = pixels.astype(np.float32)
-    seen = values[np.isfinite(values) & (values != 0)]
+        return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    known = pixels.astype(np.float32)
+    seen = known[np.isfinite(known) & (known != 0)]
     low, high = np.percentile(seen, _STRETCH_PERCENTILES) if seen.size else (0.0, 1.0)
-    stretched = (values - low) * (255.0 / max(float(high - low), 1e-6))
+    stretched = (values.astype(np.float32) - low) * (255.0 / max(float(high - low), 1e-6))
     return np.clip(np.nan_to_num(np.rint(stretched)), 0, 255).astype(np.uint8)
 
 

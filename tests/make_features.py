@@ -24,4 +24,6 @@ def random_features(count: int, *, seed: int = 0, side_px: int = 5472) -> Featur
         view_orientation_deg=rng.uniform(-180, 180, count).astype(np.float32),
         view_sizes_px=np.array([[side_px, side_px]], np.int32),
         view_angles_deg=np.zeros(1, np.float32),
+        view_directions=np.full((1, 3), np.nan, np.float32),
+        view_gsd_m=np.full(1, np.nan, np.float32),
     )

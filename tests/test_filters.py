@@ -6,7 +6,7 @@ import numpy as np
 import poselib
 import pytest
 
-from aeromatch_cli.data import Camera, Pair, PairGeometry, Pose, Verdict
+from aeromatch_cli.data import Camera, Candidates, Pair, PairGeometry, Pose, Verdict
 from aeromatch_cli.geometry.cameras import project, undistort
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, relative_pose, sampson_distance_px
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
@@ -44,7 +44,7 @@ def test_poselib_recovers_the_rotation_among_half_outliers():
     errors_deg = []
     for seed in range(9):
         points0, points1, true = scene(600, outliers=0.5, noise_px=0.3, seed=seed)
-        verdict = Poselib()(points0, points1, GEOMETRY, seed)
+        verdict = Poselib()(Candidates(points0, points1), GEOMETRY, seed)
         assert verdict.state == "verified"
         assert verdict.model_kind == "E"
         assert verdict.keep[true].mean() > 0.99
@@ -56,7 +56,7 @@ def test_poselib_recovers_the_rotation_among_half_outliers():
 
 def test_poselib_survives_few_inliers():
     points0, points1, true = scene(400, outliers=0.8, seed=5)
-    verdict = Poselib()(points0, points1, GEOMETRY, 1)
+    verdict = Poselib()(Candidates(points0, points1), GEOMETRY, 1)
     assert verdict.state == "verified"
     assert verdict.keep[true].mean() > 0.97
     assert angle_between_deg(verdict.relative_rotation, relative_pose(POSE0, POSE1)[0]) < 0.3
@@ -64,7 +64,7 @@ def test_poselib_survives_few_inliers():
 
 def test_the_model_acts_on_normalised_rays():
     points0, points1, _ = scene(300, noise_px=0.0)
-    verdict = Poselib()(points0, points1, GEOMETRY, 0)
+    verdict = Poselib()(Candidates(points0, points1), GEOMETRY, 0)
     normalised = []
     for camera, points in ((CAMERA0, points0), (CAMERA1, points1)):
         k = camera.params if camera.model == "PINHOLE" else (camera.params[0], *camera.params[:3])
@@ -78,7 +78,7 @@ def test_the_model_acts_on_normalised_rays():
 
 def test_the_fundamental_matrix_acts_on_undistorted_pixels():
     points0, points1, true = scene(400, outliers=0.3, seed=2)
-    verdict = Poselib(model="fundamental")(points0, points1, GEOMETRY, 0)
+    verdict = Poselib(model="fundamental")(Candidates(points0, points1), GEOMETRY, 0)
     assert verdict.state == "verified"
     assert verdict.model_kind == "F"
     assert verdict.relative_rotation is None
@@ -93,7 +93,7 @@ def test_random_matches_are_not_verified(count):
         rng = np.random.default_rng(seed)
         points0 = rng.uniform(0, [2000, 1500], (count, 2))
         points1 = rng.uniform(0, [1600, 1200], (count, 2))
-        verdict = Poselib()(points0, points1, GEOMETRY, seed)
+        verdict = Poselib()(Candidates(points0, points1), GEOMETRY, seed)
         assert verdict.state == "rejected"
         assert not verdict.keep.any()
         assert "15 needed" in verdict.reason
@@ -103,7 +103,7 @@ def test_random_matches_are_not_verified(count):
 @pytest.mark.parametrize("model", ["relative_pose", "fundamental"])
 def test_too_few_matches_are_not_verifiable(count, model):
     points0, points1, _ = scene(20)
-    verdict = Poselib(model=model)(points0[:count], points1[:count], GEOMETRY, 0)
+    verdict = Poselib(model=model)(Candidates(points0[:count], points1[:count]), GEOMETRY, 0)
     assert verdict.state == "not verifiable"
     assert verdict.keep.shape == (count,)
     assert not verdict.keep.any()
@@ -114,14 +114,14 @@ def test_points_without_a_ray_are_dropped():
     points0, points1, _ = scene(100)
     folding = Camera("SIMPLE_RADIAL", 2000, 1500, (1500.0, 999.5, 749.5, -0.5))
     points0[:5] = [90000.0, 90000.0]
-    verdict = Poselib()(points0, points1, replace(GEOMETRY, camera0=folding), 0)
+    verdict = Poselib()(Candidates(points0, points1), replace(GEOMETRY, camera0=folding), 0)
     assert not verdict.keep[:5].any()
 
 
 @pytest.mark.parametrize("name", sorted(FILTERS))
 def test_two_runs_are_equal_to_the_bit(name):
     points0, points1, _ = scene(300, outliers=0.6, seed=3)
-    first, second = (FILTERS[name]()(points0, points1, GEOMETRY, 11) for _ in range(2))
+    first, second = (FILTERS[name]()(Candidates(points0, points1), GEOMETRY, 11) for _ in range(2))
     assert np.array_equal(first.keep, second.keep)
     assert np.array_equal(first.model, second.model)
     assert np.array_equal(first.errors_px, second.errors_px)
@@ -142,7 +142,7 @@ def test_the_options_and_the_seed_of_the_pair_reach_the_estimator(monkeypatch, m
     points0, points1, _ = scene(100)
     recipe = Poselib(model=model, threshold_px=2.5, confidence=0.99, min_iterations=20, max_iterations=700)
     for seed in (12345, 0):
-        assert apply_chain([PoseBand(), recipe], points0, points1, GEOMETRY, seed).state == "verified"
+        assert apply_chain([PoseBand(), recipe], Candidates(points0, points1), GEOMETRY, seed).state == "verified"
     options = {"max_epipolar_error": 2.5, "success_prob": 0.99, "min_iterations": 20, "max_iterations": 700}
     assert seen == [{**options, "seed": 12345}, {**options, "seed": 0}]
 
@@ -165,7 +165,7 @@ def noisy_poses(seed, sigma_angle_deg, sigma_position_m):
 def test_the_band_keeps_true_matches_at_the_stated_sigma(sigma_angle_deg, sigma_position_m):
     points0, points1, _ = scene(100, seed=1)
     kept = [
-        PoseBand()(points0, points1, noisy_poses(seed, sigma_angle_deg, sigma_position_m), 0).keep.mean()
+        PoseBand()(Candidates(points0, points1), noisy_poses(seed, sigma_angle_deg, sigma_position_m), 0).keep.mean()
         for seed in range(60)
     ]
     assert np.mean(kept) >= 0.95
@@ -195,8 +195,8 @@ def test_the_band_drops_what_is_far_off():
     matrix = fundamental_from_poses(CAMERA0, POSE0, CAMERA1, POSE1)
     lines = undistort(CAMERA0, points0) @ matrix[:, :2].T + matrix[:, 2]
     across = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
-    assert PoseBand()(points0, points1, geometry, 0).keep.all()
-    verdict = PoseBand()(points0, points1 + 100 * across, geometry, 0)
+    assert PoseBand()(Candidates(points0, points1), geometry, 0).keep.all()
+    verdict = PoseBand()(Candidates(points0, points1 + 100 * across), geometry, 0)
     assert not verdict.keep.any()
     assert (verdict.errors_px > 30).all()
 
@@ -208,16 +208,16 @@ def test_without_poses_or_baseline_everything_passes():
         replace(GEOMETRY, pose1=replace(POSE1, world_rotation=None)),
         replace(GEOMETRY, pose1=replace(POSE1, center_m=POSE0.center_m)),
     ):
-        verdict = PoseBand()(points0, points1, geometry, 0)
+        verdict = PoseBand()(Candidates(points0, points1), geometry, 0)
         assert verdict.keep.all()
         assert verdict.state == "not verifiable"
-    assert PoseBand()(points0[:0], points1[:0], GEOMETRY, 0).keep.shape == (0,)
+    assert PoseBand()(Candidates(points0[:0], points1[:0]), GEOMETRY, 0).keep.shape == (0,)
 
 
 def test_a_chain_counts_what_each_filter_dropped():
     points0, points1, true = scene(400, outliers=0.5, seed=6)
-    band, chain = PoseBand()(points0, points1, GEOMETRY, 0), (PoseBand(), Poselib())
-    verdict = apply_chain(chain, points0, points1, GEOMETRY, 0)
+    band, chain = PoseBand()(Candidates(points0, points1), GEOMETRY, 0), (PoseBand(), Poselib())
+    verdict = apply_chain(chain, Candidates(points0, points1), GEOMETRY, 0)
     assert verdict.state == "verified"
     assert verdict.model_kind == "E"
     assert verdict.rejected["pose"] == (~band.keep).sum()
@@ -230,7 +230,10 @@ def test_a_chain_counts_what_each_filter_dropped():
 
 def test_a_chain_of_one_is_the_filter():
     points0, points1, _ = scene(100, outliers=0.4)
-    alone, chained = Poselib()(points0, points1, GEOMETRY, 3), apply_chain([Poselib()], points0, points1, GEOMETRY, 3)
+    alone, chained = (
+        Poselib()(Candidates(points0, points1), GEOMETRY, 3),
+        apply_chain([Poselib()], Candidates(points0, points1), GEOMETRY, 3),
+    )
     assert np.array_equal(alone.keep, chained.keep)
     assert np.array_equal(alone.model, chained.model)
     assert np.array_equal(alone.errors_px, chained.errors_px)
@@ -240,7 +243,7 @@ def test_a_chain_of_one_is_the_filter():
 def test_a_refusal_keeps_nothing():
     rng = np.random.default_rng(0)
     points0, points1 = rng.uniform(0, 1500, (40, 2)), rng.uniform(0, 1200, (40, 2))
-    verdict = apply_chain([Poselib(), PoseBand()], points0, points1, GEOMETRY, 0)
+    verdict = apply_chain([Poselib(), PoseBand()], Candidates(points0, points1), GEOMETRY, 0)
     assert verdict.state == "rejected"
     assert not verdict.keep.any()
     assert verdict.rejected == {"poselib": 40}
@@ -249,14 +252,14 @@ def test_a_refusal_keeps_nothing():
 
 def test_a_chain_without_a_model_is_not_verifiable():
     points0, points1, _ = scene(50)
-    verdict = apply_chain([PoseBand()], points0, points1, GEOMETRY, 0)
+    verdict = apply_chain([PoseBand()], Candidates(points0, points1), GEOMETRY, 0)
     assert verdict.state == "not verifiable"
     assert verdict.keep.all()
-    few = apply_chain([PoseBand(), Poselib()], points0[:14], points1[:14], GEOMETRY, 0)
+    few = apply_chain([PoseBand(), Poselib()], Candidates(points0[:14], points1[:14]), GEOMETRY, 0)
     assert few.state == "not verifiable"
     assert not few.keep.any()
     assert few.rejected == {"pose": 0, "poselib": 14}
-    empty = apply_chain([Poselib()], points0[:0], points1[:0], GEOMETRY, 0)
+    empty = apply_chain([Poselib()], Candidates(points0[:0], points1[:0]), GEOMETRY, 0)
     assert empty.state == "not verifiable"
     assert empty.keep.shape == (0,)
 
@@ -264,13 +267,13 @@ def test_a_chain_without_a_model_is_not_verifiable():
 class _DropAll:
     name = "drop"
 
-    def __call__(self, points0_px, points1_px, geometry, seed):
-        return Verdict(keep=np.zeros(len(points0_px), dtype=bool), state="not verifiable", reason="none fits")
+    def __call__(self, candidates, geometry, seed):
+        return Verdict(keep=np.zeros(len(candidates), dtype=bool), state="not verifiable", reason="none fits")
 
 
 def test_a_verified_pair_that_loses_every_match_is_rejected():
     points0, points1, _ = scene(50)
-    verdict = apply_chain([Poselib(), _DropAll()], points0, points1, GEOMETRY, 0)
+    verdict = apply_chain([Poselib(), _DropAll()], Candidates(points0, points1), GEOMETRY, 0)
     assert verdict.state == "rejected"
     assert verdict.reason == "drop left no match"
     assert sum(verdict.rejected.values()) == 50

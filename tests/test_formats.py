@@ -3,7 +3,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +164,8 @@ def test_broken_tables_say_so(tmp_path: Path, data: bytes) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 50_000])
 def test_features_round_trip(tmp_path: Path, count: int) -> None:
-    features = random_features(count)
+    rng = np.random.default_rng(0)
+    features = replace(random_features(count), colours=rng.integers(0, 256, (count, 3), dtype=np.uint8))
     path = archived(tmp_path, write_features, features, "print")
     found = read_features(path)
     for field in fields(Features):
@@ -173,6 +174,10 @@ def test_features_round_trip(tmp_path: Path, count: int) -> None:
         assert (after.dtype, after.shape) == (before.dtype, before.shape), field.name
     assert features_fingerprint(path) == "print"
     np.testing.assert_array_equal(read_keypoints(path)[0], features.keypoints_px)
+    np.testing.assert_array_equal(read_keypoints(path)[2], features.colours)
+    plain = archived(tmp_path, write_features, replace(features, colours=None), "print")
+    assert read_features(plain).colours is None
+    assert read_keypoints(plain)[2] is None
 
 
 def test_keypoints_of_a_large_image_keep_their_fraction(tmp_path: Path) -> None:

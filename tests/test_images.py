@@ -22,6 +22,7 @@ from aeromatch_cli.images import (
     read_mask,
     read_pixels,
     render_view,
+    sample_colours,
     sees_sky,
     shrink,
     shrink_camera,
@@ -409,3 +410,18 @@ def test_the_source_view_is_the_source() -> None:
 def test_undistort_is_the_inverse_used_here() -> None:
     points = np.array([[0.0, 0.0], [639.0, 479.0], [320.0, 10.0]])
     np.testing.assert_allclose(distort(LENS, undistort(LENS, points)), points, atol=1e-9)
+
+
+def test_colours_are_averages_around_the_points_in_eight_bits() -> None:
+    picture = np.zeros((64, 96, 3), np.uint8)
+    picture[:, :48], picture[:, 48:] = (200, 100, 50), (20, 40, 60)
+    points = np.array([[10.0, 20.0], [70.0, 20.0], [24.0, 30.0]])
+    found = sample_colours(picture, points, np.array([1.0, 9.0, 500.0]))
+    np.testing.assert_array_equal(found[:2], [(200, 100, 50), (20, 40, 60)])
+    # A blob larger than the picture: the largest square that fits, 64 px, a third of it beyond the edge at 48.
+    np.testing.assert_allclose(found[2], 0.75 * np.array([200, 100, 50]) + 0.25 * np.array([20, 40, 60]), atol=1.0)
+    gray = sample_colours(picture[..., 0], points, np.ones(3))
+    np.testing.assert_array_equal(gray, np.repeat([[200], [20], [200]], 3, axis=1))
+    deep = sample_colours(picture.astype(np.uint16) * 100, points, np.ones(3))
+    assert deep.dtype == np.uint8
+    assert (deep[0, 0], deep[1, 0]) == (255, 0)

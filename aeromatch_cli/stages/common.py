@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Image, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor, Outcome
 from aeromatch_cli.formats import csv_text
@@ -112,6 +112,16 @@ class Context:
             ground_z_m=sum(heights) / len(heights) if heights else None,
         )
 
+    def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
+        """Where else the ground of an image is looked at from: the images it is paired with that have an attitude."""
+        found = []
+        for other_id, overlap in _paired(self.pairs).get(image_id, ()):
+            pose = self.pose(other_id)
+            if pose is not None and pose.world_rotation is not None:
+                camera = self.block.camera(self.image_by_id[other_id])
+                found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
+        return tuple(found)
+
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """What strategies with these `needs` read of one image's geometry."""
         key = image_id, needs
@@ -130,7 +140,22 @@ class Context:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:
             parts["ground"] = (self.ground_z_m(image_id), self.block.gsd_m)
+        if "neighbours" in needs:
+            parts["neighbours"] = [
+                (n.camera, n.pose.center_m, n.pose.world_rotation, n.overlap, n.ground_z_m)
+                for n in self.neighbours(image_id)
+            ]
         return fingerprint(parts)
+
+
+@lru_cache(maxsize=4)
+def _paired(pairs: tuple[Pair, ...]) -> Mapping[str, Sequence[tuple[str, float]]]:
+    """image_id -> the other image and the overlap of each of its pairs, in the order of the ids."""
+    found: dict[str, list[tuple[str, float]]] = {}
+    for pair in pairs:
+        found.setdefault(pair.image_id0, []).append((pair.image_id1, pair.overlap))
+        found.setdefault(pair.image_id1, []).append((pair.image_id0, pair.overlap))
+    return {image_id: sorted(others) for image_id, others in found.items()}
 
 
 @lru_cache(maxsize=4)

@@ -31,7 +31,7 @@ class EnhanceTask:
     """One image to enhance.
 
     mask: file or None. sky_rotation: the attitude where the image sees above the horizon, else None. scale: stored
-    raster to the raster worked on (--max-size).
+    raster to the raster worked on (--max-size). colour: whether a later stage reads the picture's colours.
     """
 
     image_id: str
@@ -40,6 +40,7 @@ class EnhanceTask:
     camera: Camera
     sky_rotation: FloatArray | None
     scale: float
+    colour: bool
     enhancer: Enhancer
     workspace: Workspace
     fingerprint: str
@@ -55,6 +56,7 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
     mask = mask_path(settings.block.masks, image.name)
     pose = context.pose(image.image_id)
     sky = sees_sky(camera, pose)
+    colour = settings.enhance.needs_colour or settings.extract.colours
     parts = [
         PIPELINE_VERSION,
         library_version("opencv-python-headless"),
@@ -62,6 +64,7 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
         image_fingerprint(mask) if mask else "",
         scale,
         settings.enhance,
+        colour,
         context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
     ]
     return EnhanceTask(
@@ -71,6 +74,7 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
         camera=camera,
         sky_rotation=pose.world_rotation if sky and pose else None,
         scale=scale,
+        colour=colour,
         enhancer=settings.enhance,
         workspace=context.workspace,
         fingerprint=fingerprint(*parts),
@@ -122,7 +126,7 @@ def _without_nodata(pixels: NDArray[Any]) -> BoolArray | None:
 
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
     """Pixels after enhancement, their validity, and what the strategy says; always made anew: a PNG costs more."""
-    pixels, valid = load_source(task, colour=task.enhancer.needs_colour)
+    pixels, valid = load_source(task, colour=task.colour)
     result = task.enhancer(pixels, valid)
     return result.pixels, valid, result
 

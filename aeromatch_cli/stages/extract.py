@@ -11,7 +11,7 @@ import numpy as np
 from aeromatch_cli.data import Features, Image
 from aeromatch_cli.formats import features_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
-from aeromatch_cli.images import shrink_camera
+from aeromatch_cli.images import sample_colours, shrink_camera
 from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
 from aeromatch_cli.strategies import Extractor
@@ -51,6 +51,9 @@ def run_task(task: ExtractTask) -> int:
     source = task.views.source
     camera = shrink_camera(source.camera, source.scale)
     features = task.extractor(camera, pictures)
+    if task.extractor.colours:
+        colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
+        features = replace(features, colours=colours)
     features = _in_stored_frame(features, source.scale)
     enhance.keep(source, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from aeromatch_cli.data import FloatArray, Matches, Pair
+from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
 from aeromatch_cli.formats import (
     MatchEntry,
     VerifiedEntry,
@@ -28,6 +29,8 @@ from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
 
+# Keypoints (K, 2) of an image, stored pixels, and their colours (K, 3) where the extractor kept them.
+Side = tuple[FloatArray, NDArray[np.uint8] | None]
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
 WEAK_MATCHES = 50
 
@@ -98,9 +101,8 @@ def run_task(task: FilterTask) -> RowResult:
 
 
 def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry:
-    keypoints = [_keypoints(task.workspace.features(i)) for i in (task.image_id0, entry.image_id1)]
-    points0, points1 = match_points(entry.matches, *keypoints)
-    verdict = apply_chain(task.chain, points0, points1, pair.geometry, pair.seed)
+    sides = [_keypoints(task.workspace.features(i)) for i in (task.image_id0, entry.image_id1)]
+    verdict = apply_chain(task.chain, candidates(entry.matches, *sides), pair.geometry, pair.seed)
     kept = select(entry.matches, verdict.keep)
     errors = None if verdict.errors_px is None else verdict.errors_px[verdict.keep]
     verdict = replace(verdict, keep=np.ones(len(kept.indices), dtype=bool), errors_px=errors)
@@ -122,6 +124,14 @@ def match_points(matches: Matches, keypoints0: FloatArray, keypoints1: FloatArra
     return sides[0], sides[1]
 
 
+def candidates(matches: Matches, side0: Side, side1: Side) -> Candidates:
+    """What filters see of the matches of two images, each given as keypoints (K, 2) and colours (K, 3) or None."""
+    points = match_points(matches, side0[0], side1[0])
+    if side0[1] is None or side1[1] is None or (matches.indices < 0).any():
+        return Candidates(*points)
+    return Candidates(*points, side0[1][matches.indices[:, 0]], side1[1][matches.indices[:, 1]])
+
+
 def select(matches: Matches, keep: Any) -> Matches:
     """The matches where `keep` (M,) is true."""
     return Matches(
@@ -134,12 +144,13 @@ def select(matches: Matches, keep: Any) -> Matches:
 
 
 @lru_cache(maxsize=256)
-def _cached_keypoints(path: Path, stamp: int) -> FloatArray:
+def _cached_keypoints(path: Path, stamp: int) -> Side:
     del stamp  # only tells rewritten files apart
-    return read_keypoints(path)[0]
+    keypoints_px, _, colours = read_keypoints(path)
+    return keypoints_px, colours
 
 
-def _keypoints(path: Path) -> FloatArray:
+def _keypoints(path: Path) -> Side:
     return _cached_keypoints(path, path.stat().st_mtime_ns)
 
 

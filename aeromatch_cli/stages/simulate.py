@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import Image, Pose, View
+from aeromatch_cli.data import Image, Neighbour, Pose, View
 from aeromatch_cli.images import render_view, shrink_camera, to_gray8, write_png
 from aeromatch_cli.stages import enhance
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
@@ -24,6 +24,7 @@ class SimulateTask:
     pose: Pose | None
     ground_z_m: float | None
     gsd_m: float | None
+    neighbours: tuple[Neighbour, ...]
     simulator: Simulator
     fingerprint: str
 
@@ -35,13 +36,15 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     ground_z_m = context.ground_z_m(image.image_id)
     geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
     own = fingerprint(source.fingerprint, simulator, geometry)
-    return SimulateTask(source, context.pose(image.image_id), ground_z_m, context.block.gsd_m, simulator, own)
+    neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
+    pose = context.pose(image.image_id)
+    return SimulateTask(source, pose, ground_z_m, context.block.gsd_m, neighbours, simulator, own)
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:
     """The views of one image: geometry only."""
     camera = shrink_camera(task.source.camera, task.source.scale)
-    return task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m)
+    return task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
 
 
 def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:

@@ -5,10 +5,10 @@ Calls, by family (table in the family's __init__):
 
   pairings    strategy(block) -> list[Pair]                          sorted by ids, image_id0 < image_id1
   enhancers   strategy(pixels, valid) -> Enhanced                    one image, before any view is made
-  simulators  strategy(camera, pose, ground_z_m, gsd_m) -> tuple[View, ...]
+  simulators  strategy(camera, pose, ground_z_m, gsd_m, neighbours) -> tuple[View, ...]
   extractors  strategy(camera, views) -> Features                    views: ViewPixels of one image
   matchers    strategy(features0, features1, geometry) -> Matches
-  filters     strategy(points0_px, points1_px, geometry, seed) -> Verdict   points in stored pixels
+  filters     strategy(candidates, geometry, seed) -> Verdict            points in stored pixels
   exporters   strategy(contents, folder) -> ExportSummary            the only family that writes: a foreign format
 """
 
@@ -21,15 +21,16 @@ from typing import Any, ClassVar, Protocol
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from aeromatch_cli.data import BoolArray, Camera, Features, Matches, PairGeometry, Pose, View
+from aeromatch_cli.data import BoolArray, Camera, Features, Matches, Neighbour, PairGeometry, Pose, View
 
 
 class Strategy(BaseModel):
     """A frozen, hashable recipe.
 
     version: raised whenever the results change; part of the fingerprint.
-    needs: what the call reads of an image's geometry, of "camera", "pose" (centre and attitude), "sigma" and "ground";
-    only that enters the fingerprint, so that a change re-does exactly the stages that depend on it.
+    needs: what the call reads of an image's geometry, of "camera", "pose" (centre and attitude), "sigma", "ground" and
+    "neighbours" (cameras, poses and ground of the images it is paired with); only that enters the fingerprint, so that
+    a change re-does exactly the stages that depend on it. A filter that reads "colour" needs extract.colours.
     verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
     """
 
@@ -71,11 +72,21 @@ class Enhancer(Protocol):
 
 class Simulator(Protocol):
     def __call__(
-        self, camera: Camera, pose: Pose | None, ground_z_m: float | None, gsd_m: float | None
+        self,
+        camera: Camera,
+        pose: Pose | None,
+        ground_z_m: float | None,
+        gsd_m: float | None,
+        neighbours: Sequence[Neighbour] = (),
     ) -> tuple[View, ...]: ...
 
 
 class Extractor(Protocol):
+    """colours: whether the stage adds the colour around every keypoint to the features."""
+
+    @property
+    def colours(self) -> bool: ...
+
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features: ...
 
 

@@ -51,13 +51,14 @@ class Preset:
         pair: Pair = self.pair_of[ids]
         geometry = self.context.geometry(pair)
         matches = self.context.settings.match(features0, features1, geometry)
-        points = filtering.match_points(matches, features0.keypoints_px, features1.keypoints_px)
+        sides = [(features.keypoints_px, features.colours) for features in (features0, features1)]
+        candidates = filtering.candidates(matches, *sides)
         seed = filtering.pair_seed(self.context, pair)
-        verdict = apply_chain(self.context.settings.filter, *points, geometry, seed)
+        verdict = apply_chain(self.context.settings.filter, candidates, geometry, seed)
         keep = verdict.keep if verdict.state == "verified" else np.zeros_like(verdict.keep)
         return Found(
-            points0_px=points[0][keep],
-            points1_px=points[1][keep],
+            points0_px=candidates.points0_px[keep],
+            points1_px=candidates.points1_px[keep],
             scores=matches.scores[keep].astype(np.float64),
             keypoints0_px=features0.keypoints_px.astype(np.float64),
             keypoints1_px=features1.keypoints_px.astype(np.float64),

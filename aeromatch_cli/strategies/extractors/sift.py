@@ -48,6 +48,7 @@ class Sift(Strategy):
         "balanced",
         description="What a cell gives first: the largest, the most contrasted, or response x size^2 (balanced).",
     )
+    colours: bool = Field(False, description="Keep the colour around every keypoint; the filter `colour` reads it.")
     per_cell: int = Field(200, ge=1, description="Keypoints per cell of the even spread; larger is less even.")
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
@@ -245,4 +246,10 @@ def _features(
         view_orientation_deg=described.orientations_deg,
         view_sizes_px=np.array([(v.view.width_px, v.view.height_px) for v in views], np.int32).reshape(-1, 2),
         view_angles_deg=np.array([v.view.angle_deg for v in views], np.float32),
+        view_directions=np.array([_or_nan(v.view.world_direction, 3) for v in views], np.float32).reshape(-1, 3),
+        view_gsd_m=np.array([_or_nan(v.view.gsd_m) for v in views], np.float32).reshape(-1),
     )
+
+
+def _or_nan(value: FloatArray | float | None, length: int = 1) -> FloatArray:
+    return np.full(length, np.nan) if value is None else np.asarray(value, np.float64).reshape(length)

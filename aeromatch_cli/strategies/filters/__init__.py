@@ -1,4 +1,4 @@
-"""Filters: strategy(points0_px, points1_px, geometry, seed) -> Verdict, stored pixels; `apply_chain` composes them."""
+"""Filters: strategy(candidates, geometry, seed) -> Verdict, stored pixels; `apply_chain` composes them."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Camera, FloatArray, PairGeometry, Pose, Verdict
+from aeromatch_cli.data import BoolArray, Camera, Candidates, FloatArray, PairGeometry, Pose, Verdict
 from aeromatch_cli.geometry.cameras import calibration_matrix, undistort
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px
 from aeromatch_cli.strategies import Strategy
@@ -29,13 +29,14 @@ class PoseBand(Strategy):
     sigmas: float = Field(3.0, gt=0.0, description="Half-width of the band in predicted standard deviations.")
     sigma_px: float = Field(1.5, gt=0.0, description="Standard deviation of a keypoint, pixels.")
 
-    def __call__(self, points0_px: FloatArray, points1_px: FloatArray, geometry: PairGeometry, seed: int) -> Verdict:
-        """points (M, 2) in stored pixels. errors_px are Sampson distances to the poses' own epipolar geometry."""
+    def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
+        """errors_px are Sampson distances to the poses' own epipolar geometry."""
         pose0, pose1 = geometry.pose0, geometry.pose1
         if pose0 is None or pose1 is None or pose0.world_rotation is None or pose1.world_rotation is None:
-            everything = np.ones(len(points0_px), dtype=bool)
+            everything = np.ones(len(candidates), dtype=bool)
             return Verdict(keep=everything, state="not verifiable", reason="a pose is missing")
-        points0, points1 = undistort(geometry.camera0, points0_px), undistort(geometry.camera1, points1_px)
+        points0 = undistort(geometry.camera0, candidates.points0_px)
+        points1 = undistort(geometry.camera1, candidates.points1_px)
         matrix = fundamental_from_poses(geometry.camera0, pose0, geometry.camera1, pose1)
         errors = sampson_distance_px(matrix, points0, points1)
         sigma = predicted_sigma_px(points0, points1, geometry.camera0, pose0, geometry.camera1, pose1)

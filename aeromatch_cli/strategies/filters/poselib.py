@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Camera, FloatArray, PairGeometry, Verdict
+from aeromatch_cli.data import BoolArray, Camera, Candidates, FloatArray, PairGeometry, Verdict
 from aeromatch_cli.geometry.cameras import parameters, undistort
 from aeromatch_cli.geometry.epipolar import essential, fundamental, sampson_distance_px
 from aeromatch_cli.strategies import Strategy
@@ -35,11 +35,11 @@ class Poselib(Strategy):
     min_iterations: int = Field(50, ge=1, description="Samples drawn at least.")
     max_iterations: int = Field(3000, ge=1, description="Samples drawn at most.")
 
-    def __call__(self, points0_px: FloatArray, points1_px: FloatArray, geometry: PairGeometry, seed: int) -> Verdict:
-        """points (M, 2) in stored pixels. The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
-        nothing = np.zeros(len(points0_px), dtype=bool)
-        points0 = undistort(geometry.camera0, points0_px)
-        points1 = undistort(geometry.camera1, points1_px)
+    def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
+        """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
+        nothing = np.zeros(len(candidates), dtype=bool)
+        points0 = undistort(geometry.camera0, candidates.points0_px)
+        points1 = undistort(geometry.camera1, candidates.points1_px)
         usable = np.isfinite(points0).all(axis=1) & np.isfinite(points1).all(axis=1)
         if usable.sum() < self.min_inliers:
             reason = f"{int(usable.sum())} matches, {self.min_inliers} needed"

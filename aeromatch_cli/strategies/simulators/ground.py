@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import Camera, FloatArray, Pose, View
+from aeromatch_cli.data import Camera, FloatArray, Neighbour, Pose, View
 from aeromatch_cli.geometry.footprints import (
     MAX_DISTANCE_FACTOR,
     clip_half_plane,
@@ -57,10 +58,15 @@ class GroundView(Strategy):
     )
 
     def __call__(
-        self, camera: Camera, pose: Pose | None, ground_z_m: float | None, gsd_m: float | None
+        self,
+        camera: Camera,
+        pose: Pose | None,
+        ground_z_m: float | None,
+        gsd_m: float | None,
+        neighbours: Sequence[Neighbour] = (),
     ) -> tuple[View, ...]:
         """Views of one image; see the family's table for the contract."""
-        source = source_view(camera)
+        source = source_view(camera, pose)
         if pose is None or ground_z_m is None or gsd_m is None:
             return (source,)
         ground = self._ground_view(camera, pose, ground_z_m, gsd_m)
@@ -95,7 +101,18 @@ class GroundView(Strategy):
         )
         # The third homogeneous coordinate is the depth in metres: positive exactly for ground before the camera.
         undistorted_from_view = undistorted_from_world @ world_from_view
-        return View("ground", width, height, undistorted_from_view, False, tilt_deg(pose.world_rotation))
+        return View(
+            name="ground",
+            width_px=width,
+            height_px=height,
+            undistorted_from_view=undistorted_from_view,
+            is_source=False,
+            angle_deg=tilt_deg(pose.world_rotation),
+            world_direction=np.array([0.0, 0.0, -1.0]),
+            gsd_m=scale_m,
+            north_up=True,
+            ground_from_view=world_from_view,
+        )
 
 
 def _clip_depth(polygon_m: FloatArray, undistorted_from_world: FloatArray, coarsest_m: float) -> FloatArray:
