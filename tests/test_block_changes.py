@@ -74,3 +74,21 @@ def test_only_strategies_that_read_the_ground_depend_on_its_scale(done_site):
             for one in (context, finer)
         ]
         assert {needs for needs in KINDS if prints[0][needs] != prints[1][needs]} == {"ground"}
+
+
+def test_another_pose_redoes_its_image_and_its_neighbours_views_only(done_site):
+    context = context_of(done_site)
+    needs = frozenset({"neighbours"})
+    first, *others = [image.image_id for image in context.block.images]
+    paired = tuple(pair for pair in context.pairs if first not in (pair.image_id0, pair.image_id1))
+    apart = replace(
+        context, pairs=paired + tuple(p for p in context.pairs if {first, others[0]} == {p.image_id0, p.image_id1})
+    )
+    pose = apart.block.poses[first]
+    moved = with_block(apart, poses={**apart.block.poses, first: replace(pose, center_m=pose.center_m + 1.0)})
+    changed = {
+        i for i in (first, *others) if apart.geometry_fingerprint(i, needs) != moved.geometry_fingerprint(i, needs)
+    }
+    assert changed == {others[0]}
+    assert [neighbour.pose for neighbour in apart.neighbours(first)] == [apart.block.poses[others[0]]]
+    assert len(apart.neighbours(others[0])) == IMAGES - 1
