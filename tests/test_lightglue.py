@@ -93,13 +93,18 @@ def features(count: int, seed: int = 0) -> Features:
         view_orientation_deg=rng.uniform(0, 360, count).astype(np.float32),
         view_sizes_px=np.array([[640, 480]], np.int32),
         view_angles_deg=np.zeros(1, np.float32),
+        view_directions=np.full((1, 3), np.nan, np.float32),
+        view_gsd_m=np.full(1, np.nan, np.float32),
     )
+
+
+OF_VIEWS = {"view_sizes_px", "view_angles_deg", "view_directions", "view_gsd_m"}
 
 
 def permuted(original: Features, order: np.ndarray) -> Features:
     """The same keypoints listed in another order: new row n is old row order[n]."""
     rows = {field.name: getattr(original, field.name) for field in dataclasses.fields(original)}
-    for name in rows.keys() - {"view_sizes_px", "view_angles_deg", "descriptor_keypoint_idx"}:
+    for name in rows.keys() - {*OF_VIEWS, "descriptor_keypoint_idx", "colours"}:
         rows[name] = rows[name][order]
     return Features(**rows)
 
@@ -112,7 +117,7 @@ def noisy(original: Features, shift_px: float) -> Features:
 def two_views(view0: Features, view1: Features) -> Features:
     """One image whose keypoint n is row n of both views."""
     rows = {field.name: getattr(view0, field.name) for field in dataclasses.fields(view0)}
-    for name in rows.keys() - {"keypoints_px", "sizes_px", "responses"}:
+    for name in rows.keys() - {"keypoints_px", "sizes_px", "responses", "colours"}:
         rows[name] = np.concatenate([rows[name], getattr(view1, name)])
     return Features(**rows | {"view_idx": np.repeat(np.arange(2, dtype=np.int32), len(view0.keypoints_px))})
 
@@ -364,6 +369,8 @@ def by_hand() -> Features:
         view_orientation_deg=np.array([270.0, 180.0, 45.0], np.float32),
         view_sizes_px=np.array([[640, 480], [200, 100]], np.int32),
         view_angles_deg=np.zeros(2, np.float32),
+        view_directions=np.full((2, 3), np.nan, np.float32),
+        view_gsd_m=np.full(2, np.nan, np.float32),
     )
 
 

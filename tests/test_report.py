@@ -20,7 +20,7 @@ from aeromatch_cli.formats import MatchEntry, VerifiedEntry, write_features, wri
 from aeromatch_cli.stages import report
 from aeromatch_cli.stages.common import Context, StageReport
 from aeromatch_cli.stages.report_rows import ImageRow, PairRow, gather, stage_rows
-from aeromatch_cli.workspace import Workspace, write_atomically
+from aeromatch_cli.workspace import Workspace, write_atomically, write_json
 
 NASTY = '<img src=x onerror=alert(1)> & "ü b".png'
 WIDTH, HEIGHT = 160, 128
@@ -44,6 +44,8 @@ def features() -> Features:
         view_orientation_deg=np.zeros(count, np.float32),
         view_sizes_px=np.array([[WIDTH, HEIGHT]], np.int32),
         view_angles_deg=np.zeros(1, np.float32),
+        view_directions=np.full((1, 3), np.nan, np.float32),
+        view_gsd_m=np.full(1, np.nan, np.float32),
     )
 
 
@@ -161,6 +163,14 @@ def test_rows_hold_the_numbers_of_the_workspace(full):
         (2, 0, 0, 0.0),
     ]
     assert [i.keypoints for i in images] == [100] * 4
+    assert [(i.views, i.shadow) for i in images] == [(None, None)] * 4
+
+
+def test_images_tell_their_views_and_shadow(full):
+    write_json(full.workspace.views("b"), {"views": [{"name": "source"}, {"name": "ground"}]})
+    write_json(full.workspace.enhanced("b", ".json"), {"shadow_share": 0.34, "fingerprint": "x"})
+    of_b = gather(full)[1][1]
+    assert (of_b.views, of_b.shadow) == (2, 0.34)
 
 
 def test_page_shows_headline_tables_and_reasons(full):
@@ -189,7 +199,7 @@ def test_page_shows_headline_tables_and_reasons(full):
     ac = row_with(page, "pair-table", "a.png", str(escape(NASTY)))
     assert ac[5:7] == ["12", "0"]
     assert ac[9:12] == ["rejected", "", "8 inliers of 12 matches"]
-    assert row_with(page, "image-table", "sub/d.png")[1:] == ["full", "100", "2", "0", "0", "0", "weakly tied."]
+    assert row_with(page, "image-table", "sub/d.png")[1:] == ["full", "", "", "100", "2", "0", "0", "0", "weakly tied."]
     assert row_with(page, "stage-table", "extract")[3:7] == ["5", "4", "0", "1"]
     assert "name: poselib" in words  # the settings
 
@@ -244,7 +254,16 @@ def test_page_without_poses_features_or_verified_pairs(tmp_path):
         "4 images have no position",
     ):
         assert text in words, text
-    assert row_with(page_of(empty), "image-table", "a.png")[2:] == ["", "1", "0", "0", "", "no features. weakly tied."]
+    assert row_with(page_of(empty), "image-table", "a.png")[2:] == [
+        "",
+        "",
+        "",
+        "1",
+        "0",
+        "0",
+        "",
+        "no features. weakly tied.",
+    ]
     filed = [row.label for row in stage_rows(empty.workspace)]
     assert filed == []  # the report stage does not report about itself
 

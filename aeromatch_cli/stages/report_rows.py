@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -21,6 +21,7 @@ from aeromatch_cli.stages.common import Context
 from aeromatch_cli.stages.filter import match_points, verified_pairs
 from aeromatch_cli.workspace import Workspace, read_json
 
+T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
 COVERAGE_CELLS = 16
 NOT_JUDGED = "not judged"
@@ -55,7 +56,9 @@ class PairRow:
 class ImageRow:
     """One image. href: relative link to the picture, or "". keypoints, coverage: None where there are no features.
 
-    pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match.
+    pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match. views: virtual
+    views that its features come from, None where none are on file. shadow: share of the picture that the enhancement
+    treated as shadow, None where it looks for none.
     """
 
     image_id: str
@@ -67,6 +70,8 @@ class ImageRow:
     verified_pairs: int
     verified_matches: int
     coverage: float | None
+    views: int | None = None
+    shadow: float | None = None
 
 
 @dataclass(frozen=True)
@@ -147,9 +152,17 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
                 verified_pairs=tied[image.image_id],
                 verified_matches=matches[image.image_id],
                 coverage=coverage.share(image.image_id),
+                views=_fact(context.workspace.views(image.image_id), "views", len),
+                shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
             )
         )
     return pairs, images
+
+
+def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:
+    """One fact of a JSON file of the workspace, None where the stage that writes it left none."""
+    facts = read_json(path) if path.is_file() else {}
+    return of(facts[key]) if key in facts else None
 
 
 def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:
