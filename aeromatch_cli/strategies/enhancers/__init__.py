@@ -9,6 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.enhancers.clahe import ClaheEnhancement
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
+from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
+from aeromatch_cli.strategies.enhancers.wallis import WallisEnhancement
 
-ENHANCERS: Mapping[str, type[Strategy]] = {"none": NoEnhancement}
+ENHANCERS: Mapping[str, type[Strategy]] = {
+    "none": NoEnhancement,
+    "shadow": ShadowEnhancement,
+    "clahe": ClaheEnhancement,
+    "wallis": WallisEnhancement,
+}

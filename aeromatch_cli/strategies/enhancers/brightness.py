@@ -1,0 +1,37 @@
+"""Brightness of gray and colour pictures, and putting a changed one back without a change of hue."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STRIP_ROWS = 256
+
+
+def brightness(pixels: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) of (H, W) or (H, W, C), same dtype: the gray level, or the only band."""
+    import cv2
+
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.shape[2] != 3:
+        return np.asarray(np.rint(pixels.mean(axis=2)).astype(pixels.dtype))
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+
+
+def with_brightness(pixels: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[Any]:
+    """Pixels (H, W) or (H, W, C) scaled, all bands alike, so that their brightness `before` becomes `after`."""
+    import cv2
+
+    if pixels.ndim == 2:
+        return after.astype(pixels.dtype)
+    out = np.empty_like(pixels)
+    code = cv2.CV_8U if pixels.dtype == np.uint8 else cv2.CV_16U
+    for top in range(0, len(pixels), _STRIP_ROWS):
+        rows = slice(top, top + _STRIP_ROWS)
+        factor = after[rows].astype(np.float32) / np.maximum(before[rows].astype(np.float32), np.float32(1.0))
+        wide = cv2.merge([factor] * pixels.shape[2])
+        out[rows] = cv2.multiply(pixels[rows], wide, dtype=code).reshape(out[rows].shape)
+    return out

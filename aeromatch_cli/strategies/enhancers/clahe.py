@@ -1,0 +1,30 @@
+"""Contrast-limited adaptive histogram equalisation of the brightness (Zuiderveld, Graphics Gems IV, 1994, VIII.5)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import BoolArray
+from aeromatch_cli.strategies import Enhanced, Strategy
+from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+
+
+class ClaheEnhancement(Strategy):
+    """Local contrast everywhere, shadow or not; hue stays."""
+
+    needs_colour: ClassVar[bool] = False
+    name: Literal["clahe"] = "clahe"
+    clip_limit: float = Field(2.0, gt=0.0, le=100.0, description="Bound on a tile's slope of mapping, OpenCV's unit.")
+    tiles: int = Field(8, ge=1, le=256, description="Tiles across and down the picture.")
+
+    def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
+        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask."""
+        import cv2
+
+        source = np.ascontiguousarray(brightness(pixels))
+        equalised = cv2.createCLAHE(self.clip_limit, (self.tiles, self.tiles)).apply(source)
+        return Enhanced(with_brightness(pixels, source, equalised))

@@ -1,0 +1,60 @@
+"""Wallis filter: every neighbourhood brought towards one mean and one spread of brightness.
+
+Wallis 1976, "An approach to the space variant restoration and enhancement of images".
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import BoolArray
+from aeromatch_cli.strategies import Enhanced, Strategy
+from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+
+_STRIP_ROWS = 256
+_WHITE_PERCENTILE = 99.8  # of pictures deeper than 8 bits, whose white is not known
+
+
+class WallisEnhancement(Strategy):
+    """Local mean and contrast made alike everywhere, shadow or not; hue stays."""
+
+    needs_colour: ClassVar[bool] = False
+    name: Literal["wallis"] = "wallis"
+    window_share: float = Field(
+        0.04, gt=0.0, le=1.0, description="Side of the neighbourhood as a share of the picture's longer side."
+    )
+    mean: float = Field(0.5, ge=0.0, le=1.0, description="Mean that brightness is brought to, as a share of white.")
+    spread: float = Field(0.2, gt=0.0, le=0.5, description="Standard deviation that it is brought to, likewise.")
+    contrast: float = Field(0.8, ge=0.0, le=1.0, description="How far the spread is changed: 0 not, 1 wholly.")
+    brightness: float = Field(0.9, ge=0.0, le=1.0, description="How far the mean is changed: 0 not, 1 wholly.")
+
+    def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
+        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask."""
+        source = brightness(pixels)
+        white = 255.0 if pixels.dtype == np.uint8 else max(1.0, float(np.percentile(source, _WHITE_PERCENTILE)))
+        return Enhanced(with_brightness(pixels, source, self._filtered(source, white)))
+
+    def _filtered(self, source: NDArray[Any], white: float) -> NDArray[Any]:
+        """g = (f - m) c S / (c s + (1 - c) S) + b M + (1 - b) m, m and s the local mean and spread, M and S wanted."""
+        import cv2
+
+        half = max(1, round(0.5 * self.window_share * max(source.shape)))
+        side, top_value = 2 * half + 1, float(np.iinfo(source.dtype).max)
+        wanted = self.spread * white
+        out = np.empty_like(source)
+        for top in range(0, len(source), _STRIP_ROWS):
+            first, last = max(0, top - half), min(len(source), top + _STRIP_ROWS + half)
+            values = source[first:last].astype(np.float32)
+            mean = cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT)
+            square = cv2.sqrBoxFilter(values, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
+            spread = np.sqrt(np.maximum(square - mean.astype(np.float64) ** 2, 0.0)).astype(np.float32)
+            slope = self.contrast * wanted / (self.contrast * spread + (1.0 - self.contrast) * wanted + 1e-3 * white)
+            level = self.brightness * self.mean * white + (1.0 - self.brightness) * mean
+            rows = slice(top - first, min(top + _STRIP_ROWS, len(source)) - first)
+            bounded = np.clip(np.rint((values - mean) * slope + level), 0.0, top_value)[rows]
+            out[top : top + _STRIP_ROWS] = bounded.astype(source.dtype)
+        return out
