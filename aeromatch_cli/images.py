@@ -244,6 +244,9 @@ def render_view(
     if scale < _ALIASING_SCALE:
         pixels = shrink(pixels, scale)
         map_x, map_y = (map_x + 0.5) * scale - 0.5, (map_y + 0.5) * scale - 0.5
+    kernel = _smoothing_kernel(view, inside, scale if scale < _ALIASING_SCALE else 1.0)
+    if kernel is not None:
+        pixels = cv2.filter2D(pixels, -1, kernel, borderType=cv2.BORDER_REPLICATE)
     map_x, map_y = map_x.astype(np.float32), map_y.astype(np.float32)
     picture = cv2.remap(pixels, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     picture[~inside] = 0
@@ -285,6 +288,30 @@ def _interpolation_error_px(grid: FloatArray, camera: Camera) -> float:
     bend[:, 1:-1] += np.abs(grid[:, 2:] - 2.0 * grid[:, 1:-1] + grid[:, :-2])
     bend[1:-1] += np.abs(grid[2:] - 2.0 * grid[1:-1] + grid[:-2])
     return float(np.nan_to_num(bend[inside]).max(initial=0.0)) / 8.0
+
+
+def _smoothing_kernel(view: View, inside: BoolArray, scale: float) -> FloatArray | None:
+    """Gaussian (K, K) on a source reduced by `scale` for what the view still shrinks along one axis; None if little.
+
+    A shrink by t needs a blur of 0.8 sqrt(t^2 - 1) source pixels along its axis (Morel and Yu 2009, section 3.2).
+    """
+    ys, xs = np.nonzero(inside[::_GRID_STEP_PX, ::_GRID_STEP_PX])
+    if not len(xs):
+        return None
+    at = np.array([xs.mean(), ys.mean()]) * _GRID_STEP_PX
+    warp = view.undistorted_from_view
+    depth = float(warp[2, :2] @ at + warp[2, 2])
+    place = (warp[:2, :2] @ at + warp[:2, 2]) / depth
+    jacobian = scale * (warp[:2, :2] - np.outer(place, warp[2, :2])) / depth
+    axes, shrinks, _ = np.linalg.svd(jacobian)
+    if shrinks[0] * _ALIASING_SCALE <= 1.0:
+        return None
+    # A variance of 0.01 leaves an axis as it is and keeps the matrix invertible.
+    variances = np.maximum(0.64 * (shrinks**2 - 1.0), 0.01)
+    reach = int(np.ceil(3.0 * np.sqrt(variances[0])))
+    grid = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1.0)] * 2), axis=-1)
+    weights = np.exp(-0.5 * (((grid @ axes) ** 2) / variances).sum(axis=-1))
+    return np.asarray(weights / weights.sum())
 
 
 def _typical_scale(camera: Camera, view: View, inside: BoolArray) -> float:

@@ -1,0 +1,131 @@
+"""What the strategies that look at the ground plane share: how much ground an image offers, and one view of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from aeromatch_cli.data import Camera, FloatArray, Pose, View
+from aeromatch_cli.geometry.footprints import (
+    MAX_DISTANCE_FACTOR,
+    clip_half_plane,
+    ground_footprint,
+    ground_sampling_distance_m,
+)
+from aeromatch_cli.geometry.views import view_from_ground
+from aeromatch_cli.geometry.warps import undistorted_from_ground
+from aeromatch_cli.strategies import Strategy
+
+# A smaller view holds no feature worth the name; the source is used instead.
+_SMALLEST_VIEW_PX = 32
+# Of a pixel: a box whose side falls on a pixel's edge up to rounding keeps that pixel.
+_ROUNDING_PX = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPlane:
+    """The ground that one image offers to views.
+
+    polygon_m: (N, 2) world x, y. undistorted_from_world: (3, 3) as in `geometry.warps.undistorted_from_ground`.
+    axis: (3,) the optical axis. gsd_m: scale of the views. flying_height_m: above the plane.
+    """
+
+    polygon_m: FloatArray
+    undistorted_from_world: FloatArray
+    axis: FloatArray
+    gsd_m: float
+    flying_height_m: float
+
+
+class PlaneViews(Strategy):
+    """Settings of views of the ground plane, and how one is made."""
+
+    name: str  # a strategy's own, first in every listing
+    source: bool = Field(default=False, description="Also use the source image, as view 0.")
+    max_megapixels: float = Field(
+        default=32.0, gt=0.0, description="Largest view; one that would be larger is scaled down to this."
+    )
+    max_distance_factor: float = Field(
+        default=MAX_DISTANCE_FACTOR,
+        gt=0.0,
+        description="Ground farther away than this many flying heights is left out.",
+    )
+    max_magnification: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=2.0,
+        description="The view is never finer than the middle of the image by more than this.",
+    )
+    max_stretch: float = Field(
+        default=3.0, gt=1.0, description="Far ground that the view would enlarge more than this is left out."
+    )
+
+    def ground_plane(
+        self, camera: Camera, pose: Pose | None, ground_z_m: float | None, gsd_m: float | None, per_side: int = 8
+    ) -> GroundPlane | None:
+        """The ground that an image offers, or None where something is unknown or no ground is seen.
+
+        per_side: points along each side of the image that the polygon is made of.
+        """
+        if pose is None or pose.world_rotation is None or ground_z_m is None or gsd_m is None:
+            return None
+        own_gsd = ground_sampling_distance_m(camera, pose, ground_z_m, self.max_distance_factor)
+        if own_gsd is None:
+            return None
+        scale_m = max(gsd_m, own_gsd / self.max_magnification)
+        undistorted_from_world = undistorted_from_ground(camera, pose, ground_z_m)
+        height_m = float(pose.center_m[2]) - ground_z_m
+        polygon = ground_footprint(camera, pose, ground_z_m, self.max_distance_factor * height_m, per_side)
+        polygon = _clip_depth(polygon, undistorted_from_world, scale_m * self.max_stretch)
+        if len(polygon) < 3:
+            return None
+        return GroundPlane(polygon, undistorted_from_world, np.array(pose.world_rotation[2]), scale_m, height_m)
+
+    def plane_view(self, ground: GroundPlane, polygon_m: FloatArray, direction: FloatArray, name: str) -> View | None:
+        """The parallel view along a downward unit `direction` of the box around polygon_m, or None if that is small.
+
+        A ground point's pixel follows from the direction and the scale alone, up to whole pixels: pixel edges lie at
+        multiples of the scale from the world's origin.
+        """
+        if len(polygon_m) < 3:
+            return None
+        shrunk = view_from_ground(direction)
+        corners = polygon_m @ shrunk.T
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        scale_m = max(ground.gsd_m, float(np.sqrt((high - low).prod() / (self.max_megapixels * 1e6))))
+        # Whole pixels within the box: less than one is lost at each edge, and the bound holds.
+        first, last = np.ceil(low / scale_m - _ROUNDING_PX), np.floor(high / scale_m + _ROUNDING_PX)
+        width, height = (int(side) for side in last - first)
+        if min(width, height) < _SMALLEST_VIEW_PX:
+            return None
+        world_from_view = np.eye(3)
+        world_from_view[:2, :2] = np.linalg.inv(shrunk) * scale_m
+        world_from_view[:2, 2] = world_from_view[:2, :2] @ (first + 0.5)
+        return View(
+            name=name,
+            width_px=width,
+            height_px=height,
+            # The third homogeneous coordinate is the depth in metres: positive exactly for ground before the camera.
+            undistorted_from_view=ground.undistorted_from_world @ world_from_view,
+            is_source=False,
+            angle_deg=float(np.rad2deg(np.arccos(np.clip(ground.axis @ direction, -1.0, 1.0)))),
+            world_direction=direction,
+            gsd_m=scale_m,
+            north_up=True,
+            ground_from_view=world_from_view,
+        )
+
+
+def _clip_depth(polygon_m: FloatArray, undistorted_from_world: FloatArray, coarsest_m: float) -> FloatArray:
+    """The part of a ground polygon (N, 2) where a source pixel covers at most coarsest_m squared of ground.
+
+    A square metre of ground covers det(H) / depth^3 square pixels, H being undistorted_from_world and depth its third
+    homogeneous coordinate: a bound on the scale is a bound on the depth, which is a straight line on the ground.
+    """
+    if len(polygon_m) < 3:
+        return polygon_m
+    largest_depth = np.cbrt(abs(float(np.linalg.det(undistorted_from_world))) * coarsest_m**2)
+    depth = polygon_m @ undistorted_from_world[2, :2] + undistorted_from_world[2, 2]
+    return clip_half_plane(polygon_m, depth - largest_depth)

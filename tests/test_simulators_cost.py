@@ -1,0 +1,34 @@
+"""What the stage reports say of the cost of views."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from aeromatch_cli.data import Camera
+from aeromatch_cli.images import render_view
+from aeromatch_cli.stages.simulate import ViewCost, cost_facts
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.simulators.tilts import Tilts
+
+
+def test_cost_is_counted_over_views() -> None:
+
+    camera = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))
+    views = Tilts(levels=0, turns=4)(camera, None, None, None)
+    gray = np.zeros((300, 400), np.uint8)
+    cost = ViewCost.of([ViewPixels(view, *render_view(gray, None, camera, view)) for view in views])
+    assert cost == ViewCost(4, 0.48)
+
+
+def test_facts_add_up_over_the_passes_of_a_command() -> None:
+    first = cost_facts([ViewCost(1, 2.0), ViewCost(3, 4.0)], {})
+    assert first == {
+        "images": 2,
+        "views": 4,
+        "view_megapixels": 6.0,
+        "views_per_image": 2.0,
+        "view_megapixels_per_image": 3.0,
+    }
+    both = cost_facts([ViewCost(5, 9.0)], {"keypoints": 77, **first})
+    assert (both["images"], both["views"], both["view_megapixels"]) == (3, 9, 15.0)
+    assert (both["views_per_image"], both["view_megapixels_per_image"]) == (3.0, 5.0)
