@@ -6,10 +6,10 @@ import pytest
 
 from aeromatch_cli.data import Camera, View
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors import sift as sift_module
+from aeromatch_cli.strategies.extractors import detection
+from aeromatch_cli.strategies.extractors.detection import root_sift
 from aeromatch_cli.strategies.extractors.merging import merge_keypoints
-from aeromatch_cli.strategies.extractors.selection import even_selection
-from aeromatch_cli.strategies.extractors.sift import Sift, root_sift
+from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.extractors.tiles import tiles
 
 
@@ -124,37 +124,6 @@ def test_two_runs_are_equal_to_the_bit():
     assert all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
-def uneven(seed=0):
-    """Strong texture on the left third, weak texture elsewhere."""
-    gray = texture(600, 300, seed).astype(float)
-    gray[:, 200:] = 128 + (gray[:, 200:] - 128) * 0.25
-    return np.rint(gray).astype(np.uint8)
-
-
-def cells_hit(points):
-    return len(np.unique((points // 25).astype(int), axis=0))
-
-
-def test_the_selection_is_more_even_than_the_strongest():
-    gray = uneven()
-    even = extract(gray, keypoints=300, selection="response", per_cell=4).keypoints_px
-    strongest = extract(gray, keypoints=300, selection="response", per_cell=300).keypoints_px
-    assert cells_hit(even) > 1.5 * cells_hit(strongest)
-    assert (even[:, 0] > 200).mean() > 0.5
-    assert (strongest[:, 0] > 200).mean() < 0.1
-
-
-def test_even_selection_by_hand():
-    points = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [11.0, 1.0], [12.0, 2.0]])
-    strengths = np.array([5.0, 9.0, 7.0, 1.0, 2.0])
-    # Two cells of 10 x 10 px; the first round gives 1 and 4, the second the stronger of 2 and 3.
-    single = np.ones(5, np.int64)
-    assert even_selection(points, strengths, single, (20, 10), 2, 1).tolist() == [1, 4]
-    assert even_selection(points, strengths, single, (20, 10), 3, 2).tolist() == [1, 2, 4]
-    # Point 1 has two descriptors: the budget of three is spent with the first round.
-    assert even_selection(points, strengths, np.array([1, 2, 1, 1, 1]), (20, 10), 3, 2).tolist() == [1, 4]
-
-
 def test_tiles_share_out_every_pixel_once_and_are_bounded():
     for width, height in [(5472, 3648), (2304, 1728), (4000, 2250), (11000, 700), (100, 90)]:
         layout = tiles(width, height, 4_000_000, 128)
@@ -176,7 +145,7 @@ def test_tiles_share_out_every_pixel_once_and_are_bounded():
 def test_tiles_find_the_same_keypoints(monkeypatch):
     gray = texture(1400, 900, seed=3)
     whole = extract(gray, keypoints=10**6)
-    monkeypatch.setattr(sift_module, "_TILE_AREA_PX", 400_000)
+    monkeypatch.setattr(detection, "TILE_AREA_PX", 400_000)
     assert len(tiles(1400, 900, 400_000, 128)) > 3
     tiled = extract(gray, keypoints=10**6)
     a = {(round(float(x), 2), round(float(y), 2)) for x, y in whole.keypoints_px}

@@ -1,39 +1,99 @@
-"""Which features of an image to keep: an exact budget, spread evenly, strongest first in each place."""
+"""Which features of an image to keep: an exact budget, spread evenly over the ground, strongest first in each place.
+
+Cells are anchored in the world where a view knows it, so that two images that see the same ground rank the same points
+against each other, wherever their borders run.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.warps import area_scale
+from aeromatch_cli.strategies import ViewPixels
+
+# The visible area of a cell is counted on about so many samples of its view.
+_AREA_SAMPLES = 40_000
+
+
+def distinct(points_px: FloatArray, sizes_px: FloatArray, strengths: FloatArray, radius_px: float) -> BoolArray:
+    """Which points (N, 2) have no stronger one within radius_px and a factor of two in size (N,).
+
+    A blob that answers at neighbouring scales is one thing on the ground and shall cost one descriptor. Of equally
+    strong ones the first in the list stands. The rule is local: every image that sees the place decides alike.
+    """
+    from scipy.spatial import cKDTree
+
+    keep: BoolArray = np.ones(len(points_px), dtype=bool)
+    if len(points_px) == 0:
+        return keep
+    pairs = np.sort(cKDTree(points_px).query_pairs(radius_px, output_type="ndarray"), axis=1)
+    ratio = sizes_px[pairs[:, 0]] / sizes_px[pairs[:, 1]]
+    first, second = pairs[(ratio <= 2.0) & (ratio >= 0.5)].T
+    keep[np.where(strengths[second] > strengths[first], first, second)] = False
+    return keep
 
 
 def even_selection(
+    views: Sequence[ViewPixels],
+    view_idx: IntArray,
     points_px: FloatArray,
     strengths: FloatArray,
-    costs: IntArray,
-    size_px: tuple[int, int],
     budget: int,
     per_cell: int,
 ) -> IntArray:
-    """Indices (ascending, int64) of the points (N, 2) that a budget buys, by round-robin over square cells.
+    """Indices (ascending, int64) of the features that a budget buys; points_px (N, 2) in the frames of their views.
 
-    costs (N,): descriptors of each point, >= 1. Every cell gives its strongest point, then its second strongest, and
-    so on; the last round takes the strongest over all cells. The last point taken may exceed the budget by its own
-    further descriptors, which the caller drops. Cells are sized to hold per_cell of `budget` points on average. Equal
-    strengths are ordered by position in the list. size_px: (width, height) of the image.
+    Every cell gives its strongest feature, then its second strongest, and so on, each at a pace in proportion to the
+    area that its view sees of it, in view pixels: views share the budget by what they show, and what one cannot use
+    goes to the others. Cells hold about per_cell of `budget` features: squares of a power of two metres along the
+    world's axes where the view's ground is known, else squares of view pixels. Equal features go by their order.
     """
-    if int(costs.sum()) <= budget:
+    if len(points_px) <= budget:
         return np.arange(len(points_px))
-    width_px, height_px = size_px
-    side = np.sqrt(width_px * height_px * per_cell / budget)
-    columns, rows = max(1, round(width_px / side)), max(1, round(height_px / side))
-    column = np.clip(((points_px[:, 0] + 0.5) * columns / width_px).astype(np.int64), 0, columns - 1)
-    row = np.clip(((points_px[:, 1] + 0.5) * rows / height_px).astype(np.int64), 0, rows - 1)
-    order = np.lexsort((-strengths, row * columns + column))
-    cells = (row * columns + column)[order]
-    starts = np.flatnonzero(np.concatenate([[True], cells[1:] != cells[:-1]]))
-    rank = np.empty(len(order), np.int64)
+    samples = [_samples(view) for view in views]
+    cell_px2 = sum(len(seen) * step**2 for seen, step in samples) * per_cell / budget
+    turn = np.zeros(len(points_px))
+    for number, (view, (seen, step)) in enumerate(zip(views, samples, strict=True)):
+        of_view = np.flatnonzero(view_idx == number)
+        if len(of_view):
+            cells, seen_cells = _cells(view, cell_px2, points_px[of_view], seen)
+            turn[of_view] = _turns(cells, strengths[of_view], seen_cells) / step**2
+    return np.sort(np.lexsort((-strengths, turn))[:budget])
+
+
+def _samples(view: ViewPixels) -> tuple[FloatArray, int]:
+    """Visible pixels (N, 2) on a regular grid over the view, and its step in pixels."""
+    height, width = view.gray.shape
+    step = max(1, int(np.sqrt(width * height / _AREA_SAMPLES)))
+    y, x = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    seen = grid if view.valid is None else grid[view.valid[grid[:, 1], grid[:, 0]]]
+    return seen.astype(np.float64), step
+
+
+def _cells(view: ViewPixels, cell_px2: float, points_px: FloatArray, seen_px: FloatArray) -> tuple[IntArray, IntArray]:
+    """Cell numbers of points (N,) and samples (S,) of a view, cells of about cell_px2 square pixels."""
+    places: list[FloatArray] = [points_px.astype(np.float64), seen_px]
+    side, warp = float(np.sqrt(cell_px2)), view.view.ground_from_view
+    if warp is not None:
+        side_m = side * float(np.median(area_scale(warp, places[0])))
+        side = float(2.0 ** np.rint(np.log2(side_m)))
+        places = [apply_homography(warp, place) for place in places]
+    points, seen = (np.floor(place / side).astype(np.int64) @ [1 << 32, 1] for place in places)
+    return points, seen
+
+
+def _turns(cells: IntArray, strengths: FloatArray, seen_cells: IntArray) -> FloatArray:
+    """When each feature (N,) is taken: its rank by strength within its cell over the samples seen of the cell."""
+    order = np.lexsort((-strengths, cells))
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(cells[order]) != 0]))
+    rank = np.empty(len(order))
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
-    taken = np.lexsort((-strengths, rank))
-    spent_before = np.cumsum(costs[taken]) - costs[taken]
-    return np.sort(taken[spent_before < budget])
+    known, counts = np.unique(np.append(cells, seen_cells), return_counts=True)
+    own, points = np.unique(cells, return_counts=True)
+    samples = counts[np.searchsorted(known, own)] - points
+    return (rank + 0.5) / np.maximum(samples, 1)[np.searchsorted(own, cells)]
