@@ -1,5 +1,7 @@
 """Mutual nearest neighbours against a brute-force reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,11 @@ from hypothesis import strategies as st
 
 from aeromatch_cli.data import Features, Pair, PairGeometry
 from aeromatch_cli.geometry.cameras import from_colmap
-from aeromatch_cli.strategies.matchers import MATCHERS
-from aeromatch_cli.strategies.matchers import nearest as nearest_module
-from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.nearest import Nearest, mutual_nearest
+from aeromatch_cli.strategies.matchers import MATCHERS, scan
+from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
+from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.views import like_views
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
 GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)
@@ -60,15 +63,17 @@ def features(described, keypoint_idx=None):
         view_orientation_deg=zeros,
         view_sizes_px=np.array([[100, 80]], np.int32),
         view_angles_deg=np.zeros(1, np.float32),
+        view_directions=np.full((1, 3), np.nan, np.float32),
+        view_gsd_m=np.full(1, np.nan, np.float32),
     )
 
 
 @pytest.fixture(params=[True, False], ids=["bytes", "float32"])
 def arithmetic(request, monkeypatch):
     """Both ways to multiply; the byte way only where this processor has it."""
-    if request.param and not nearest_module._has_integer_product():
+    if request.param and not scan._has_integer_product():
         pytest.skip("no byte product on this processor")
-    monkeypatch.setattr(nearest_module, "_has_integer_product", lambda: request.param)
+    monkeypatch.setattr(scan, "_has_integer_product", lambda: request.param)
 
 
 @settings(max_examples=40, deadline=None)
@@ -154,6 +159,75 @@ def test_one_to_one_is_greedy(rows):
             used0.add(idx0[k])
             used1.add(idx1[k])
     assert sorted(one_to_one(idx0, idx1, costs.astype(float)).tolist()) == sorted(expected)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 60))
+def test_distinct_matches_keep_the_cheapest_of_a_place(seed, count):
+    rng = np.random.default_rng(seed)
+    places, costs = rng.uniform(0, 4, (count, 4)), rng.integers(0, 9, count).astype(float)
+    expected = []
+    for k in np.argsort(costs, kind="stable").tolist():
+        apart = np.linalg.norm((places[expected] - places[k]).reshape(-1, 2, 2), axis=2).max(axis=1, initial=0.0)
+        if not len(expected) or not (apart <= 1.0).any():
+            expected.append(k)
+    assert distinct(places, costs, 1.0).tolist() == sorted(expected)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 150), st.integers(1, 40))
+def test_limits_hide_what_lies_outside(seed, count0, count1):
+    rng = np.random.default_rng(seed)
+    d0 = descriptors(rng, count0, 0)
+    d1 = descriptors(rng, count1, 60, d0)
+    forms, places = rng.normal(size=(count0, 2, 3)) * [0.02, 0.02, 1.0], rng.uniform(0, 50, (count1, 2))
+    inside = (np.abs(forms @ np.column_stack([places, np.ones(count1)]).T) <= 1.0).all(axis=1)
+    rows, columns, ratios = mutual_nearest(
+        d0, d1, np.arange(count0), np.arange(count1), ratio=1.0, limits=Limits(forms, places)
+    )
+    squared = np.where(inside, ((d0[:, None].astype(int) - d1[None]) ** 2).sum(axis=2).astype(float), np.inf)
+    assert inside[rows, columns].all()
+    mutual = [
+        (i, int(row.argmin()))
+        for i, row in enumerate(squared)
+        if np.isfinite(row.min()) and squared[:, row.argmin()].argmin() == i
+    ]
+    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == mutual
+    second = np.sort(np.pad(squared[rows], ((0, 0), (0, 1)), constant_values=np.inf), axis=1)[:, 1]
+    assert np.allclose(ratios, np.sqrt(squared[rows, columns] / second))
+
+
+def test_views_of_like_direction_are_compared():
+    down, tilted = [0.0, 0.0, -1.0], [np.sin(0.6), 0.0, -np.cos(0.6)]
+    one = features(np.zeros((0, 128), np.uint8))
+
+    def seen(directions, gsd_m, angles_deg):
+        arrays = (np.array(values, np.float32) for values in (directions, gsd_m, angles_deg))
+        return replace(one, **dict(zip(("view_directions", "view_gsd_m", "view_angles_deg"), arrays, strict=True)))
+
+    nan = np.nan
+    first = seen([tilted, down, tilted], [nan, 0.1, 0.1], [0.0, 34.0, 0.0])
+    second = seen([down, down], [nan, 0.2], [0.0, 0.0])
+    # Source with source whatever their directions, the ground view with the ground view, the tilted one with none.
+    assert like_views(first, second, 5.0).tolist() == [[True, False], [False, True], [False, False]]
+    assert like_views(first, second, 40.0).tolist() == [[True, False], [False, True], [False, True]]
+    unknown = seen([[nan] * 3], [nan], [0.0])
+    assert like_views(first, unknown, 5.0).all()
+
+
+def test_view_pairs_say_which_views_found_a_match():
+    rng = np.random.default_rng(4)
+    base = descriptors(rng, 40, 0)
+    views = {
+        "view_idx": (np.arange(40) >= 20).astype(np.int32),
+        "view_directions": np.array([[0, 0, -1], [0.6, 0, -0.8]], np.float32),
+        "view_gsd_m": np.array([0.1, 0.1], np.float32),
+        "view_angles_deg": np.array([0.0, 37.0], np.float32),
+        "view_sizes_px": np.array([[100, 80]] * 2, np.int32),
+    }
+    matches = Nearest()(replace(features(base), **views), replace(features(base), **views), GEOMETRY)
+    assert len(matches.indices) == 40
+    assert matches.view_pairs.tolist() == [[0, 0]] * 20 + [[1, 1]] * 20
 
 
 def test_the_table_names_its_classes():

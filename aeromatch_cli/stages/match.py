@@ -39,7 +39,7 @@ def pair_fingerprint(context: Context, pair: Pair) -> str:
     """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
     matcher = context.settings.match
     sides = [
-        (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.needs))
+        (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
         for i in (pair.image_id0, pair.image_id1)
     ]
     return fingerprint(matcher, sides)

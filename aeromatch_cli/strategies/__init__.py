@@ -39,6 +39,10 @@ class Strategy(BaseModel):
     needs: ClassVar[frozenset[str]] = frozenset()
     verifies: ClassVar[bool] = True
 
+    def reads(self) -> frozenset[str]:
+        """Those of `needs` that this very recipe reads: fewer where an option leaves some out."""
+        return self.needs
+
     def fingerprint_files(self) -> tuple[str, ...]:
         """Paths of files (weights) whose contents are part of the recipe."""
         return ()
@@ -82,10 +86,18 @@ class Simulator(Protocol):
 
 
 class Extractor(Protocol):
-    """colours: whether the stage adds the colour around every keypoint to the features."""
+    """colours: whether the stage adds the colour around every keypoint to the features.
+    follows_north: whether what it makes of a view that has north up is only comparable with such views.
+    with_room_for: the same for images that get further views only because other images have no attitude.
+    """
 
     @property
     def colours(self) -> bool: ...
+
+    @property
+    def follows_north(self) -> bool: ...
+
+    def with_room_for(self, views: int) -> Extractor: ...
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features: ...
 

@@ -1,189 +1,123 @@
-"""Mutual nearest neighbours with the ratio test: the classical matcher, exact to the bit on any machine.
-
-RootSIFT descriptors are bytes, so every dot product is an integer that 32 bits hold exactly: an 8-bit integer product
-(where the processor has one) and float32 BLAS (sums below 2^24) give the same numbers whatever the library does.
-Source: Lowe, IJCV 2004, section 7.1 (ratio); Arandjelovic and Zisserman, CVPR 2012 (RootSIFT).
-"""
+"""Mutual nearest neighbours with the ratio test over views of like direction: the classical matcher."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry
+from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, Matches, PairGeometry
+from aeromatch_cli.geometry.cameras import undistort
+from aeromatch_cli.geometry.prediction import Windows, search_windows
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.matchers.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
+from aeromatch_cli.strategies.matchers.guided import Found, search_again
+from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.views import like_views
 
-# Rows of the score matrix at a time: 128 x 4000 values stay in a core's own cache for all passes over them.
-_BLOCK_ROWS = 128
-_SHIFT = 128
-_COMPONENTS_EXACT = 128  # 2 x 128 x 255^2 < 2^24: up to here float32 sums of byte products are exact
-
-Multiply = Callable[[int, int, NDArray[Any]], NDArray[Any]]
+# Matches closer than this in both images are one.
+_SAME_MATCH_PX = 1.0
 
 
 class Nearest(Strategy):
-    """Mutual nearest neighbours over all descriptors of both images, at most one match per keypoint."""
+    """Mutual nearest neighbours between views of like direction, at most one match per keypoint.
 
-    version: ClassVar[int] = 1
+    guided: where both attitudes and the ground are known, a keypoint of image 0 is only compared with those of image 1
+    that lie where the poses and their sigma put it; then, whatever is known, around the places that the verified
+    matches predict (`matchers.guided`).
+    """
+
+    version: ClassVar[int] = 2
+    needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
     name: Literal["nearest"] = "nearest"
     ratio: float = Field(
         0.8, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
     )
     ratio_both: bool = Field(False, description="The ratio must hold from image 1's side as well.")
+    max_direction_deg: float = Field(
+        5.0, ge=0.0, le=180.0, description="Simulated views whose directions are farther apart are not compared."
+    )
+    guided: bool = Field(
+        False, description="Search where the poses say, then once more around what verified matches predict."
+    )
+    sigmas: float = Field(3.0, gt=0.0, description="Guided: half-width of the window in predicted standard deviations.")
+    sigma_px: float = Field(1.5, gt=0.0, description="Guided: standard deviation of a keypoint, pixels.")
+    relief: float = Field(
+        0.3, gt=0.0, lt=1.0, description="Guided: how far things rise over or fall below the ground, in flying heights."
+    )
+
+    def reads(self) -> frozenset[str]:
+        """Nothing of the geometry, unless guided."""
+        return self.needs if self.guided else frozenset()
 
     def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches:
-        """Matches of one pair, sorted by keypoint of image 0; geometry is not used. Scores are 1 - d1/d2."""
-        rows, columns, ratios = mutual_nearest(
-            features0.descriptors,
-            features1.descriptors,
-            features0.descriptor_keypoint_idx,
-            features1.descriptor_keypoint_idx,
-            ratio=self.ratio,
-            ratio_both=self.ratio_both,
+        """Matches of one pair, sorted by keypoint of image 0.
+
+        Scores are 1 - d1/d2, or 1 - cost where a model guided the search.
+        """
+        windows = self._windows(features0, geometry) if self.guided else None
+        limits = None
+        if windows is not None:
+            limits = Limits(windows.forms(), undistort(geometry.camera1, features1.keypoints_px))
+        alike = like_views(features0, features1, self.max_direction_deg)
+        found = self._scan(features0, features1, alike, limits)
+        if self.guided:
+            found = search_again(found, features0, features1, geometry, alike, windows)
+        return _matches(found, features0, features1)
+
+    def _windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
+        """Where every keypoint of image 0 may lie in image 1, None where that is unknown."""
+        pose0, pose1, ground_z_m = geometry.pose0, geometry.pose1, geometry.ground_z_m
+        if pose0 is None or pose1 is None or ground_z_m is None:
+            return None
+        heights_m = [float(pose.center_m[2]) - ground_z_m for pose in (pose0, pose1)]
+        if pose0.world_rotation is None or pose1.world_rotation is None or min(heights_m) <= 0.0:
+            return None
+        return search_windows(
+            features0.keypoints_px,
+            geometry.camera0,
+            pose0,
+            geometry.camera1,
+            pose1,
+            ground_z_m,
+            relief_m=self.relief * min(heights_m),
+            sigmas=self.sigmas,
+            sigma_px=self.sigma_px,
         )
-        idx0, idx1 = features0.descriptor_keypoint_idx[rows], features1.descriptor_keypoint_idx[columns]
-        kept = one_to_one(idx0, idx1, ratios)
-        kept = kept[np.argsort(idx0[kept], kind="stable")]
-        rows, columns = rows[kept], columns[kept]
-        return Matches(
-            indices=np.stack([idx0[kept], idx1[kept]], axis=1).astype(np.int32),
-            scores=(1.0 - ratios[kept]).astype(np.float32),
-            view_pairs=np.stack([features0.view_idx[rows], features1.view_idx[columns]], axis=1).astype(np.int16),
-        )
+
+    def _scan(self, features0: Features, features1: Features, alike: BoolArray, limits: Limits | None) -> Found:
+        """Matches of all view pairs that are alike, costs d1/d2."""
+        nothing = np.zeros(0, np.int64)
+        parts: list[tuple[IntArray, IntArray, FloatArray]] = [(nothing, nothing, np.zeros(0))]
+        for view0, view1 in np.argwhere(alike):
+            of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
+            keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
+            rows, columns, ratios = mutual_nearest(
+                features0.descriptors[of0],
+                features1.descriptors[of1],
+                keypoints0,
+                keypoints1,
+                ratio=self.ratio,
+                ratio_both=self.ratio_both,
+                limits=None if limits is None else Limits(limits.forms[keypoints0], limits.places[keypoints1]),
+            )
+            parts.append((of0[rows], of1[columns], ratios))
+        return Found(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def mutual_nearest(
-    descriptors0: NDArray[Any],
-    descriptors1: NDArray[Any],
-    keypoint_idx0: IntArray,
-    keypoint_idx1: IntArray,
-    *,
-    ratio: float,
-    ratio_both: bool = False,
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Descriptor rows, columns (int64) and ratios d1/d2 (float64) of mutual nearest neighbours that pass the ratio.
-
-    descriptors (D0, C), (D1, C): both uint8 or both float32. The runner-up d2 belongs to another keypoint than the
-    nearest; without one the ratio is 0. On equal distances the lower index wins.
-    """
-    if len(descriptors0) == 0 or len(descriptors1) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
-    nearest, best, second, column_best = _scan(descriptors0, descriptors1, keypoint_idx1)
-    ratios = _ratios(best, second)
-    rows = np.flatnonzero((best == column_best[nearest]) & (ratios < ratio))
-    # Two rows may be equally near to one column: the first keeps it.
-    _, first = np.unique(nearest[rows], return_index=True)
-    rows = rows[np.sort(first)]
-    if ratio_both and len(rows):
-        back = _scan(descriptors1[nearest[rows]], descriptors0, keypoint_idx0)
-        ratios_back = _ratios(back[1], back[2])
-        ratios[rows] = np.maximum(ratios[rows], ratios_back)
-        rows = rows[ratios_back < ratio]
-    return rows, nearest[rows], ratios[rows]
-
-
-def _ratios(best: NDArray[Any], second: NDArray[Any]) -> FloatArray:
-    """d1/d2 (float64) of negated squared distances; 0 where there is no second, 1 where both are 0."""
-    near, far = np.maximum(-best.astype(np.float64), 0.0), np.maximum(-second.astype(np.float64), 0.0)
-    ratio = np.sqrt(np.divide(near, far, out=np.ones_like(near), where=far > 0))
-    ratio[second == _lowest(second.dtype)] = 0.0
-    return ratio
-
-
-def _lowest(dtype: np.dtype[Any]) -> Any:
-    return np.iinfo(dtype).min if np.issubdtype(dtype, np.integer) else -np.inf
-
-
-def _scan(
-    queries: NDArray[Any], targets: NDArray[Any], target_keypoint_idx: IntArray
-) -> tuple[IntArray, NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """One pass over the score matrix s = -|q - t|^2, block by block.
-
-    Returns the nearest target of each query (Q,), its score, the best score of another keypoint (Q,) and the best
-    score of each target (T,).
-    """
-    multiply, norms_q, norms_t, dtype = _product(queries, targets)
-    # Descriptors of one keypoint side by side, so that the nearest one's siblings are a short run of columns.
-    run_start, run_length = _runs(target_keypoint_idx)
-    nearest = np.empty(len(queries), np.int64)
-    best: NDArray[Any] = np.empty(len(queries), dtype)
-    second: NDArray[Any] = np.empty(len(queries), dtype)
-    column_best: NDArray[Any] = np.full(len(targets), _lowest(np.dtype(dtype)), dtype)
-    for start in range(0, len(queries), _BLOCK_ROWS):
-        stop = min(start + _BLOCK_ROWS, len(queries))
-        scores = multiply(start, stop, norms_t)
-        scores -= norms_q[start:stop, None]
-        rows = np.arange(stop - start)
-        at = scores.argmax(axis=1)
-        nearest[start:stop], best[start:stop] = at, scores[rows, at]
-        np.maximum(column_best, scores.max(axis=0), out=column_best)
-        for k in range(int(run_length[at].max())):
-            scores[rows, run_start[at] + np.minimum(k, run_length[at] - 1)] = _lowest(scores.dtype)
-        second[start:stop] = scores.max(axis=1)
-    return nearest, best, second, column_best
-
-
-def _runs(keypoint_idx: IntArray) -> tuple[IntArray, IntArray]:
-    """Start and length, per descriptor, of the run of equal keypoint numbers it lies in (extractors write runs)."""
-    starts = np.flatnonzero(np.concatenate([[True], keypoint_idx[1:] != keypoint_idx[:-1]]))
-    lengths = np.diff(np.append(starts, len(keypoint_idx)))
-    return np.repeat(starts, lengths), np.repeat(lengths, lengths)
-
-
-def _product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
-    """How to compute 2 q.t - |t|^2 for a block of queries, with the squared norms and the type of the result."""
-    are_bytes = queries.dtype == np.uint8 and targets.dtype == np.uint8 and queries.shape[1] <= _COMPONENTS_EXACT
-    if are_bytes and _has_integer_product():
-        return _integer_product(queries, targets)
-    q, t = queries.astype(np.float32), targets.astype(np.float32)
-    transposed = t.T
-    buffer = np.empty((min(_BLOCK_ROWS, len(q)), len(t)), np.float32)
-
-    def multiply(start: int, stop: int, norms: NDArray[Any]) -> NDArray[Any]:
-        block = buffer[: stop - start]
-        np.matmul(q[start:stop], transposed, out=block)
-        block += block
-        block -= norms
-        return block
-
-    return multiply, (q * q).sum(axis=1), (t * t).sum(axis=1), np.float32
-
-
-def _integer_product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
-    """The same on signed bytes: distances do not change when both sides are shifted by 128."""
-    import torch
-
-    q, t = ((x.astype(np.int16) - _SHIFT).astype(np.int8) for x in (queries, targets))
-    q_torch, t_torch = torch.from_numpy(q), torch.from_numpy(t).T
-    buffer_torch = torch.empty((min(_BLOCK_ROWS, len(q)), len(t)), dtype=torch.int32)
-    buffer = buffer_torch.numpy()
-
-    def multiply(start: int, stop: int, norms: NDArray[Any]) -> NDArray[Any]:
-        torch._int_mm(q_torch[start:stop], t_torch, out=buffer_torch[: stop - start])
-        block: NDArray[Any] = buffer[: stop - start]
-        block += block
-        block -= norms
-        return block
-
-    norms = [np.einsum("ij,ij->i", x, x, dtype=np.int32) for x in (q, t)]
-    return multiply, norms[0], norms[1], np.int32
-
-
-@cache
-def _has_integer_product() -> bool:
-    """Whether this processor multiplies bytes fast, and does so without saturating: tried once on extreme values."""
-    import torch
-
-    supported = getattr(torch.cpu, "_is_vnni_supported", None)
-    if supported is None or not supported() or not hasattr(torch, "_int_mm"):
-        return False
-    extremes = np.where(np.arange(32 * 128).reshape(32, 128) % 3 == 0, 127, -128).astype(np.int8)
-    product = torch._int_mm(torch.from_numpy(extremes), torch.from_numpy(extremes).T).numpy()
-    wide = extremes.astype(np.int64)
-    return bool(np.array_equal(product, wide @ wide.T))
+def _matches(found: Found, features0: Features, features1: Features) -> Matches:
+    """The cheapest matches in which each keypoint occurs once, and no two lie together in both images."""
+    idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+    kept = one_to_one(idx0, idx1, found.costs)
+    places: FloatArray = np.concatenate(
+        [features0.keypoints_px[idx0[kept]], features1.keypoints_px[idx1[kept]]], axis=1, dtype=np.float64
+    )
+    kept = kept[distinct(places, found.costs[kept], _SAME_MATCH_PX)]
+    kept = kept[np.argsort(idx0[kept], kind="stable")]
+    rows, columns = found.rows[kept], found.columns[kept]
+    return Matches(
+        indices=np.stack([idx0[kept], idx1[kept]], axis=1).astype(np.int32),
+        scores=(1.0 - found.costs[kept]).astype(np.float32),
+        view_pairs=np.stack([features0.view_idx[rows], features1.view_idx[columns]], axis=1).astype(np.int16),
+    )

@@ -1,0 +1,250 @@
+"""A second search around the places that verified matches predict: a point instead of a line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, Camera, Features, FloatArray, IntArray, PairGeometry
+from aeromatch_cli.geometry.cameras import undistort
+from aeromatch_cli.geometry.epipolar import sampson_distance_px
+from aeromatch_cli.geometry.prediction import Windows, inverse_depths, places_of_heights, stereo_of
+from aeromatch_cli.geometry.two_view import Sampling, TwoView, chance_errors_px, estimate, log10_false_alarms
+
+# Fewer matches support no first model, whatever the odds that chance gives it.
+_MIN_INLIERS = 12
+_LOG10_FALSE_ALARMS = -3.0
+_MODEL_PX = 4.0
+# Matches around a point whose heights are tried.
+_NEIGHBOURS = 6
+# Predicting and searching: what is found predicts once more.
+_ROUNDS = 2
+# Standard deviations of true matches: Sampson distance and distance to the nearest predicted place, pixels; octaves
+# between both sizes beyond those of the matches around; distance of descriptors over the one that wrong pairs have.
+_LINE_PX, _PLACE_PX, _SIZE_OCTAVES, _LOOK = 0.7, 1.0, 0.2, 0.4
+# Sum of the four squares that 95 % of the true matches stay below (chi-square).
+_LARGEST_COST = 9.49
+# Share of random keypoint pairs that look at most as different as "wrong pairs have".
+_CHANCE = 0.02
+_DRAWS = 8192
+_TRIALS = 16
+_CHUNK = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Matches as descriptors (N,) of either image, with costs in 0-1, smaller is better."""
+
+    rows: IntArray
+    columns: IntArray
+    costs: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One image as the search sees it. places_px: (K, 2) undistorted. first, count: (K,) run of its descriptors."""
+
+    features: Features
+    places_px: FloatArray
+    first: IntArray
+    count: IntArray
+
+
+def search_again(
+    found: Found,
+    features0: Features,
+    features1: Features,
+    geometry: PairGeometry,
+    alike: BoolArray,
+    windows: Windows | None = None,
+) -> Found:
+    """Matches around the places that a verified model and the heights of its matches predict, instead of those found.
+
+    A match needs that its epipolar line, a place predicted by other matches, its size and its looks agree together.
+    Unchanged where `found` supports no model beyond chance. alike: (V0, V1) views that are compared. windows:
+    where each keypoint of image 0 was searched, None for everywhere.
+    """
+    side0, side1 = side_of(features0, geometry.camera0), side_of(features1, geometry.camera1)
+    wrong = distance_of_wrong_pairs(side0, side1, alike)
+    for _ in range(_ROUNDS):
+        idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+        model = verified(side0.places_px[idx0], side1.places_px[idx1], geometry, windows and windows.take(idx0))
+        if model is None or wrong == 0.0:
+            break
+        places_px, octaves = predicted(side0, side1, idx0[model.inliers], idx1[model.inliers], model, geometry)
+        found = around(side0, side1, places_px, octaves, model, alike, wrong)
+    return found
+
+
+def side_of(features: Features, camera: Camera) -> Side:
+    """Needs the descriptors of a keypoint side by side, as extractors write them."""
+    count = np.bincount(features.descriptor_keypoint_idx, minlength=len(features.keypoints_px))
+    return Side(features, undistort(camera, features.keypoints_px), np.cumsum(count) - count, count)
+
+
+def verified(
+    points0_px: FloatArray, points1_px: FloatArray, geometry: PairGeometry, windows: Windows | None
+) -> TwoView | None:
+    """A relative pose beyond chance of matches (N, 2), undistorted pixels, searched in windows (N) or everywhere."""
+    usable: BoolArray = np.asarray(np.isfinite(points0_px + points1_px).all(axis=1))
+    if usable.sum() < _MIN_INLIERS:
+        return None
+    points0, points1 = points0_px[usable], points1_px[usable]
+    found = estimate(points0, points1, geometry, "relative_pose", Sampling(_MODEL_PX), 0)
+    if found.inliers.sum() < _MIN_INLIERS:
+        return None
+
+    def distance(a: FloatArray, b: FloatArray) -> FloatArray:
+        return sampson_distance_px(found.pixel_model, a, b)
+
+    if windows is None:
+        errors = chance_errors_px(distance, points0, points1)
+    else:
+        # A wrong match lies anywhere in its window.
+        wrong0, wrong1 = np.tile(points0_px, (_TRIALS, 1)), windows.sample(_TRIALS, np.random.default_rng(0))
+        seen = np.isfinite(wrong0 + wrong1).all(axis=1)
+        errors = distance(wrong0[seen], wrong1[seen])
+    if log10_false_alarms(points0, points1, found.inliers, errors, _MODEL_PX, found.sample) > _LOG10_FALSE_ALARMS:
+        return None
+    inliers: BoolArray = np.zeros(len(usable), dtype=np.bool_)
+    inliers[usable] = found.inliers
+    return replace(found, inliers=inliers)
+
+
+def predicted(
+    side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, model: TwoView, geometry: PairGeometry
+) -> tuple[FloatArray, FloatArray]:
+    """From matches idx0, idx1 (M,): places (K0, Q, 2) in image 1 of all keypoints of image 0, as high as each of the Q
+    nearest matches of other keypoints, and octaves (K0,) that things grow by around there.
+    """
+    from scipy.spatial import cKDTree
+
+    usable = np.flatnonzero(np.isfinite(side0.places_px).all(axis=1))
+    count = min(_NEIGHBOURS + 1, len(idx0))
+    known0, known1 = side0.places_px[idx0], side1.places_px[idx1]
+    nearest = np.zeros((len(side0.places_px), count), np.int64)
+    nearest[usable] = cKDTree(known0).query(side0.places_px[usable], k=count)[1].reshape(-1, count)
+    # No match confirms itself: it goes last, and the last one is dropped.
+    itself = idx0[nearest] == np.arange(len(nearest))[:, None]
+    nearest = np.take_along_axis(nearest, np.argsort(itself, axis=1, kind="stable"), axis=1)[:, :-1]
+    pose = geometry.pose0
+    up = None if pose is None or pose.world_rotation is None else np.asarray(pose.world_rotation)[:, 2]
+    stereo = stereo_of(model.model, np.asarray(model.rotation), geometry.camera0, geometry.camera1, up)
+    inverse = inverse_depths(stereo, known0, known1)
+    places_px = places_of_heights(stereo, side0.places_px, known0[nearest], inverse[nearest])
+    steps = _octaves(side0, side1, idx0, idx1)
+    return places_px, np.median(steps[nearest], axis=1)
+
+
+def _octaves(side0: Side, side1: Side, idx0: IntArray, idx1: IntArray) -> FloatArray:
+    """Size of keypoints of image 1 over those of image 0, (N,) as logarithms to base 2."""
+    return np.asarray(np.log2(side1.features.sizes_px[idx1].astype(np.float64) / side0.features.sizes_px[idx0]))
+
+
+def around(
+    side0: Side,
+    side1: Side,
+    places_px: FloatArray,
+    octaves: FloatArray,
+    model: TwoView,
+    alike: BoolArray,
+    wrong: float,
+) -> Found:
+    """Mutually best matches near the predicted places (K0, Q, 2) and sizes (K0,), by the sum of what disagrees."""
+    idx0, idx1 = nearby(places_px, side1.places_px, _PLACE_PX * np.sqrt(_LARGEST_COST))
+    errors_px = sampson_distance_px(model.pixel_model, side0.places_px[idx0], side1.places_px[idx1])
+    apart_px = np.linalg.norm(places_px[idx0] - side1.places_px[idx1][:, None], axis=2)
+    apart_px = np.where(np.isfinite(apart_px), apart_px, np.inf).min(axis=1)
+    steps = _octaves(side0, side1, idx0, idx1) - octaves[idx0]
+    costs = (errors_px / _LINE_PX) ** 2 + (apart_px / _PLACE_PX) ** 2 + (steps / _SIZE_OCTAVES) ** 2
+    idx0, idx1, costs = (values[costs <= _LARGEST_COST] for values in (idx0, idx1, costs))
+    distances, rows, columns = closest(side0, side1, idx0, idx1, alike)
+    costs = costs + (distances / (_LOOK * wrong)) ** 2
+    best = (costs <= _LARGEST_COST) & is_cheapest(idx0, costs) & is_cheapest(idx1, costs)
+    return Found(rows[best], columns[best], costs[best] / _LARGEST_COST)
+
+
+def nearby(places_px: FloatArray, points1_px: FloatArray, radius_px: float) -> tuple[IntArray, IntArray]:
+    """Row of places (N, Q, 2) and point of (M, 2) of all that are closer than the radius, each once, sorted.
+
+    Points are sorted by square cells of twice the radius, row by row: what is near a place lies in two runs of them.
+    """
+    row, column = np.nonzero(np.isfinite(places_px).all(axis=2))
+    usable = np.flatnonzero(np.isfinite(points1_px).all(axis=1))
+    if not len(row) or not len(usable):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    origin, side = points1_px[usable].min(axis=0) - 2.0 * radius_px, 2.0 * radius_px
+    shape = np.floor((points1_px[usable].max(axis=0) - origin) / side).astype(np.int64) + 2
+
+    def cells(points_px: FloatArray) -> IntArray:
+        return np.asarray(np.clip(np.floor((points_px - origin) / side), -1, shape), np.int64)
+
+    codes = cells(points1_px[usable]) @ [1, shape[0]]
+    order = np.argsort(codes, kind="stable")
+    codes, usable = codes[order], usable[order]
+    places = places_px[row, column]
+    low, high = cells(places - radius_px), cells(places + radius_px)
+    found = []
+    for lines in (low[:, 1], high[:, 1]):
+        first = np.searchsorted(codes, np.maximum(low[:, 0], 0) + lines * shape[0], side="left")
+        last = np.searchsorted(codes, np.minimum(high[:, 0], shape[0] - 1) + lines * shape[0], side="right")
+        lengths = np.maximum(last - first, 0)
+        asked = np.repeat(np.arange(len(row)), lengths)
+        at = np.arange(len(asked)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + first[asked]
+        near = ((places[asked] - points1_px[usable[at]]) ** 2).sum(axis=1) <= radius_px**2
+        found.append(row[asked[near]] * len(points1_px) + usable[at[near]])
+    code = np.unique(np.concatenate(found))
+    return code // len(points1_px), code % len(points1_px)
+
+
+def closest(
+    side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, alike: BoolArray
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Smallest descriptor distance (N,) of keypoint pairs (N,) over views that are alike (infinite without any) and
+    the descriptors (N,), (N,) of it."""
+    distance, row, column = np.full(len(idx0), np.inf), np.zeros(len(idx0), np.int64), np.zeros(len(idx0), np.int64)
+    widest = int((side0.count[idx0] * side1.count[idx1]).max(initial=0))
+    for k in range(widest):
+        # The k-th combination of both keypoints' descriptors, of the pairs that have so many.
+        at = np.flatnonzero(side0.count[idx0] * side1.count[idx1] > k)
+        d0 = side0.first[idx0[at]] + k // side1.count[idx1[at]]
+        d1 = side1.first[idx1[at]] + k % side1.count[idx1[at]]
+        allowed = alike[side0.features.view_idx[d0], side1.features.view_idx[d1]]
+        at, d0, d1 = at[allowed], d0[allowed], d1[allowed]
+        measured = descriptor_distances(side0.features, side1.features, d0, d1)
+        nearer = measured < distance[at]
+        at = at[nearer]
+        distance[at], row[at], column[at] = measured[nearer], d0[nearer], d1[nearer]
+    return distance, row, column
+
+
+def descriptor_distances(features0: Features, features1: Features, rows: IntArray, columns: IntArray) -> FloatArray:
+    """Euclidean distances (N,) of descriptors."""
+    squared = np.empty(len(rows))
+    for start in range(0, len(rows), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        apart = features0.descriptors[rows[part]].astype(np.float32)
+        apart -= features1.descriptors[columns[part]]
+        squared[part] = np.einsum("ij,ij->i", apart, apart)
+    return np.sqrt(squared)
+
+
+def distance_of_wrong_pairs(side0: Side, side1: Side, alike: BoolArray) -> float:
+    """Distance that one in fifty random keypoint pairs stays below: how much alike things of this place look anyway."""
+    count0, count1 = len(side0.count), len(side1.count)
+    if not min(count0, count1):
+        return 0.0
+    rng = np.random.default_rng(0)
+    draws = [rng.integers(0, count, _DRAWS) for count in (count0, count1)]
+    distances, _, _ = closest(side0, side1, draws[0], draws[1], alike)
+    known = distances[np.isfinite(distances)]
+    return float(np.quantile(known, _CHANCE)) if len(known) else 0.0
+
+
+def is_cheapest(groups: IntArray, costs: FloatArray) -> BoolArray:
+    """Whether each (N,) is the first of the cheapest of its group."""
+    order = np.lexsort((costs, groups))
+    flags = np.zeros(len(order), dtype=bool)
+    flags[order[np.unique(groups[order], return_index=True)[1]]] = True
+    return flags
