@@ -6,7 +6,20 @@ from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import apply_chain as apply_chain
+from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
+from aeromatch_cli.strategies.filters.colour import Colour
+from aeromatch_cli.strategies.filters.epipolar import Epipolar
+from aeromatch_cli.strategies.filters.homography import Homography
+from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.pose import PoseBand
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
-FILTERS: Mapping[str, type[Strategy]] = {"poselib": Poselib, "pose": PoseBand}
+FILTERS: Mapping[str, type[Strategy]] = {
+    "poselib": Poselib,
+    "pose": PoseBand,
+    "colour": Colour,
+    "clustered-ransac": ClusteredRansac,
+    "epipolar": Epipolar,
+    "homography": Homography,
+    "magsac": Magsac,
+}

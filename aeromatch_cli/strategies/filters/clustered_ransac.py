@@ -1,0 +1,82 @@
+"""K-means clustered RANSAC: matches are clustered, and each cluster explained by planes of its own.
+
+Source: J. Geo-inf. Sci. 2025(6), 1401-1419; the mathematics stands in geometry.planes.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from aeromatch_cli.data import BoolArray, Candidates, PairGeometry, Verdict
+from aeromatch_cli.geometry.planes import Planes, fit_planes
+from aeromatch_cli.geometry.two_view import undistorted
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.filters.colour import dominant_colours
+
+# Without colours: matches for each cluster.
+_MATCHES_PER_CLUSTER = 64
+
+
+class ClusteredRansac(Strategy):
+    """Keeps a match if a plane of its own or a nearby cluster explains it, or if its neighbours move as it does.
+
+    The number of clusters follows the colour content: dominant colours of the matched places in image 0 (see
+    `colour.dominant_colours`), or one per 64 matches where the extractor keeps no colours; never so many that they
+    hold less than 24 matches on average. Small structures, trees and facades that make no plane are kept by local
+    support. Where planes and support do not explain min_inliers matches there is too little to judge by: everything is
+    left to the filters after this one, and the verdict is "not verifiable".
+    """
+
+    version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
+    name: Literal["clustered-ransac"] = "clustered-ransac"
+    clusters: int = Field(0, ge=0, description="Clusters at most; 0 = as many as dominant colours.")
+    planes: int = Field(3, ge=1, description="Planes of one cluster at most, found one after the other.")
+    threshold_px: float = Field(
+        3.0, gt=0.0, description="Largest distance to a plane, larger of both directions, undistorted pixels."
+    )
+    support: float = Field(
+        2.0, gt=0.0, description="Neighbours that must move with a match on no plane, weighted by how well (0-6)."
+    )
+    min_inliers: int = Field(15, ge=8, description="Fewer matches, or fewer explained ones, are not verifiable.")
+
+    def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
+        """The Verdict has the homography of the plane with most matches, and distances to each match's own plane."""
+        found, usable = self.find_planes(candidates, geometry, seed)
+        explained = (found.labels >= 0) | (found.support >= self.support)
+        if not len(found.homographies) or explained.sum() < self.min_inliers:
+            reason = f"{int(explained.sum())} of {len(usable)} matches lie on planes, {self.min_inliers} needed"
+            return Verdict(keep=usable, state="not verifiable", reason=reason)
+        keep = np.zeros(len(usable), dtype=bool)
+        keep[usable] = explained
+        errors = np.full(len(usable), np.nan, dtype=np.float32)
+        errors[usable] = np.where(np.isfinite(found.residuals_px), found.residuals_px, np.nan)
+        largest = np.bincount(found.labels[found.labels >= 0], minlength=1).argmax()
+        return Verdict(
+            keep=keep,
+            state="verified",
+            model_kind="H",
+            model=found.homographies[largest],
+            errors_px=errors,
+        )
+
+    def find_planes(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> tuple[Planes, BoolArray]:
+        """The planes among the matches that have undistorted pixels, and which of those given (M,) these are."""
+        points0, points1, usable = undistorted(candidates.points0_px, candidates.points1_px, geometry)
+        found = fit_planes(
+            points0,
+            points1,
+            clusters=self.clusters or self._clusters_by_content(candidates),
+            planes_per_cluster=self.planes,
+            threshold_px=self.threshold_px,
+            seed=seed,
+        )
+        return found, usable
+
+    def _clusters_by_content(self, candidates: Candidates) -> int:
+        if candidates.colours0 is None:
+            return max(1, len(candidates) // _MATCHES_PER_CLUSTER)
+        return dominant_colours(candidates.colours0)
