@@ -16,7 +16,8 @@ pairs.csv       image_id0, image_id1 (id0 < id1), overlap (0-1), view_angle_deg,
 failures.csv    stage, item, reason
 distrusted.json images whose attitude contradicts the pictures: fingerprint (of all that the judgement rests on),
                 settings (fingerprint of the strategies), images: image_id -> angle_deg, facts (fingerprint of the
-                image and its pose)
+                image and its pose); suspects: image_id -> facts, of images that no verified pair ties to those that
+                they overlap with: they and their neighbours are also matched as they were taken
 
 enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json: fingerprint, picture
                              (whether the picture is kept), and the facts that the strategy states.

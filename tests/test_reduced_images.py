@@ -50,7 +50,7 @@ def extracted(root: Path, max_size_px: int) -> Features:
     workspace.create()
     context = Context(settings, workspace, Executor("serial"), known, (), {"blobs": "print"}, {})
     task = extract.make_task(context, image)
-    assert extract.run_task(task) > 0
+    assert extract.run_task(task).keypoints > 0
     return read_features(task.path)
 
 

@@ -6,7 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -65,6 +65,8 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given_poses: Mapping[str, Pose]
     guessed_cameras: frozenset[str] = frozenset()
+    # Images that no match ties to their surroundings although their poses say so (`stages.distrust`).
+    suspects: frozenset[str] = frozenset()
     shard: Shard | None = None
     overwrite: bool = False
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
@@ -107,10 +109,22 @@ class Context:
             pair=pair,
             camera0=self.block.camera(images[pair.image_id0]),
             camera1=self.block.camera(images[pair.image_id1]),
-            pose0=self.pose(pair.image_id0),
-            pose1=self.pose(pair.image_id1),
+            pose0=self._believed(pair.image_id0),
+            pose1=self._believed(pair.image_id1),
             ground_z_m=sum(heights) / len(heights) if heights else None,
         )
+
+    def _believed(self, image_id: str) -> Pose | None:
+        """The pose by which matches are searched and limited: of a suspect only where it was."""
+        pose = self.pose(image_id)
+        return replace(pose, world_rotation=None) if pose is not None and image_id in self.suspects else pose
+
+    def lacks_north(self, image_id: str) -> bool:
+        """Whether an image, or one that it is paired with, has no attitude to be trusted: what turns its north up
+        cannot be compared with it, the picture as it was taken can."""
+        ids = (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))
+        poses = [self._believed(i) for i in ids]
+        return any(pose is None or pose.world_rotation is None for pose in poses)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
         """Where else the ground of an image is looked at from: the images it is paired with that have an attitude."""
@@ -136,6 +150,8 @@ class Context:
             parts["camera"] = self.block.camera(self.image_by_id[image_id])
         if "pose" in needs:
             parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
+        if "pose" in needs and image_id in self.suspects:
+            parts["suspect"] = True
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:

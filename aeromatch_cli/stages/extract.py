@@ -42,11 +42,20 @@ def make_task(context: Context, image: Image) -> ExtractTask:
     settings = context.settings
     geometry = context.geometry_fingerprint(image.image_id, settings.extract.needs)
     own = fingerprint(views.fingerprint, settings.extract, geometry)
-    return ExtractTask(views, settings.extract, settings.run.keep_images, own)
+    extractor = settings.extract.with_room_for(1) if views.as_taken else settings.extract
+    return ExtractTask(views, extractor, settings.run.keep_images, own)
 
 
-def run_task(task: ExtractTask) -> int:
-    """Write features/<id>.npz; returns the number of keypoints."""
+@dataclass(frozen=True)
+class Extracted:
+    """What was found in one image, and what its views cost."""
+
+    keypoints: int
+    cost: simulate.ViewCost
+
+
+def run_task(task: ExtractTask) -> Extracted:
+    """Write features/<id>.npz."""
     pictures, enhancement = simulate.render(task.views)
     source = task.views.source
     camera = shrink_camera(source.camera, source.scale)
@@ -58,7 +67,7 @@ def run_task(task: ExtractTask) -> int:
     enhance.keep(source, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
-    return len(features.keypoints_px)
+    return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
 
 
 def _in_stored_frame(features: Features, scale: float) -> Features:
@@ -92,10 +101,12 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     todo = [task for task in tasks if context.overwrite or not _is_done(task)]
     report.items += len(tasks)
     report.skipped += len(tasks) - len(todo)
-    counts = run_stage(context, report, run_task, todo, [task.image_id for task in todo])
-    facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
-    if counts:
-        report.facts = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
+    made = run_stage(context, report, run_task, todo, [task.image_id for task in todo])
+    if made:
+        counts = [item.keypoints for item in made]
+        facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
+        summed = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
+        report.facts = summed | simulate.cost_facts([item.cost for item in made], report.facts)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 

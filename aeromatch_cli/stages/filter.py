@@ -169,7 +169,8 @@ def run(context: Context) -> StageReport:
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     report.facts = summarise(context)
     if context.shard is None:
-        report.facts["rotation_contradicts_pose"] = distrust.judge(context, _rotations(context))
+        judged = distrust.judge(context, _rotations(context), None if missing else _components(context))
+        report.facts["rotation_contradicts_pose"] = judged
     return report.write(context.workspace, context.shard)
 
 
@@ -209,7 +210,26 @@ def summarise(context: Context) -> dict[str, Any]:
     """States of the pairs, verified matches, connected components and weakly tied images."""
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()
-    matches, parent = 0, {image.image_id: image.image_id for image in context.block.images}
+    matches = 0
+    for pair, entry in verified_pairs(context):
+        states[entry.verdict.state] += 1
+        if entry.verdict.state == "verified":
+            count = len(entry.matches.indices)
+            matches += count
+            ties.update({pair.image_id0: count, pair.image_id1: count})
+    sizes = Counter(_components(context).values())
+    weak = sorted(image.image_id for image in context.block.images if ties[image.image_id] < WEAK_MATCHES)
+    return {
+        "pairs": dict(sorted(states.items())),
+        "verified_matches": matches,
+        "components": sorted(sizes.values(), reverse=True),
+        "weakly_tied": weak,
+    }
+
+
+def _components(context: Context) -> dict[str, str]:
+    """image_id -> the image that stands for all those that verified pairs connect with it."""
+    parent = {image.image_id: image.image_id for image in context.block.images}
 
     def root(image_id: str) -> str:
         while parent[image_id] != image_id:
@@ -218,17 +238,7 @@ def summarise(context: Context) -> dict[str, Any]:
         return image_id
 
     for pair, entry in verified_pairs(context):
-        states[entry.verdict.state] += 1
         if entry.verdict.state == "verified":
-            count = len(entry.matches.indices)
-            matches += count
-            ties.update({pair.image_id0: count, pair.image_id1: count})
-            parent[root(pair.image_id0)] = root(pair.image_id1)
-    sizes = Counter(root(image_id) for image_id in parent)
-    weak = sorted(image_id for image_id in parent if ties[image_id] < WEAK_MATCHES)
-    return {
-        "pairs": dict(sorted(states.items())),
-        "verified_matches": matches,
-        "components": sorted(sizes.values(), reverse=True),
-        "weakly_tied": weak,
-    }
+            roots = sorted((root(pair.image_id0), root(pair.image_id1)))
+            parent[roots[1]] = roots[0]
+    return {image_id: root(image_id) for image_id in parent}

@@ -105,10 +105,12 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
 
 def _report_turned(context: Context, judged: StageReport) -> None:
     """Images that lost their attitude in this very stage: their views, pairs and verdicts are out of date now."""
-    turned = _attitudes(context) - _attitudes(without_distrusted(replace(context, overwrite=False)))
-    if turned:
-        reason = "matches contradict its attitude: run `aeromatch run`, or match and filter again, to go on without it"
-        judged.failures += [(image_id, reason) for image_id in sorted(turned)]
+    trusted = without_distrusted(replace(context, overwrite=False))
+    remedy = "run `aeromatch run`, or match and filter again, to go on without it"
+    doubted = dict.fromkeys(trusted.suspects - context.suspects, f"nothing matches by its attitude: {remedy}")
+    turned = dict.fromkeys(_attitudes(context) - _attitudes(trusted), f"matches contradict its attitude: {remedy}")
+    if doubted or turned:
+        judged.failures += sorted({**doubted, **turned}.items())
         judged.write(context.workspace)
 
 
@@ -123,9 +125,10 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
             else again
         )
         trusted = without_distrusted(replace(context, overwrite=False))
-        if context.shard is not None or _attitudes(trusted) == _attitudes(context):
+        unchanged = _attitudes(trusted) == _attitudes(context) and trusted.suspects == context.suspects
+        if context.shard is not None or unchanged:
             break
-        log.info("attitudes of some images contradict the pictures; these images are done again without")
+        log.info("attitudes of some images contradict the pictures, or match nothing: these are done again without")
         context, first = pairs.prepare(context.settings, context.executor, shard=context.shard)
     reports = [first, *reports]
     if context.shard is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,18 +15,20 @@ from aeromatch_cli.images import render_view, shrink_camera, to_gray8, write_png
 from aeromatch_cli.stages import enhance
 from aeromatch_cli.stages.common import Context, StageReport, run_stage
 from aeromatch_cli.strategies import Simulator, ViewPixels
+from aeromatch_cli.strategies.simulators import source_view
 from aeromatch_cli.workspace import fingerprint, read_json, write_atomically, write_json
 
 
 @dataclass(frozen=True, eq=False)
 class SimulateTask:
-    """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown."""
+    """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown. as_taken: also as it is."""
 
     source: enhance.EnhanceTask
     pose: Pose | None
     ground_z_m: float | None
     gsd_m: float | None
     neighbours: tuple[Neighbour, ...]
+    as_taken: bool
     simulator: Simulator
     fingerprint: str
 
@@ -35,16 +39,20 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     simulator = context.settings.simulate
     ground_z_m = context.ground_z_m(image.image_id)
     geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
-    own = fingerprint(source.fingerprint, simulator, geometry)
+    as_taken = context.settings.extract.follows_north and context.lacks_north(image.image_id)
+    own = fingerprint(source.fingerprint, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)
-    return SimulateTask(source, pose, ground_z_m, context.block.gsd_m, neighbours, simulator, own)
+    return SimulateTask(source, pose, ground_z_m, context.block.gsd_m, neighbours, as_taken, simulator, own)
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:
     """The views of one image: geometry only."""
     camera = shrink_camera(task.source.camera, task.source.scale)
-    return task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
+    views = task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
+    if task.as_taken and not any(view.is_source for view in views):
+        return (source_view(camera, task.pose), *views)
+    return views
 
 
 def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
@@ -59,7 +67,19 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
     return pictures, result
 
 
-def keep(task: SimulateTask, pictures: list[ViewPixels], *, with_pictures: bool) -> None:
+@dataclass(frozen=True)
+class ViewCost:
+    """How many views were made, and of how many megapixels together."""
+
+    views: int
+    megapixels: float
+
+    @classmethod
+    def of(cls, pictures: Sequence[ViewPixels]) -> ViewCost:
+        return cls(len(pictures), sum(item.view.width_px * item.view.height_px for item in pictures) / 1e6)
+
+
+def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: bool) -> None:
     """Write views.json, and with `with_pictures` a PNG of every view."""
     workspace, image_id = task.source.workspace, task.source.image_id
     if with_pictures:
@@ -87,10 +107,24 @@ def keep(task: SimulateTask, pictures: list[ViewPixels], *, with_pictures: bool)
     )
 
 
-def _run_task(task: SimulateTask) -> str:
+def cost_facts(costs: Sequence[ViewCost], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """What views cost: sums over the images made, the `earlier` ones of the same command included, and means."""
+    images = len(costs) + earlier.get("images", 0)
+    views = sum(cost.views for cost in costs) + earlier.get("views", 0)
+    megapixels = math.fsum(cost.megapixels for cost in costs) + earlier.get("view_megapixels", 0.0)
+    return {
+        "images": images,
+        "views": views,
+        "view_megapixels": round(megapixels, 6),
+        "views_per_image": round(views / images, 3),
+        "view_megapixels_per_image": round(megapixels / images, 3),
+    }
+
+
+def _run_task(task: SimulateTask) -> ViewCost:
     pictures, _ = render(task)
     keep(task, pictures, with_pictures=True)
-    return task.source.image_id
+    return ViewCost.of(pictures)
 
 
 def run(context: Context) -> StageReport:
@@ -99,7 +133,9 @@ def run(context: Context) -> StageReport:
     tasks = [make_task(context, image) for image in context.images()]
     todo = [task for task in tasks if context.overwrite or not is_done(task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
-    run_stage(context, report, _run_task, todo, [task.source.image_id for task in todo])
+    costs = run_stage(context, report, _run_task, todo, [task.source.image_id for task in todo])
+    if costs:
+        report.facts = cost_facts(costs, {})
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
