@@ -1,10 +1,14 @@
 """This project's presets beside the peers: same pairs, images, size and budget, seeds fixed, judged by truth.
 
-A method is a peer or a preset, with settings in brackets as in `--set`: 'opencv-sift,baseline,fusion[enhance=none]'.
+A method is a peer or a preset, with settings in brackets as in `--set`, and a short label before it where the name gets
+long: 'opencv-sift,baseline,plain=fusion[enhance=none,simulate=none]'.
 Rendered scenes (one block with the `mixed` flight each) are judged by their exact geometry, real blocks
 (DATA/BLOCK/images, DATA/BLOCK/reference) by the epipolar lines of their reference poses. A pair is hard where the
 shadow share is 20 % or more or the view angle 30 degrees or more (in a real block also where one image is 1.6 times as
 bright as the other), and overlaps by a fifth at least.
+
+--reference and --unprocessed name two of the methods: the goals compare every other one with them. --poses both runs
+the presets with exact and with noisy poses (rendered scenes), and says what the noise costs.
 
 Every method runs in a process of its own per scene, two threads. A row's seconds are those of both images' features
 (decoding included), matching and verification; start-up is not timed. peak_mb is the largest resident memory meanwhile.
@@ -22,52 +26,29 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from importlib import metadata
 from pathlib import Path
 
 from common import write_readme
 from methods import worker
 from methods.base import Options
-from methods.results import Row, make_row, tables, write_rows
-from methods.scenes import MIN_OVERLAP, Judged, JudgedPair, Selection, real, rendered
+from methods.goals import Comparison, Row
+from methods.results import PARTS, make_row, tables, write_rows
+from methods.scenes import MIN_OVERLAP, Judged, JudgedPair, Selection, real, rendered, with_noisy_poses
+from methods.sources import OUR_CODE, PEER_CODE, code_digest, versions
 from methods.store import read_measured, write_measured
-from methods.table import NEED_WEIGHTS, PEERS, method, split_methods
+from methods.table import NEED_WEIGHTS, PEERS, Named, method, named_methods, split_methods
 from methods.worker import Measured
 
-import aeromatch_cli
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import AeromatchError, ConfigError
 from aeromatch_cli.synthetic import PRESETS
-from aeromatch_cli.workspace import file_digest, fingerprint, write_text
+from aeromatch_cli.workspace import fingerprint, write_text
 
 THREADS = 2
 REAL_MAX_SIZE_PX = 1000
-_PEERS = ("aliked", "base", "colmap", "keynet", "matching", "opencv_asift", "opencv_sift", "worker")
-# Source that answers depend on, below the package or this folder.
-PEER_CODE = ("geometry", *(f"methods/{module}.py" for module in _PEERS))
-OUR_CODE = (
-    "blocks",
-    "geometry",
-    "nets",
-    "stages",
-    "strategies",
-    "data.py",
-    "formats.py",
-    "images.py",
-    "methods/ours.py",
-)
-LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")
 # What a plain run and --quick do where an option is not given.
 FULL = {"scenes": ",".join(PRESETS), "pairs": 16, "size": "1000x750", "images": 24, "keypoints": 2048}
 QUICK = {"scenes": "city,grass", "pairs": 4, "size": "480x360", "images": 12, "keypoints": 512}
-
-
-def code_digest(*places: str) -> str:
-    """Digest of source files and folders below the package or this folder."""
-    roots = [Path(aeromatch_cli.__file__).parent, Path(__file__).parent]
-    paths = [root / place for root in roots for place in places]
-    files = [file for path in paths for file in ([path] if path.is_file() else sorted(path.rglob("*.py")))]
-    return fingerprint([(path.name, file_digest(path)) for path in files])
 
 
 def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
@@ -83,48 +64,55 @@ def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
         yield real(folder, args.data, block, selection, max_size_px=args.max_size)
 
 
-def measure(name: str, judged: Judged, options: Options, store: Path) -> Iterator[tuple[str, Measured]]:
+def measure(spec: str, judged: Judged, options: Options, store: Path) -> Iterator[tuple[str, Measured]]:
     """Key and answer of one method for every pair of a scene, in order; what the store has is not made again."""
     # What an answer depends on, the judge left out. Peers read nothing of stages, strategies and presets.
     code, settings = (
-        (PEER_CODE, None) if name in PEERS else (OUR_CODE, load(*parse_method(name)).model_dump(mode="json"))
+        (PEER_CODE, None) if spec in PEERS else (OUR_CODE, load(*parse_method(spec)).model_dump(mode="json"))
     )
-    versions = [metadata.version(library) for library in LIBRARIES]
-    basis = [name, settings, judged.key, vars(options) | {"weights": None}, code_digest(*code), versions]
+    basis = [spec, settings, judged.key, vars(options) | {"weights": None}, code_digest(*code), versions()]
     keys = [fingerprint(basis, pair.images)[:16] for pair in judged.pairs]
     if all((store / f"{key}.npz").is_file() for key in keys):
         yield from ((key, read_measured(store / f"{key}.npz")) for key in keys)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, worker.start, (name, judged.scene, options)) as process:
+    with ProcessPoolExecutor(1, context, worker.start, (spec, judged.scene, options)) as process:
         for pair, key in zip(judged.pairs, keys, strict=True):
             path = store / f"{key}.npz"
             if not path.is_file():
                 try:
                     write_measured(path, process.submit(worker.run_pair, pair.images).result())
                 except BrokenProcessPool as error:
-                    raise SystemExit(f"{name} on {judged.scene.name}: its process died ({error})") from error
+                    raise SystemExit(f"{spec} on {judged.scene.name}: its process died ({error})") from error
             yield key, read_measured(path)
 
 
-def judged_row(name: str, judged: Judged, pair: JudgedPair, options: Options, key: str, measured: Measured) -> Row:
+def judged_row(name: Named, judged: Judged, pair: JudgedPair, options: Options, key: str, measured: Measured) -> Row:
     """The row of one pair."""
     found = measured.found
     score = judged.truth.judge(
         *pair.images, found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
     )
-    return make_row(name, judged.scene.name, pair, score, measured, options, key)
+    return make_row(name, judged, pair, score, measured, options, key)
 
 
-def run(args: argparse.Namespace) -> list[Row]:
+def poses_of(name: Named, judged: Judged, asked: str) -> list[Judged]:
+    """The scene with the poses that a method is to be measured with: peers read none, real blocks have one set."""
+    noisy = None if name.spec in PEERS or asked == "exact" else with_noisy_poses(judged)
+    if noisy is None:
+        return [judged]
+    return [noisy] if asked == "noisy" else [judged, noisy]
+
+
+def run(args: argparse.Namespace, names: list[Named]) -> list[Row]:
     """All rows, written as they come."""
     options = Options(args.keypoints, args.budget, THREADS, args.seed, args.reference_weights)
-    selection = Selection(args.condition, args.pairs, args.seed, args.noisy_poses)
+    selection = Selection(args.condition, args.pairs, args.seed)
     store = args.out / "scenes" / "found"
     store.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    names = split_methods(args.methods)
     total = len(list(filter(None, args.scenes.split(",") + args.blocks.split(",")))) * len(names)
+    noisy = None if args.noisy_methods is None else split_methods(args.noisy_methods)
     started, done = time.monotonic(), 0
     for judged in scenes(args, selection):
         if len(judged.pairs) < args.pairs:
@@ -132,14 +120,16 @@ def run(args: argparse.Namespace) -> list[Row]:
             print(f"{judged.scene.name} has only {found}, {args.pairs} were asked for", file=sys.stderr)
         for name in names if judged.pairs else ():
             before = time.monotonic()
-            answers = measure(name, judged, options, store)
-            for pair, (key, measured) in zip(judged.pairs, answers, strict=True):
-                rows.append(judged_row(name, judged, pair, options, key, measured))
-                write_rows(args.out / "results.json", rows)
+            poses = args.poses if noisy is None or name.label in noisy else "exact"
+            for posed in poses_of(name, judged, poses):
+                answers = measure(name.spec, posed, options, store)
+                for pair, (key, measured) in zip(posed.pairs, answers, strict=True):
+                    rows.append(judged_row(name, posed, pair, options, key, measured))
+                    write_rows(args.out / "results.json", rows)
             done += 1
             left = (time.monotonic() - started) / done * (total - done)
             print(
-                f"{judged.scene.name} {name}: {len(judged.pairs)} pairs, {time.monotonic() - before:.0f} s; "
+                f"{judged.scene.name} {name.label}: {len(judged.pairs)} pairs, {time.monotonic() - before:.0f} s; "
                 f"{done} of {total}, about {left / 60:.0f} min left",
                 file=sys.stderr,
             )
@@ -155,8 +145,14 @@ def command(args: argparse.Namespace) -> str:
         parts.append(f"--data DIR --blocks {args.blocks} --max-size {args.max_size}")
     if args.reference_weights:
         parts.append("--reference-weights DIR")
-    if args.noisy_poses:
-        parts.append("--noisy-poses")
+    if args.poses != "exact":
+        parts.append(f"--poses {args.poses}")
+    if args.noisy_methods:
+        parts.append(f"--noisy-methods '{args.noisy_methods}'")
+    if args.reference:
+        parts.append(f"--reference '{args.reference}'")
+    if args.unprocessed:
+        parts.append(f"--unprocessed '{args.unprocessed}'")
     return " ".join([*parts, "--out DIR"])
 
 
@@ -173,12 +169,16 @@ def parse() -> argparse.Namespace:
     add("--size", metavar="WxH", help="of rendered images")
     add("--images", type=int, help="of each rendered block")
     add("--quick", action="store_true", help="small images, few pairs: two minutes")
-    add("--noisy-poses", action="store_true", help="presets get poses_noisy.csv instead of exact poses")
+    add("--poses", choices=("exact", "noisy", "both"), default="exact", help="what presets get; both: a row for each")
+    add("--noisy-methods", metavar="LABELS", help="comma-separated: only these with noisy poses, the others with exact")
+    add("--reference", help="the method whose weak pairs the goals are about, as in --methods: opencv-sift")
+    add("--unprocessed", help="the method without enhancement and views that the goals compare with")
     add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
     add("--data", type=Path, metavar="DIR", help="folder of real blocks")
     add("--blocks", default="", help="names of real blocks, comma-separated")
     add("--max-size", type=int, default=REAL_MAX_SIZE_PX, help="longer side of real images, px")
-    add("--readme", action="store_true", help="write the tables into the README")
+    add("--tables", default="condition,scene,angle", help=f"what --readme writes, comma-separated: {', '.join(PARTS)}")
+    add("--readme", nargs="?", const="bench_methods", metavar="NAME", help="write tables between the README's markers")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
     for key, value in (QUICK if args.quick else FULL).items():
@@ -188,6 +188,8 @@ def parse() -> argparse.Namespace:
         args.methods = ",".join(name for name in (*PEERS, "baseline") if name not in NEED_WEIGHTS)
     if args.blocks and args.data is None:
         parser.error("--blocks needs --data: the folder that holds BLOCK/images and BLOCK/reference")
+    if unknown := set(args.tables.split(",")) - set(PARTS):
+        parser.error(f"--tables: {', '.join(sorted(unknown))} is none of {', '.join(PARTS)}")
     if args.pairs < 1 or args.keypoints < 1:
         parser.error("--pairs and --keypoints must be at least 1")
     return args
@@ -198,21 +200,27 @@ def main() -> None:
     worker.limit_threads(THREADS)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
     try:
-        for name in split_methods(args.methods):
-            method(name)
-            if name in NEED_WEIGHTS and args.reference_weights is None:
-                raise ConfigError(f"{name} needs --reference-weights DIR")
-        rows = run(args)
+        names = named_methods(args.methods)
+        for name in names:
+            method(name.spec)
+            if name.spec in NEED_WEIGHTS and args.reference_weights is None:
+                raise ConfigError(f"{name.spec} needs --reference-weights DIR")
+        comparison = Comparison.among(names, args.reference, args.unprocessed)
+        unknown = set(split_methods(args.noisy_methods or "")) - {name.label for name in names}
+        if unknown:
+            raise ConfigError(f"--noisy-methods: {', '.join(sorted(unknown))} is none of --methods")
+        rows = run(args, names)
         if not rows:
             raise ConfigError(f"no scene has a pair of condition {args.condition}: give another --seed or --condition")
     except AeromatchError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(error.exit_code) from error
-    text = tables(rows)
+    text = tables(rows, comparison)
     write_text(args.out / "table.md", text)
     print(text)
     if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_methods")
+        chosen = tables(rows, comparison, tuple(args.tables.split(",")))
+        write_readme(f"    {command(args)}\n\n{chosen}", args.readme)
 
 
 if __name__ == "__main__":

@@ -7,5 +7,9 @@ ours      a preset of this project, with settings in brackets
 table     name -> method
 scenes    rendered scenes and real blocks, and which of their pairs are judged
 worker    one method on one scene in a process of its own, timed
+sources   source files and libraries that answers depend on
+store     what methods answered, on disk
 results   rows, their file, and the tables made from it
+goals, goal_tables   every method against SIFT + ratio and against unprocessed images
+view_costs   what views of an image cost, for scripts/bench_views
 """

@@ -18,7 +18,9 @@ from methods.base import Found, Options, Scene
 
 
 class Preset:
-    """Poses and cameras of the block are given, pairs are the judged ones; everything else is the preset's.
+    """Poses and cameras of the block are given, everything else is the preset's. Its own pairs of the whole block are
+    chosen first, from the same poses: views look where the neighbours look, and an image has more of these than the
+    judged pairs. Of all pairs only the judged ones are matched.
 
     An image's features are made by the extract stage (decoding, enhancement, views, writing and reading of its file
     included), a pair's matches by the preset's matcher and its chain of filters, on verified pairs only. Nothing runs
@@ -28,14 +30,18 @@ class Preset:
     def __init__(self, scene: Scene, options: Options, *, preset: str, settings: tuple[str, ...]) -> None:
         self._folder = tempfile.TemporaryDirectory()  # lives as long as this object
         work = Path(self._folder.name)
-        listed = work / "pairs.txt"
-        listed.write_text("".join(f"{a},{b}\n" for a, b in scene.pairs), encoding="utf-8")
         budget = [] if options.budget == "image" else [f"extract.budget={options.budget}"]
-        own = ["pairs=file", f"pairs.path={listed}", f"extract.keypoints={options.keypoints}", *budget]
+        own = [f"extract.keypoints={options.keypoints}", *budget, *settings]
         block = {"images": str(scene.images), "poses": str(scene.poses), "cameras": str(scene.block)}
-        run = {"executor": "serial", "jobs": 1}
-        tree = load(preset, [*own, *settings], block, workspace=str(work / "work"), run=run, seed=options.seed)
-        self.context, _ = pairs.prepare(tree, Executor("serial", 1))
+        top = {"workspace": str(work / "work"), "run": {"executor": "serial", "jobs": 1}, "seed": options.seed}
+        executor = Executor("serial", 1)
+        chosen, _ = pairs.prepare(load(preset, own, block, **top), executor)
+        names = {image.image_id: image.name for image in chosen.block.images}
+        both = {(names[pair.image_id0], names[pair.image_id1]) for pair in chosen.pairs} | set(scene.pairs)
+        listed = work / "pairs.txt"
+        listed.write_text("".join(f"{a},{b}\n" for a, b in sorted(both)), encoding="utf-8")
+        own += ["pairs=file", f"pairs.path={listed}"]
+        self.context, _ = pairs.prepare(load(preset, own, block, **top), executor)
         self.id_of = {image.name: image.image_id for image in self.context.block.images}
         self.pair_of = {(pair.image_id0, pair.image_id1): pair for pair in self.context.pairs}
 

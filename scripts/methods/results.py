@@ -15,7 +15,10 @@ from aeromatch_cli.evaluate.metrics import auc
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
 from aeromatch_cli.workspace import write_text
 from methods.base import Options
-from methods.scenes import JudgedPair
+from methods.goal_tables import goals_table, markdown, noise_table, shadow_table, strategies_table
+from methods.goals import ENOUGH_CORRECT, EXACT, NOISY, Comparison, Row, noisy_label
+from methods.scenes import NOISY_POSES, Judged, JudgedPair
+from methods.table import Named
 from methods.worker import Measured
 
 # What every row holds, in this order; what follows in a row is an extra.
@@ -25,19 +28,20 @@ FIELDS = (
     "translation_error_deg", "seconds", "peak_mb",
 )  # fmt: skip
 EXTRAS = ("within_5px", "hidden", "unseen", "kept_in_shadow", "correct_in_shadow", "wrong_at_border")
-ENOUGH_CORRECT = 30
-Row = dict[str, Any]
+PARTS = ("goals", "shadow", "strategies", "noise", "condition", "scene", "angle")
 
 
 def make_row(
-    name: str, scene: str, pair: JudgedPair, score: PairScore, measured: Measured, options: Options, key: str
+    name: Named, judged: Judged, pair: JudgedPair, score: PairScore, measured: Measured, options: Options, key: str
 ) -> Row:
     """One row: FIELDS, then extras. NaN becomes null. keypoints: descriptors of an image that entered matching, mean of
-    both. key: what the row depends on; a row with this key need not be made again."""
+    both. spec: what the method's label stands for. key: what the row depends on; a row with this key need not be made
+    again."""
+    poses = NOISY if judged.scene.poses.name == NOISY_POSES else EXACT
     found = {
         **score.row(),
-        "method": name,
-        "scene": scene,
+        "method": noisy_label(name.label) if poses == NOISY else name.label,
+        "scene": judged.scene.name,
         "condition": pair.condition,
         "pair": " ".join(pair.images),
         "view_angle_deg": pair.conditions.view_angle_deg,
@@ -49,7 +53,8 @@ def make_row(
     }
     row = {field: _plain(found[field]) for field in (*FIELDS, *EXTRAS)}
     asked = {"asked_keypoints": options.keypoints, "budget": options.budget, "seed": options.seed}
-    return row | {"texture": _plain(pair.conditions.texture), **asked, "threads": options.threads, "key": key}
+    asked |= {"threads": options.threads, "poses": poses, "spec": name.spec}
+    return row | {"texture": _plain(pair.conditions.texture), **asked, "key": key}
 
 
 def _plain(value: Any) -> Any:
@@ -63,26 +68,47 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     write_text(path, "[\n" + ",\n".join(json.dumps(row, allow_nan=False) for row in rows) + "\n]\n")
 
 
-def tables(rows: Sequence[Row]) -> str:
-    """Markdown: figures by condition, by scene and by view angle."""
+def tables(rows: Sequence[Row], comparison: Comparison, parts: Sequence[str] = PARTS) -> str:
+    """Markdown: the goals, and figures by condition, by scene and by view angle."""
     if not rows:
         return "No rows.\n"
     first = rows[0]
-    view_classes = [name for name, _ in VIEW_ANGLE_CLASSES]
-    parts = [
+    text = [
         f"Budget {first['asked_keypoints']} descriptors per {first['budget']}, seed {first['seed']}, "
         f"{first['threads']} threads, one process per method and scene.",
+        *_legend(rows),
         "Correct, kept, correctness, recall: sums over pairs. Median error: median of the pairs' medians. Coverage: "
         "mean. AUC: of the larger of rotation and translation error. Seconds: median pair, features of both images "
         "included. Peak MB: largest. Real blocks: judged by reference epipolar lines, recall unknown.",
-        "### By condition",
-        _table(rows, lambda row: row["condition"], "condition", ["hard", "easy"]),
-        "### By scene",
-        _table(rows, lambda row: row["scene"], "scene", list(dict.fromkeys(row["scene"] for row in rows))),
-        "### By view angle, degrees",
-        _table(rows, _view_class, "view angle", view_classes),
     ]
-    return "\n\n".join(parts) + "\n"
+    makers: dict[str, tuple[str, Callable[[], str]]] = {
+        "goals": ("Goals", lambda: goals_table(rows, comparison)),
+        "shadow": ("Shadow", lambda: shadow_table(rows, comparison)),
+        "strategies": ("Single strategies and combinations", lambda: strategies_table(rows, comparison)),
+        "noise": ("Pose noise", lambda: noise_table(rows)),
+        "condition": ("By condition", lambda: _table(rows, lambda row: row["condition"], "condition", _CONDITIONS)),
+        "scene": ("By scene", lambda: _table(rows, lambda row: row["scene"], "scene", _scenes(rows))),
+        "angle": ("By view angle, degrees", lambda: _table(rows, _view_class, "view angle", _VIEW_CLASSES)),
+    }
+    for part in parts:
+        title, make = makers[part]
+        text += [f"### {title}", make()]
+    return "\n\n".join(text) + "\n"
+
+
+_CONDITIONS = ["hard", "easy"]
+_VIEW_CLASSES = [name for name, _ in VIEW_ANGLE_CLASSES]
+
+
+def _legend(rows: Sequence[Row]) -> list[str]:
+    """What labels stand for."""
+    specs = {row["method"]: row["spec"] for row in rows if row["poses"] == EXACT}
+    named = [f"`{label}` = `{spec}`" for label, spec in specs.items() if label != spec]
+    return ["Methods: " + "; ".join(named) + "."] if named else []
+
+
+def _scenes(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["scene"] for row in rows))
 
 
 def _view_class(row: Row) -> str:
@@ -94,13 +120,13 @@ def _table(rows: Sequence[Row], group_of: Callable[[Row], str], title: str, grou
         title, "method", "pairs", "correct", "kept", "correctness", "recall", f">= {ENOUGH_CORRECT} correct",
         "median error px", "coverage", "AUC 5°", "AUC 10°", "seconds", "peak MB",
     )  # fmt: skip
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    lines = []
     for group in groups:
         members = [row for row in rows if group_of(row) == group]
         for method in dict.fromkeys(row["method"] for row in members):
-            cells = [group, f"`{method}`", *summary([row for row in members if row["method"] == method])]
-            lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            own = [row for row in members if row["method"] == method]
+            lines.append([group, f"`{method}`", *summary(own)])
+    return markdown(columns, lines)
 
 
 def summary(rows: Sequence[Row]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -23,16 +23,16 @@ MIN_OVERLAP = 0.2
 # Mean grey level of one image over that of the other from which a pair of real images is hard.
 HARD_BRIGHTNESS_RATIO = 1.6
 HARD, EASY = "hard", "easy"
+EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """condition: "hard", "easy" or "all" (half of each). pairs: of each scene. noisy_poses: what presets are given."""
+    """condition: "hard", "easy" or "all" (half of each). pairs: of each scene."""
 
     condition: str
     pairs: int
     seed: int
-    noisy_poses: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,22 @@ def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard:
     # Streams of their own, so that one scene's pairs do not depend on which others are judged.
     rng = np.random.default_rng([selection.seed, stable_hash(name) % (1 << 32)])
     pairs = chosen(candidates, selection, rng)
-    poses = out / ("poses_noisy.csv" if selection.noisy_poses and truth.kind == "rendered" else "poses.csv")
     listed = tuple(pair.images for pair in pairs)
-    scene = Scene(name, out / "images", poses, out / "block.json", truth.cameras, listed)
-    return Judged(scene, truth, pairs, fingerprint(out.name, poses.name, listed))
+    scene = Scene(name, out / "images", out / EXACT_POSES, out / "block.json", truth.cameras, listed)
+    return Judged(scene, truth, pairs, _key(scene))
+
+
+def _key(scene: Scene) -> str:
+    return fingerprint(scene.images.parent.name, scene.poses.name, scene.pairs)
+
+
+def with_noisy_poses(judged: Judged) -> Judged | None:
+    """The same scene and pairs with poses that have the block's noise; None where it has none (real blocks)."""
+    poses = judged.scene.poses.with_name(NOISY_POSES)
+    if not poses.is_file():
+        return None
+    scene = replace(judged.scene, poses=poses)
+    return replace(judged, scene=scene, key=_key(scene))
 
 
 def chosen(candidates: list[JudgedPair], selection: Selection, rng: np.random.Generator) -> tuple[JudgedPair, ...]:

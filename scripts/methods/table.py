@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 from aeromatch_cli.config import load, parse_method, preset_names
@@ -27,6 +29,34 @@ PEERS: Mapping[str, Make] = {
     "keynet-tfeat": partial(KeyNet, descriptor="tfeat-liberty.params"),
 }
 NEED_WEIGHTS = ("aliked", "keynet", "keynet-tfeat")
+
+
+@dataclass(frozen=True)
+class Named:
+    """A method as it is asked for. label: in tables and rows. spec: a peer, or PRESET[key=value,...]."""
+
+    label: str
+    spec: str
+
+
+def named_methods(text: str) -> list[Named]:
+    """The methods between commas, each with a label before it or not: 'opencv-sift,plain=fusion[enhance=none]'.
+
+    Raises ConfigError where a label stands for two methods, or is the name of another one.
+    """
+    found: dict[str, Named] = {}
+    for part in split_methods(text):
+        match = re.fullmatch(r"(?:([^\[\]=|`]+)=)?([^\[\]=]+(?:\[.*\])?)", part)
+        if match is None:
+            raise ConfigError(f"{part!r} is not a method; write a peer, PRESET[key=value] or LABEL=PRESET[key=value]")
+        spec = match[2].strip()
+        label = (match[1] or spec).strip()
+        if label != spec and label in (*PEERS, *preset_names()):
+            raise ConfigError(f"{part!r}: {label} is a method itself; take another label")
+        if label in found:
+            raise ConfigError(f"{label} stands for {found[label].spec} and for {spec}; labels must differ")
+        found[label] = Named(label, spec)
+    return list(found.values())
 
 
 def method(text: str) -> Make:
