@@ -124,7 +124,8 @@ class View:
     gsd_m: ground metres per view pixel, None where it is unknown or varies (perspective views).
     ground_from_view: (3, 3) view pixel -> world x, y in metres on the plane that the view was made of, None for the
     source. north_up: whether the view's axes follow the world's alone (a function of world_direction), so that things
-    on the ground have the same orientation in all views of like direction.
+    on the ground have the same orientation in all views of like direction. enhanced: whether its picture is the
+    enhanced one where the picture as it was taken has a view of its own.
     """
 
     name: str
@@ -137,6 +138,7 @@ class View:
     gsd_m: float | None = None
     north_up: bool = False
     ground_from_view: FloatArray | None = None
+    enhanced: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +167,7 @@ class Features:
     view_size_px: (D,) float32 diameter in that view; view_orientation_deg: (D,) float32 in that view.
     view_sizes_px: (V, 2) int32 width, height of every view; view_angles_deg: (V,) float32.
     view_directions: (V, 3) float32 and view_gsd_m: (V,) float32 as in View, NaN where unknown.
+    view_enhanced: (V,) bool as in View.
     colours: (K, 3) uint8 RGB (gray thrice) of the enhanced image, averaged over each keypoint's blob, or None.
     """
 
@@ -181,6 +184,7 @@ class Features:
     view_angles_deg: FloatArray
     view_directions: FloatArray
     view_gsd_m: FloatArray
+    view_enhanced: BoolArray
     colours: NDArray[np.uint8] | None = None
 
 

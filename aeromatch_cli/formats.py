@@ -23,7 +23,7 @@ enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; 
                              (whether the picture is kept), and the facts that the strategy states.
 simulated/<id>/views.json    fingerprint, pictures (whether they are kept), scale (stored raster to the raster that
                              the views were made from), views:
-                             name, width_px, height_px, is_source, angle_deg, undistorted_from_view (3 x 3). Source
+                             name, width_px, height_px, is_source, angle_deg, enhanced, undistorted_from_view. Source
                              pixel = distort(camera, undistorted_from_view . view pixel); for is_source the view is
                              the raster itself. With scale < 1 the camera is the one resized by scale.
 simulated/<id>/<view>.png    gray picture of the view (kept by the single stage and with --keep-images).
@@ -33,7 +33,8 @@ features/<id>.npz            fingerprint ()str
   descriptors (D,C) uint8 (RootSIFT x 512) or float32; descriptor_keypoint_idx (D,) int32
   view_idx (D,) int32; view_keypoints_px (D,2) float32, view_size_px (D,) float32, view_orientation_deg (D,) float32:
   place, diameter and direction in the view's own frame; view_sizes_px (V,2) int32; view_angles_deg (V,) float32;
-  view_directions (V,3) float32 unit vectors, world frame, and view_gsd_m (V,) float32, NaN where unknown
+  view_directions (V,3) float32 unit vectors, world frame, and view_gsd_m (V,) float32, NaN where unknown;
+  view_enhanced (V,) bool: views of the enhanced picture beside those of the picture as it was taken
   colours (K,3) uint8 RGB of the enhanced picture around each keypoint, present only with extract.colours
 
 matches/<id0>.npz            one row: all pairs of id0, concatenated; pair p owns entries offsets[p]:offsets[p+1]

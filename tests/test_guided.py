@@ -60,6 +60,7 @@ def described(points_px, descriptors, size_px=8.0):
         view_angles_deg=np.zeros(1, np.float32),
         view_directions=np.full((1, 3), np.nan, np.float32),
         view_gsd_m=np.full(1, np.nan, np.float32),
+        view_enhanced=np.zeros(1, bool),
     )
 
 

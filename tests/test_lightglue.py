@@ -95,10 +95,11 @@ def features(count: int, seed: int = 0) -> Features:
         view_angles_deg=np.zeros(1, np.float32),
         view_directions=np.full((1, 3), np.nan, np.float32),
         view_gsd_m=np.full(1, np.nan, np.float32),
+        view_enhanced=np.zeros(1, bool),
     )
 
 
-OF_VIEWS = {"view_sizes_px", "view_angles_deg", "view_directions", "view_gsd_m"}
+OF_VIEWS = {"view_sizes_px", "view_angles_deg", "view_directions", "view_gsd_m", "view_enhanced"}
 
 
 def permuted(original: Features, order: np.ndarray) -> Features:
@@ -371,6 +372,7 @@ def by_hand() -> Features:
         view_angles_deg=np.zeros(2, np.float32),
         view_directions=np.full((2, 3), np.nan, np.float32),
         view_gsd_m=np.full(2, np.nan, np.float32),
+        view_enhanced=np.zeros(2, bool),
     )
 
 

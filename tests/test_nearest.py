@@ -65,6 +65,7 @@ def features(described, keypoint_idx=None):
         view_angles_deg=np.zeros(1, np.float32),
         view_directions=np.full((1, 3), np.nan, np.float32),
         view_gsd_m=np.full(1, np.nan, np.float32),
+        view_enhanced=np.zeros(1, bool),
     )
 
 
@@ -203,7 +204,8 @@ def test_views_of_like_direction_are_compared():
 
     def seen(directions, gsd_m, angles_deg):
         arrays = (np.array(values, np.float32) for values in (directions, gsd_m, angles_deg))
-        return replace(one, **dict(zip(("view_directions", "view_gsd_m", "view_angles_deg"), arrays, strict=True)))
+        named = dict(zip(("view_directions", "view_gsd_m", "view_angles_deg"), arrays, strict=True))
+        return replace(one, **named, view_enhanced=np.zeros(len(gsd_m), bool))
 
     nan = np.nan
     first = seen([tilted, down, tilted], [nan, 0.1, 0.1], [0.0, 34.0, 0.0])
@@ -224,10 +226,39 @@ def test_view_pairs_say_which_views_found_a_match():
         "view_gsd_m": np.array([0.1, 0.1], np.float32),
         "view_angles_deg": np.array([0.0, 37.0], np.float32),
         "view_sizes_px": np.array([[100, 80]] * 2, np.int32),
+        "view_enhanced": np.zeros(2, bool),
     }
     matches = Nearest()(replace(features(base), **views), replace(features(base), **views), GEOMETRY)
     assert len(matches.indices) == 40
     assert matches.view_pairs.tolist() == [[0, 0]] * 20 + [[1, 1]] * 20
+
+
+@pytest.mark.parametrize("same_light", [True, False])
+@pytest.mark.parametrize("both_enhanced", [True, False])
+def test_a_pair_uses_the_pictures_that_agree(same_light, both_enhanced):
+    """40 places as taken and 40 enhanced: those of one kind have equal descriptors in both images."""
+    rng = np.random.default_rng(8)
+    ground, (border0, border1) = descriptors(rng, 40, 0), (descriptors(rng, 40, 0), descriptors(rng, 40, 0))
+    taken0, taken1 = (ground, ground) if same_light else (border0, border1)
+    other0, other1 = (border0, border1) if same_light else (ground, ground)
+
+    def image(taken, enhanced):
+        views = {
+            "view_idx": (np.arange(len(taken) + len(enhanced)) >= len(taken)).astype(np.int32),
+            "view_directions": np.array([[0, 0, -1]] * 2, np.float32),
+            "view_gsd_m": np.array([0.1, 0.1], np.float32),
+            "view_angles_deg": np.zeros(2, np.float32),
+            "view_sizes_px": np.array([[100, 80]] * 2, np.int32),
+            "view_enhanced": np.array([False, len(enhanced) > 0]),
+        }
+        return replace(features(np.concatenate([taken, enhanced])), **views)
+
+    # Where nothing is enhanced in image 1, as when it has no shadow, its only picture stands for both.
+    second = image(taken1, other1) if both_enhanced else image(ground, ground[:0])
+    matches = Nearest()(image(taken0, other0), second, GEOMETRY)
+    assert len(matches.indices) == 40
+    expected = [0 if same_light else 1, 0 if same_light or not both_enhanced else 1]
+    assert matches.view_pairs.tolist() == [expected] * 40
 
 
 def test_the_table_names_its_classes():

@@ -83,7 +83,7 @@ def test_the_half_pixel_in_numbers():
     plain = Features(
         rows, sizes, empty, np.zeros((3, 128), np.uint8), np.arange(3, dtype=np.int32), np.zeros(3, np.int32),
         rows, sizes, empty, np.array([[80, 60]], np.int32), np.zeros(1, np.float32),
-        np.full((1, 3), np.nan, np.float32), np.full(1, np.nan, np.float32),
+        np.full((1, 3), np.nan, np.float32), np.full(1, np.nan, np.float32), np.zeros(1, bool),
     )  # fmt: skip
     moved = extract._in_stored_frame(plain, 0.25)
     # The upper left corner stays the corner; pixel 0 of four times the size has its centre at 1.5.

@@ -46,6 +46,7 @@ def features() -> Features:
         view_angles_deg=np.zeros(1, np.float32),
         view_directions=np.full((1, 3), np.nan, np.float32),
         view_gsd_m=np.full(1, np.nan, np.float32),
+        view_enhanced=np.zeros(1, bool),
     )
 
 

@@ -125,10 +125,9 @@ def _without_nodata(pixels: NDArray[Any]) -> BoolArray | None:
 
 
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
-    """Pixels after enhancement, their validity, and what the strategy says; always made anew: a PNG costs more."""
+    """Pixels as taken, their validity, and what the strategy made of them; always made anew: a PNG costs more."""
     pixels, valid = load_source(task, colour=task.colour)
-    result = task.enhancer(pixels, valid)
-    return result.pixels, valid, result
+    return pixels, valid, task.enhancer(pixels, valid)
 
 
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:

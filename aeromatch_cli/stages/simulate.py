@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -56,14 +56,21 @@ def views_of(task: SimulateTask) -> tuple[View, ...]:
 
 
 def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
-    """Gray pictures of every view of one image, and the enhancement they were made from."""
+    """Gray pictures of every view of one image, and the enhancement they were made from.
+
+    With an enhancement `beside` the source that changed anything, all views of the source and then all of that.
+    """
     pixels, valid, result = enhance.enhanced(task.source)
-    gray = to_gray8(pixels)
+    grays = [(to_gray8(result.pixels), False)]
+    if task.source.enhancer.beside and result.pixels is not pixels:
+        grays = [(to_gray8(pixels), False), (grays[0][0], True)]
     camera = shrink_camera(task.source.camera, task.source.scale)
     pictures = []
-    for view in views_of(task):
-        picture, seen = render_view(gray, valid, camera, view)
-        pictures.append(ViewPixels(view, picture, seen))
+    for gray, enhanced in grays:
+        for view in views_of(task):
+            picture, seen = render_view(gray, valid, camera, view)
+            name = f"{view.name}-enhanced" if enhanced else view.name
+            pictures.append(ViewPixels(replace(view, name=name, enhanced=enhanced), picture, seen))
     return pictures, result
 
 
@@ -99,6 +106,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
                     "height_px": view.height_px,
                     "is_source": view.is_source,
                     "angle_deg": view.angle_deg,
+                    "enhanced": view.enhanced,
                     "undistorted_from_view": view.undistorted_from_view.tolist(),
                 }
                 for view in (item.view for item in pictures)

@@ -67,9 +67,14 @@ class ViewPixels:
 
 
 class Enhancer(Protocol):
-    """needs_colour: False where the strategy takes gray pixels, which decode faster."""
+    """needs_colour: False where the strategy takes gray pixels, which decode faster.
+    beside: whether the picture as it was taken has views too, so that every pair can use what suits it.
+    """
 
     needs_colour: ClassVar[bool]
+
+    @property
+    def beside(self) -> bool: ...
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced: ...
 

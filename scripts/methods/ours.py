@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.config import load
-from aeromatch_cli.data import Features, Pair
+from aeromatch_cli.data import Features, FloatArray, Pair
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.stages import extract, pairs
@@ -61,15 +61,24 @@ class Preset:
         candidates = filtering.candidates(matches, *sides)
         seed = filtering.pair_seed(self.context, pair)
         verdict = apply_chain(self.context.settings.filter, candidates, geometry, seed)
+        sides_enhanced = [f.view_enhanced[v] for f, v in zip((features0, features1), matches.view_pairs.T, strict=True)]
+        enhanced = bool(np.any(sides_enhanced))
         keep = verdict.keep if verdict.state == "verified" else np.zeros_like(verdict.keep)
         return Found(
             points0_px=candidates.points0_px[keep],
             points1_px=candidates.points1_px[keep],
             scores=matches.scores[keep].astype(np.float64),
-            keypoints0_px=features0.keypoints_px.astype(np.float64),
-            keypoints1_px=features1.keypoints_px.astype(np.float64),
-            descriptors=(len(features0.descriptors) + len(features1.descriptors)) / 2,
+            keypoints0_px=_entered(features0, enhanced)[0],
+            keypoints1_px=_entered(features1, enhanced)[0],
+            descriptors=(_entered(features0, enhanced)[1] + _entered(features1, enhanced)[1]) / 2,
         )
+
+
+def _entered(features: Features, enhanced: bool) -> tuple[FloatArray, int]:
+    """Places (K, 2) and number of the descriptors that a pair used: of the enhanced picture or of that as taken."""
+    of_picture = features.view_enhanced == (enhanced and bool(features.view_enhanced.any()))
+    described = features.descriptor_keypoint_idx[of_picture[features.view_idx]]
+    return features.keypoints_px[np.unique(described)].astype(np.float64), len(described)
 
 
 def _turned(found: Found) -> Found:

@@ -18,6 +18,10 @@ class ClaheEnhancement(Strategy):
 
     needs_colour: ClassVar[bool] = False
     name: Literal["clahe"] = "clahe"
+    beside: bool = Field(
+        False,
+        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
+    )
     clip_limit: float = Field(2.0, gt=0.0, le=100.0, description="Bound on a tile's slope of mapping, OpenCV's unit.")
     tiles: int = Field(8, ge=1, le=256, description="Tiles across and down the picture.")
 

@@ -14,6 +14,7 @@ class NoEnhancement(Strategy):
     """The picture as it was taken."""
 
     needs_colour: ClassVar[bool] = False
+    beside: ClassVar[bool] = False
     name: Literal["none"] = "none"
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:

@@ -25,6 +25,10 @@ class ShadowEnhancement(Strategy):
 
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
+    beside: bool = Field(
+        True,
+        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
+    )
     detection_px: int = Field(768, ge=64, le=4096, description="Longer side at which shadow is looked for.")
     max_gain: float = Field(
         6.0, ge=1.0, le=64.0, description="Most light given to a region, as a factor; a clear sky lacks this much sun."

@@ -24,6 +24,10 @@ class WallisEnhancement(Strategy):
 
     needs_colour: ClassVar[bool] = False
     name: Literal["wallis"] = "wallis"
+    beside: bool = Field(
+        False,
+        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
+    )
     window_share: float = Field(
         0.04, gt=0.0, le=1.0, description="Side of the neighbourhood as a share of the picture's longer side."
     )

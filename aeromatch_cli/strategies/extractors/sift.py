@@ -35,7 +35,8 @@ class Sift(Strategy):
         4000,
         ge=1,
         description="Descriptors per image over all its views: exactly so many, fewer only where fewer exist. "
-        "As in OpenCV and COLMAP, a point with two orientations counts twice.",
+        "As in OpenCV and COLMAP, a point with two orientations counts twice. Where an enhancement "
+        "works beside the source, so many in each.",
     )
     budget: Literal["image", "view"] = Field(
         "image", description="What `keypoints` is for: the whole image over all its views, or each view by itself."
@@ -71,13 +72,7 @@ class Sift(Strategy):
         # Detect, select, describe: describing every point of a forest costs more than detecting it.
         detector = self._detector()
         found = [in_source(camera, view, self._found(detector, view, index)) for index, view in enumerate(views)]
-        raw = concatenate(found)
-        if self.budget == "image":
-            raw = self._cut(raw, views, raw.view_idx)
-        else:
-            raw = concatenate(
-                [self._cut(part, (view,), part.view_idx * 0) for part, view in zip(found, views, strict=True)]
-            )
+        raw = concatenate([self._cut(found, views, group) for group in self._groups(views)])
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
         points = raw.take(standing)
         order = np.argsort(keypoint_idx, kind="stable")  # descriptors of one keypoint side by side
@@ -94,10 +89,19 @@ class Sift(Strategy):
         keep = distinct(points.points_px, points.sizes_px, self._strengths(points), _SAME_BLOB_PX)
         return raw.take(keep[np.cumsum(starts) - 1])
 
-    def _cut(self, raw: Raw, views: Sequence[ViewPixels], view_idx: IntArray) -> Raw:
-        """The features that the budget buys; view_idx (N,) into views."""
-        strengths = self._strengths(raw)
-        return raw.take(even_selection(views, view_idx, raw.points_px, strengths, self.keypoints, self.per_cell))
+    def _groups(self, views: Sequence[ViewPixels]) -> list[list[int]]:
+        """Indices of the views that share a budget: those of the picture as taken, and of the enhanced one, if any."""
+        if self.budget == "view":
+            return [[index] for index in range(len(views))]
+        groups = [[i for i, item in enumerate(views) if item.view.enhanced is enhanced] for enhanced in (False, True)]
+        return [group for group in groups if group]
+
+    def _cut(self, found: Sequence[Raw], views: Sequence[ViewPixels], group: Sequence[int]) -> Raw:
+        """The features of a group of views that the budget buys."""
+        raw = concatenate([found[index] for index in group])
+        within = np.searchsorted(group, raw.view_idx)
+        shown, strengths = [views[index] for index in group], self._strengths(raw)
+        return raw.take(even_selection(shown, within, raw.points_px, strengths, self.keypoints, self.per_cell))
 
     def _strengths(self, raw: Raw) -> FloatArray:
         if self.selection == "scale":
@@ -137,6 +141,7 @@ def _features(
         view_angles_deg=np.array([v.view.angle_deg for v in views], np.float32),
         view_directions=np.array([_or_nan(v.view.world_direction, 3) for v in views], np.float32).reshape(-1, 3),
         view_gsd_m=np.array([_or_nan(v.view.gsd_m) for v in views], np.float32).reshape(-1),
+        view_enhanced=np.array([v.view.enhanced for v in views], bool),
     )
 
 

@@ -20,6 +20,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.views import appearances
 
 if TYPE_CHECKING:
     from aeromatch_cli.nets.lightglue import Dimensions
@@ -66,9 +67,10 @@ class LightGlue(Strategy):
         views0 = [self._view(features0, idx) for idx in range(len(features0.view_sizes_px))]
         views1 = [self._view(features1, idx) for idx in range(len(features1.view_sizes_px))]
         found = [_Found.empty()]
+        compared = np.any(appearances(features0, features1), axis=0)
         for idx0, view0 in enumerate(views0):
             for idx1, view1 in enumerate(views1):
-                if len(view0.points_px) and len(view1.points_px):
+                if compared[idx0, idx1] and len(view0.points_px) and len(view1.points_px):
                     pairs, scores = matcher.match(view0, view1)
                     indices = np.stack([view0.keypoint_idx[pairs[:, 0]], view1.keypoint_idx[pairs[:, 1]]], axis=1)
                     found.append(_Found(indices, scores, np.full_like(indices, (idx0, idx1))))

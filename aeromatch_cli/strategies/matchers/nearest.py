@@ -14,7 +14,7 @@ from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
 from aeromatch_cli.strategies.matchers.guided import Found, search_again
 from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
-from aeromatch_cli.strategies.matchers.views import like_views
+from aeromatch_cli.strategies.matchers.views import appearances, like_views
 
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
@@ -61,7 +61,11 @@ class Nearest(Strategy):
         if windows is not None:
             limits = Limits(windows.forms(), undistort(geometry.camera1, features1.keypoints_px))
         alike = like_views(features0, features1, self.max_direction_deg)
-        found = self._scan(features0, features1, alike, limits)
+        # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
+        tried = [alike & pictures for pictures in appearances(features0, features1)]
+        scans = [self._scan(features0, features1, views, limits) for views in tried]
+        chosen = max(range(len(scans)), key=lambda index: len(scans[index].rows))
+        alike, found = tried[chosen], scans[chosen]
         if self.guided:
             found = search_again(found, features0, features1, geometry, alike, windows)
         return _matches(found, features0, features1)

@@ -22,8 +22,22 @@ def like_views(features0: Features, features1: Features, max_direction_deg: floa
     return np.asarray(alike)
 
 
+def appearances(features0: Features, features1: Features) -> list[BoolArray]:
+    """View pairs (V0, V1) of the pictures as taken, and of the enhanced ones where either image has any.
+
+    A picture in which nothing was enhanced is its own enhanced one.
+    """
+    found = [~features0.view_enhanced[:, None] & ~features1.view_enhanced]
+    if features0.view_enhanced.any() or features1.view_enhanced.any():
+        sides = [f.view_enhanced if f.view_enhanced.any() else ~f.view_enhanced for f in (features0, features1)]
+        found.append(sides[0][:, None] & sides[1])
+    return found
+
+
 def _is_source(features: Features) -> BoolArray:
-    """The source is view 0 where there is one, without a ground sampling distance and not turned from its own axis."""
+    """The source is the first view of its picture where there is one, without a ground sampling distance and not turned
+    from its own axis."""
     flags = np.isnan(features.view_gsd_m) & (features.view_angles_deg == 0.0)
-    flags[1:] = False
-    return np.asarray(flags)
+    first = np.ones(len(flags), dtype=bool)
+    first[1:] = features.view_enhanced[1:] != features.view_enhanced[:-1]
+    return np.asarray(flags & first)
