@@ -3,7 +3,7 @@
 Renders --blocks blocks of 8 small pictures each (scenes, flights, heights and suns drawn from their seeds, 100 and on;
 a city and a suburb are left out and only measured), trains a small U-Net for --steps steps on random pieces of them and
 writes its weights, batch normalisation folded in, as float16 safetensors for
-aeromatch_cli/strategies/enhancers/shadow_network.py.
+aeromatch_cli/nets/shadow.py.
 
 Since truth says how much of the sun each pixel lacks, materials and light are changed apart: dark materials and greens
 made darker, patches and strips of other albedo painted over sun and shadow alike, shadow weakened or taken away as by
@@ -181,7 +181,7 @@ class ConvBlock(nn.Sequential):
 
 
 class ShadowNet(nn.Module):
-    """What shadow_network.shadow_logits evaluates, as it is trained."""
+    """What nets.shadow.shadow_logits evaluates, as it is trained."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -212,7 +212,7 @@ def loss_of(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
 
 
 def folded(net: ShadowNet) -> dict[str, NDArray[np.float16]]:
-    """Weights as shadow_network reads them: NAME.weight (9 * C_in, C_out), NAME.bias (C_out,)."""
+    """Weights as nets.shadow reads them: NAME.weight (9 * C_in, C_out), NAME.bias (C_out,)."""
     arrays: dict[str, Any] = {}
     named = [(f"down{i}.{j}", block[j]) for i, block in enumerate(net.down) for j in (0, 1)]
     for name, (convolution, norm, _) in named + [(f"up{i}", block) for i, block in enumerate(net.up)]:

@@ -1,1 +1,1 @@
-"""Networks: torch modules and the loading of their weights. Nothing here downloads."""
+"""Networks: their architectures, and the loading of their weights. Nothing here downloads; torch only where it pays."""

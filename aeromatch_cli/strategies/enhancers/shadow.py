@@ -1,7 +1,7 @@
 """Adaptive shadow enhancement: shadow is found, region by region given the light it lacks, and nothing else changed.
 
 Method 1, step 1 of J. Geo-inf. Sci. 2025(6), 1401-1419, where its abstract leaves a choice open: detection by a small
-network (shadow_network), gains on linear light, borders by a guided filter.
+network (nets.shadow), gains on linear light, borders by a guided filter.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
+from aeromatch_cli.nets.shadow import WEIGHTS_PATH
 from aeromatch_cli.strategies import Enhanced, Strategy
 from aeromatch_cli.strategies.enhancers.relight import relit
 from aeromatch_cli.strategies.enhancers.shadow_mask import make_overview, shadow_share, soft_mask
-from aeromatch_cli.strategies.enhancers.shadow_network import WEIGHTS_PATH
 from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regions, gain_field, region_table
 
 

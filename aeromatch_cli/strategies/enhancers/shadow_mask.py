@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.strategies.enhancers.shadow_network import MULTIPLE_PX, network_weights, shadow_logits
+from aeromatch_cli.nets.shadow import MULTIPLE_PX, network_weights, shadow_logits
 from aeromatch_cli.strategies.enhancers.tone import Tone, tone_of
 
 # Light below this is taken for this: the noise of a dark pixel is no colour.

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-WEIGHTS_PATH = Path(__file__).with_name("shadow.safetensors")
+WEIGHTS_PATH = Path(__file__).parent / "trained" / "shadow.safetensors"
 SCALES = 5
 MULTIPLE_PX = 2**SCALES  # the first scale works on 2 x 2 pixels at once
 
