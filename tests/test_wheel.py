@@ -33,7 +33,9 @@ def test_wheel_holds_every_module_and_data_file(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     sources = {
-        p.relative_to(ROOT).as_posix() for p in (ROOT / "aeromatch_cli").rglob("*") if p.suffix in (".py", ".jinja", ".safetensors", ".md")
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "aeromatch_cli").rglob("*")
+        if path.suffix in (".py", ".jinja", ".safetensors", ".md")
     }
     presets = {f"aeromatch_cli/configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml")}
     assert sources | presets <= names
