@@ -40,7 +40,10 @@ class ShadowEnhancement(Strategy):
         description="How far a region's darkness against the other shadows changes its gain: 0 not, 1 to their mean.",
     )
     min_share: float = Field(
-        0.004, ge=0.0, le=1.0, description="Share of the picture from which shadow counts; below, nothing is changed."
+        0.02,
+        ge=0.0,
+        le=1.0,
+        description="Share of the picture from which shadow counts; below, nothing is changed: it could add no more.",
     )
     min_ratio: float = Field(
         1.3, ge=1.0, description="Lit over shadowed light from which shadow counts; below, nothing is changed."

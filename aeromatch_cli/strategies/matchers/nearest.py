@@ -23,9 +23,10 @@ _SAME_MATCH_PX = 1.0
 class Nearest(Strategy):
     """Mutual nearest neighbours between views of like direction, at most one match per keypoint.
 
-    guided: where both attitudes and the ground are known, a keypoint of image 0 is only compared with those of image 1
-    that lie where the poses and their sigma put it; then, whatever is known, around the places that the verified
-    matches predict (`matchers.guided`).
+    Most pairs of an ordinary block are settled by the pictures as they were taken (`ample`); the others are searched
+    harder. guided: where both attitudes and the ground are known, a keypoint of image 0 is only compared with those of
+    image 1 that lie where the poses and their sigma put it; then, whatever is known, around the places that the
+    verified matches predict (`matchers.guided`).
     """
 
     version: ClassVar[int] = 2
@@ -40,6 +41,12 @@ class Nearest(Strategy):
     )
     guided: bool = Field(
         False, description="Search where the poses say, then once more around what verified matches predict."
+    )
+    ample: int = Field(
+        500,
+        ge=1,
+        description="Where so many matches are found at once, enhanced pictures and guided search are left out: they "
+        "cost more than they add.",
     )
     sigmas: float = Field(3.0, gt=0.0, description="Guided: half-width of the window in predicted standard deviations.")
     sigma_px: float = Field(1.5, gt=0.0, description="Guided: standard deviation of a keypoint, pixels.")
@@ -56,19 +63,40 @@ class Nearest(Strategy):
 
         Scores are 1 - d1/d2, or 1 - cost where a model guided the search.
         """
+        alike = like_views(features0, features1, self.max_direction_deg)
+        pictures = [alike & which for which in appearances(features0, features1)]
         windows = self._windows(features0, geometry) if self.guided else None
+        found = self._scan(features0, features1, pictures[0], None)
+        if windows is not None:
+            idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+            seen = windows.take(idx0).contain(undistort(geometry.camera1, features1.keypoints_px[idx1]))
+            found = Found(found.rows[seen], found.columns[seen], found.costs[seen])
+        if len(found.rows) < self.ample:
+            found = self._search_harder(found, features0, features1, geometry, pictures, windows)
+        return _matches(found, features0, features1)
+
+    def _search_harder(
+        self,
+        first: Found,
+        features0: Features,
+        features1: Features,
+        geometry: PairGeometry,
+        pictures: list[BoolArray],
+        windows: Windows | None,
+    ) -> Found:
+        """Matches where those of the pictures as taken, `first`, are few. pictures: view pairs of each kind."""
         limits = None
         if windows is not None:
             limits = Limits(windows.forms(), undistort(geometry.camera1, features1.keypoints_px))
-        alike = like_views(features0, features1, self.max_direction_deg)
+        scans = [
+            first if limits is None and not index else self._scan(features0, features1, views, limits)
+            for index, views in enumerate(pictures)
+        ]
         # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
-        tried = [alike & pictures for pictures in appearances(features0, features1)]
-        scans = [self._scan(features0, features1, views, limits) for views in tried]
         chosen = max(range(len(scans)), key=lambda index: len(scans[index].rows))
-        alike, found = tried[chosen], scans[chosen]
-        if self.guided:
-            found = search_again(found, features0, features1, geometry, alike, windows)
-        return _matches(found, features0, features1)
+        if not self.guided:
+            return scans[chosen]
+        return search_again(scans[chosen], features0, features1, geometry, pictures[chosen], windows)
 
     def _windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
         """Where every keypoint of image 0 may lie in image 1, None where that is unknown."""
