@@ -103,4 +103,5 @@ def _settings(context: Context) -> str:
 
 def _facts(context: Context, image_id: str) -> str:
     pose = context.given_poses[image_id]
-    return fingerprint(context.image_fingerprints[image_id], pose.center_m, pose.world_rotation)
+    seen = context.geometry_fingerprint(image_id, frozenset({"camera", "ground"}))
+    return fingerprint(context.image_fingerprints[image_id], pose.center_m, pose.world_rotation, seen)

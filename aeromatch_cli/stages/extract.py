@@ -42,8 +42,7 @@ def make_task(context: Context, image: Image) -> ExtractTask:
     settings = context.settings
     geometry = context.geometry_fingerprint(image.image_id, settings.extract.needs)
     own = fingerprint(views.fingerprint, settings.extract, geometry)
-    extractor = settings.extract.with_room_for(1) if views.as_taken else settings.extract
-    return ExtractTask(views, extractor, settings.run.keep_images, own)
+    return ExtractTask(views, settings.extract, settings.run.keep_images, own)
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,8 @@ def run_task(task: ExtractTask) -> Extracted:
     pictures, enhancement = simulate.render(task.views)
     source = task.views.source
     camera = shrink_camera(source.camera, source.scale)
-    features = task.extractor(camera, pictures)
+    further = simulate.further_views(pictures)
+    features = (task.extractor.with_room_for(further) if further else task.extractor)(camera, pictures)
     if task.extractor.colours:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)

@@ -9,7 +9,7 @@ from pathlib import Path
 from aeromatch_cli.data import Features, Pair
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.stages import extract, rows
-from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
@@ -42,7 +42,7 @@ def pair_fingerprint(context: Context, pair: Pair) -> str:
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
         for i in (pair.image_id0, pair.image_id1)
     ]
-    return fingerprint(matcher, sides)
+    return fingerprint(matcher, library_version("poselib"), sides)
 
 
 def images_of_rows(context: Context) -> set[str]:

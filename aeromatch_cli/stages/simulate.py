@@ -18,6 +18,9 @@ from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
 from aeromatch_cli.workspace import fingerprint, read_json, write_atomically, write_json
 
+# Name of the source view that images get besides their simulated ones where other images have no attitude.
+_ADDED = "as-taken"
+
 
 @dataclass(frozen=True, eq=False)
 class SimulateTask:
@@ -51,7 +54,7 @@ def views_of(task: SimulateTask) -> tuple[View, ...]:
     camera = shrink_camera(task.source.camera, task.source.scale)
     views = task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
     if task.as_taken and not any(view.is_source for view in views):
-        return (source_view(camera, task.pose), *views)
+        return (replace(source_view(camera, task.pose), name=_ADDED), *views)
     return views
 
 
@@ -72,6 +75,11 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
             name = f"{view.name}-enhanced" if enhanced else view.name
             pictures.append(ViewPixels(replace(view, name=name, enhanced=enhanced), picture, seen))
     return pictures, result
+
+
+def further_views(pictures: Sequence[ViewPixels]) -> int:
+    """1 where the image as it was taken was added to simulated views because of other images' attitudes, else 0."""
+    return int(any(item.view.name == _ADDED for item in pictures))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.prediction import Windows, inverse_depths, places_of_heights, stereo_of
 from aeromatch_cli.geometry.two_view import Sampling, TwoView, chance_errors_px, estimate, log10_false_alarms
+from aeromatch_cli.strategies.matchers.assignment import one_to_one
 
 # Fewer matches support no first model, whatever the odds that chance gives it.
 _MIN_INLIERS = 12
@@ -20,9 +21,12 @@ _MODEL_PX = 4.0
 _NEIGHBOURS = 6
 # Predicting and searching: what is found predicts once more.
 _ROUNDS = 2
-# Standard deviations of true matches: Sampson distance and distance to the nearest predicted place, pixels; octaves
-# between both sizes beyond those of the matches around; distance of descriptors over the one that wrong pairs have.
+# Standard deviations of true matches: Sampson distance and distance to the nearest predicted place, pixels of the view
+# that found the keypoint (a reduced view tells places no better than its own pixels); octaves between both sizes beyond
+# those of the matches around; distance of descriptors over the one that wrong pairs have.
 _LINE_PX, _PLACE_PX, _SIZE_OCTAVES, _LOOK = 0.7, 1.0, 0.2, 0.4
+# Share of the model's matches that the search around the places which they predict must find again to be believed.
+_LEAST_KEPT = 0.5
 # Sum of the four squares that 95 % of the true matches stay below (chi-square).
 _LARGEST_COST = 9.49
 # Share of random keypoint pairs that look at most as different as "wrong pairs have".
@@ -43,12 +47,16 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One image as the search sees it. places_px: (K, 2) undistorted. first, count: (K,) run of its descriptors."""
+    """One image as the search sees it. places_px: (K, 2) undistorted. first, count: (K,) run of its descriptors.
+
+    units_px: (K,) stored pixels per pixel of the view that found each keypoint, 1 at least.
+    """
 
     features: Features
     places_px: FloatArray
     first: IntArray
     count: IntArray
+    units_px: FloatArray
 
 
 def search_again(
@@ -67,20 +75,35 @@ def search_again(
     """
     side0, side1 = side_of(features0, geometry.camera0), side_of(features1, geometry.camera1)
     wrong = distance_of_wrong_pairs(side0, side1, alike)
+    found = _one_to_one(found, features0, features1)
     for _ in range(_ROUNDS):
         idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
         model = verified(side0.places_px[idx0], side1.places_px[idx1], geometry, windows and windows.take(idx0))
         if model is None or wrong == 0.0:
             break
         places_px, octaves = predicted(side0, side1, idx0[model.inliers], idx1[model.inliers], model, geometry)
-        found = around(side0, side1, places_px, octaves, model, alike, wrong)
+        again = around(side0, side1, places_px, octaves, model, alike, wrong)
+        if len(again.rows) < _LEAST_KEPT * model.inliers.sum():
+            break  # heights around a match say nothing here: what was known is better
+        found = again
     return found
+
+
+def _one_to_one(found: Found, features0: Features, features1: Features) -> Found:
+    """The cheapest matches in which each keypoint occurs once: one that occurred twice would confirm itself."""
+    idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+    kept = one_to_one(idx0, idx1, found.costs)
+    return Found(found.rows[kept], found.columns[kept], found.costs[kept])
 
 
 def side_of(features: Features, camera: Camera) -> Side:
     """Needs the descriptors of a keypoint side by side, as extractors write them."""
     count = np.bincount(features.descriptor_keypoint_idx, minlength=len(features.keypoints_px))
-    return Side(features, undistort(camera, features.keypoints_px), np.cumsum(count) - count, count)
+    first = np.cumsum(count) - count
+    units_px = np.ones(len(count))
+    described = np.flatnonzero(count)
+    units_px[described] = features.sizes_px[described] / features.view_size_px[first[described]]
+    return Side(features, undistort(camera, features.keypoints_px), first, count, np.maximum(units_px, 1.0))
 
 
 def verified(
@@ -152,12 +175,15 @@ def around(
     wrong: float,
 ) -> Found:
     """Mutually best matches near the predicted places (K0, Q, 2) and sizes (K0,), by the sum of what disagrees."""
-    idx0, idx1 = nearby(places_px, side1.places_px, _PLACE_PX * np.sqrt(_LARGEST_COST))
+    farthest_px = _PLACE_PX * np.sqrt(_LARGEST_COST) * float(side1.units_px.max(initial=1.0))
+    idx0, idx1 = nearby(places_px, side1.places_px, farthest_px)
     errors_px = sampson_distance_px(model.pixel_model, side0.places_px[idx0], side1.places_px[idx1])
     apart_px = np.linalg.norm(places_px[idx0] - side1.places_px[idx1][:, None], axis=2)
     apart_px = np.where(np.isfinite(apart_px), apart_px, np.inf).min(axis=1)
     steps = _octaves(side0, side1, idx0, idx1) - octaves[idx0]
-    costs = (errors_px / _LINE_PX) ** 2 + (apart_px / _PLACE_PX) ** 2 + (steps / _SIZE_OCTAVES) ** 2
+    line_px = _LINE_PX * np.sqrt((side0.units_px[idx0] ** 2 + side1.units_px[idx1] ** 2) / 2.0)
+    place_px = _PLACE_PX * side1.units_px[idx1]
+    costs = (errors_px / line_px) ** 2 + (apart_px / place_px) ** 2 + (steps / _SIZE_OCTAVES) ** 2
     idx0, idx1, costs = (values[costs <= _LARGEST_COST] for values in (idx0, idx1, costs))
     distances, rows, columns = closest(side0, side1, idx0, idx1, alike)
     costs = costs + (distances / (_LOOK * wrong)) ** 2
