@@ -128,14 +128,17 @@ class Settings(_Section):
         if not any(one.verifies for one in value):
             names = "+".join(getattr(one, "name", "") for one in value)
             evidence = next(name for name, strategy in FILTERS.items() if strategy.verifies)
-            raise ValueError(f"{names} verifies nothing by itself; use {evidence}+{names}")
+            colours = " with extract.colours=true" if any("colour" in one.needs for one in value) else ""
+            raise ValueError(f"{names} verifies nothing by itself; use {names}+{evidence}{colours}")
         return value
 
     @model_validator(mode="after")
     def _colours_for_filters(self) -> Settings:
         readers = [getattr(one, "name", "") for one in self.filter if "colour" in one.needs]
         if readers and not self.extract.colours:
-            raise ValueError(f"filter {'+'.join(readers)} compares colours that are not kept; set extract.colours=true")
+            raise ValueError(
+                f"filter {'+'.join(readers)} compares colours that are not kept; add --set extract.colours=true"
+            )
         return self
 
     @field_validator("export")

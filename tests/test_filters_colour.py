@@ -90,7 +90,7 @@ def test_colours_are_counted():
 def test_the_filter_needs_colours_and_another_that_verifies():
     with pytest.raises(ConfigError, match=r"extract\.colours"):
         load("default", ["filter=colour+poselib"])
-    with pytest.raises(ConfigError, match="verifies nothing"):
+    with pytest.raises(ConfigError, match=r"use colour\+poselib with extract.colours=true"):
         load("default", ["filter=colour", "extract.colours=true"])
     chain = load("default", ["filter=colour+clustered-ransac+epipolar", "extract.colours=true"]).filter
     assert [one.name for one in chain] == ["colour", "clustered-ransac", "epipolar"]

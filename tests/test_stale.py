@@ -102,3 +102,18 @@ def test_a_focal_length_that_is_no_guess_any_more_is_exported_anew(site: Site) -
     assert prior() == 0
     assert site("run").code == 0
     assert prior() == 1
+
+
+def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
+    workspace = Workspace(site.work)
+    image_id = site.names()[0].replace(".", "_")
+    assert site("enhance", "--set", "enhance=shadow").code == 0
+    assert workspace.enhanced(image_id, ".mask.png").is_file()
+    assert site("simulate", "--set", "simulate=tilts").code == 0
+    tilted = {path.name for path in workspace.views(image_id).parent.glob("*.png")}
+    assert site("enhance").code == 0
+    assert not workspace.enhanced(image_id, ".mask.png").exists()
+    assert site("simulate").code == 0
+    names = {path.stem for path in workspace.views(image_id).parent.glob("*.png")}
+    assert names == {view["name"] for view in read_json(workspace.views(image_id))["views"]}
+    assert not tilted <= {f"{name}.png" for name in names}

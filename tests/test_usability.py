@@ -73,7 +73,7 @@ def faults(*overrides: str, **top: object) -> list[str]:
 
 @pytest.mark.parametrize("value", ["pose", "[{name: pose, sigmas: 2}]"])
 def test_a_chain_that_verifies_nothing_is_refused(value):
-    assert faults(f"filter={value}")[1:] == ["  filter: pose verifies nothing by itself; use poselib+pose"]
+    assert faults(f"filter={value}")[1:] == ["  filter: pose verifies nothing by itself; use pose+poselib"]
     assert len(load("baseline", [f"filter={value}", "filter=poselib+pose"]).filter) == 2
 
 

@@ -131,7 +131,14 @@ def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhance
 
 
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
-    """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing."""
+    """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing.
+
+    What another strategy left goes: a mask of other settings would be taken for this one's.
+    """
+    kept = {".png": picture, ".mask.png": result.mask is not None, ".json": picture or bool(result.info)}
+    for suffix, stays in kept.items():
+        if not stays:
+            task.workspace.enhanced(task.image_id, suffix).unlink(missing_ok=True)
     if picture:
         write_atomically(task.workspace.enhanced(task.image_id, ".png"), lambda s: write_png(s, result.pixels))
     mask = result.mask

@@ -97,6 +97,11 @@ class ViewCost:
 def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: bool) -> None:
     """Write views.json, and with `with_pictures` a PNG of every view."""
     workspace, image_id = task.source.workspace, task.source.image_id
+    stale = set(workspace.views(image_id).parent.glob("*.png"))
+    if with_pictures:
+        stale -= {workspace.view(image_id, item.view.name) for item in pictures}
+    for path in sorted(stale):
+        path.unlink(missing_ok=True)  # of other settings: views.json would not list it
     if with_pictures:
         for item in pictures:
             gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
