@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -167,9 +167,10 @@ def run(context: Context) -> StageReport:
     report.done = sum(result.done for result in results)
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
-    report.facts = summarise(context)
+    root = components(context)
+    report.facts = summarise(context, root)
     if context.shard is None:
-        judged = distrust.judge(context, _rotations(context), None if missing else _components(context))
+        judged = distrust.judge(context, _rotations(context), None if missing else root)
         report.facts["rotation_contradicts_pose"] = judged
     return report.write(context.workspace, context.shard)
 
@@ -206,8 +207,8 @@ def _rotations(context: Context) -> list[tuple[str, str, FloatArray, int]]:
     ]
 
 
-def summarise(context: Context) -> dict[str, Any]:
-    """States of the pairs, verified matches, connected components and weakly tied images."""
+def summarise(context: Context, root: Mapping[str, str]) -> dict[str, Any]:
+    """States of the pairs, verified matches, connected components (root: see `components`) and weakly tied images."""
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()
     matches = 0
@@ -217,7 +218,7 @@ def summarise(context: Context) -> dict[str, Any]:
             count = len(entry.matches.indices)
             matches += count
             ties.update({pair.image_id0: count, pair.image_id1: count})
-    sizes = Counter(_components(context).values())
+    sizes = Counter(root.values())
     weak = sorted(image.image_id for image in context.block.images if ties[image.image_id] < WEAK_MATCHES)
     return {
         "pairs": dict(sorted(states.items())),
@@ -227,7 +228,7 @@ def summarise(context: Context) -> dict[str, Any]:
     }
 
 
-def _components(context: Context) -> dict[str, str]:
+def components(context: Context) -> dict[str, str]:
     """image_id -> the image that stands for all those that verified pairs connect with it."""
     parent = {image.image_id: image.image_id for image in context.block.images}
 

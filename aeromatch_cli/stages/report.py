@@ -22,7 +22,7 @@ from aeromatch_cli.images import read_pixels
 from aeromatch_cli.stages import report_figures as figures
 from aeromatch_cli.stages import report_map
 from aeromatch_cli.stages.common import Context, StageReport
-from aeromatch_cli.stages.filter import WEAK_MATCHES, match_points, summarise
+from aeromatch_cli.stages.filter import WEAK_MATCHES, components, match_points, summarise
 from aeromatch_cli.stages.report_evaluation import evaluation_figures
 from aeromatch_cli.stages.report_rows import NOT_JUDGED, ImageRow, PairRow, StageRow, failure_rows, gather, stage_rows
 from aeromatch_cli.workspace import fingerprint, read_json, write_text
@@ -77,7 +77,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     environment.filters["number"] = number
     source = resources.files("aeromatch_cli.stages") / "report.html.jinja"
     template = environment.from_string(source.read_text(encoding="utf-8"))
-    facts = summarise(context)
+    facts = summarise(context, components(context))
     contradictions = _contradictions(context)
     failures = failure_rows(context)
     remarks = _remarks(context)

@@ -68,9 +68,9 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
     if task.source.enhancer.beside and result.pixels is not pixels:
         grays = [(to_gray8(pixels), False), (grays[0][0], True)]
     camera = shrink_camera(task.source.camera, task.source.scale)
-    pictures = []
+    views, pictures = views_of(task), []
     for gray, enhanced in grays:
-        for view in views_of(task):
+        for view in views:
             picture, seen = render_view(gray, valid, camera, view)
             name = f"{view.name}-enhanced" if enhanced else view.name
             pictures.append(ViewPixels(replace(view, name=name, enhanced=enhanced), picture, seen))

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli.data import FloatArray
+
 _STRIP_ROWS = 256
 
 
@@ -23,15 +25,21 @@ def brightness(pixels: NDArray[Any]) -> NDArray[Any]:
 
 def with_brightness(pixels: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[Any]:
     """Pixels (H, W) or (H, W, C) scaled, all bands alike, so that their brightness `before` becomes `after`."""
-    import cv2
-
     if pixels.ndim == 2:
         return after.astype(pixels.dtype)
     out = np.empty_like(pixels)
-    code = cv2.CV_8U if pixels.dtype == np.uint8 else cv2.CV_16U
     for top in range(0, len(pixels), _STRIP_ROWS):
         rows = slice(top, top + _STRIP_ROWS)
         factor = after[rows].astype(np.float32) / np.maximum(before[rows].astype(np.float32), np.float32(1.0))
-        wide = cv2.merge([factor] * pixels.shape[2])
-        out[rows] = cv2.multiply(pixels[rows], wide, dtype=code).reshape(out[rows].shape)
+        out[rows] = multiplied(pixels[rows], factor)
     return out
+
+
+def multiplied(source: NDArray[Any], factor: FloatArray) -> NDArray[Any]:
+    """source (H, W) or (H, W, C) times factor (H, W), rounded and bounded to its type."""
+    import cv2
+
+    bands = 1 if source.ndim == 2 else source.shape[2]
+    wide = factor if source.ndim == 2 else cv2.merge([factor] * bands)
+    code = cv2.CV_8U if source.dtype == np.uint8 else cv2.CV_16U
+    return np.asarray(cv2.multiply(source, wide, dtype=code)).reshape(source.shape)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.strategies.enhancers.brightness import multiplied
 from aeromatch_cli.strategies.enhancers.shadow_mask import SoftMask, guide_of
 from aeromatch_cli.strategies.enhancers.tone import Tone
 
@@ -55,7 +56,7 @@ def relit(
             continue
         calm = _calmed(around, noise)[top - first :][: bottom - top]
         factor = np.where(changed, tone.factor(level, log) * calm, np.float32(1.0))
-        lifted[top:bottom] = _multiplied(source, np.maximum(factor, np.float32(1.0)))
+        lifted[top:bottom] = multiplied(source, np.maximum(factor, np.float32(1.0)))
     return lifted, mask
 
 
@@ -102,13 +103,3 @@ def _enlarged(small: FloatArray, top: int, bottom: int, height: int, width: int)
     return np.asarray(
         cv2.warpAffine(small, matrix, (width, bottom - top), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     )
-
-
-def _multiplied(source: NDArray[Any], factor: FloatArray) -> NDArray[Any]:
-    """source (H, W) or (H, W, C) times factor (H, W), rounded and bounded to its type."""
-    import cv2
-
-    bands = 1 if source.ndim == 2 else source.shape[2]
-    wide = factor if source.ndim == 2 else cv2.merge([factor] * bands)
-    code = cv2.CV_8U if source.dtype == np.uint8 else cv2.CV_16U
-    return np.asarray(cv2.multiply(source, wide, dtype=code)).reshape(source.shape)

@@ -15,7 +15,7 @@ def one_to_one(idx0: IntArray, idx1: IntArray, costs: FloatArray) -> IntArray:
     order = np.argsort(costs, kind="stable")
     kept: list[IntArray] = []
     while len(order):
-        first0, first1 = _is_first(idx0[order]), _is_first(idx1[order])
+        first0, first1 = is_first(idx0[order]), is_first(idx1[order])
         chosen = order[first0 & first1]
         kept.append(chosen)
         order = order[~(np.isin(idx0[order], idx0[chosen]) | np.isin(idx1[order], idx1[chosen]))]
@@ -42,7 +42,8 @@ def distinct(places_px: FloatArray, costs: FloatArray, radius_px: float) -> IntA
     return np.flatnonzero(kept)
 
 
-def _is_first(values: IntArray) -> BoolArray:
+def is_first(values: IntArray) -> BoolArray:
+    """Whether each (N,) has no equal before it."""
     flags = np.zeros(len(values), dtype=bool)
     flags[np.unique(values, return_index=True)[1]] = True
     return flags

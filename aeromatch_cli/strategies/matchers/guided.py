@@ -11,7 +11,7 @@ from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.prediction import Windows, inverse_depths, places_of_heights, stereo_of
 from aeromatch_cli.geometry.two_view import Sampling, TwoView, chance_errors_px, estimate, log10_false_alarms
-from aeromatch_cli.strategies.matchers.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.assignment import is_first, one_to_one
 
 # Fewer matches support no first model, whatever the odds that chance gives it.
 _MIN_INLIERS = 12
@@ -44,6 +44,14 @@ class Found:
     columns: IntArray
     costs: FloatArray
 
+    def take(self, which: IntArray | BoolArray) -> Found:
+        """Those of the given positions or mask."""
+        return Found(self.rows[which], self.columns[which], self.costs[which])
+
+    def keypoints(self, features0: Features, features1: Features) -> tuple[IntArray, IntArray]:
+        """The same as keypoints (N,) of either image."""
+        return features0.descriptor_keypoint_idx[self.rows], features1.descriptor_keypoint_idx[self.columns]
+
 
 @dataclass(frozen=True, eq=False)
 class Side:
@@ -75,9 +83,10 @@ def search_again(
     """
     side0, side1 = side_of(features0, geometry.camera0), side_of(features1, geometry.camera1)
     wrong = distance_of_wrong_pairs(side0, side1, alike)
-    found = _one_to_one(found, features0, features1)
+    # One that occurred twice would confirm itself.
+    found = found.take(one_to_one(*found.keypoints(features0, features1), found.costs))
     for _ in range(_ROUNDS):
-        idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+        idx0, idx1 = found.keypoints(features0, features1)
         model = verified(side0.places_px[idx0], side1.places_px[idx1], geometry, windows and windows.take(idx0))
         if model is None or wrong == 0.0:
             break
@@ -87,13 +96,6 @@ def search_again(
             break  # heights around a match say nothing here: what was known is better
         found = again
     return found
-
-
-def _one_to_one(found: Found, features0: Features, features1: Features) -> Found:
-    """The cheapest matches in which each keypoint occurs once: one that occurred twice would confirm itself."""
-    idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
-    kept = one_to_one(idx0, idx1, found.costs)
-    return Found(found.rows[kept], found.columns[kept], found.costs[kept])
 
 
 def side_of(features: Features, camera: Camera) -> Side:
@@ -272,5 +274,5 @@ def is_cheapest(groups: IntArray, costs: FloatArray) -> BoolArray:
     """Whether each (N,) is the first of the cheapest of its group."""
     order = np.lexsort((costs, groups))
     flags = np.zeros(len(order), dtype=bool)
-    flags[order[np.unique(groups[order], return_index=True)[1]]] = True
+    flags[order] = is_first(groups[order])
     return flags

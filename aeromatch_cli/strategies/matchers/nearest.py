@@ -68,9 +68,9 @@ class Nearest(Strategy):
         windows = self._windows(features0, geometry) if self.guided else None
         found = self._scan(features0, features1, pictures[0], None)
         if windows is not None:
-            idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+            idx0, idx1 = found.keypoints(features0, features1)
             seen = windows.take(idx0).contain(undistort(geometry.camera1, features1.keypoints_px[idx1]))
-            found = Found(found.rows[seen], found.columns[seen], found.costs[seen])
+            found = found.take(seen)
         if len(found.rows) < self.ample:
             found = self._search_harder(found, features0, features1, geometry, pictures, windows)
         return _matches(found, features0, features1)
@@ -140,7 +140,7 @@ class Nearest(Strategy):
 
 def _matches(found: Found, features0: Features, features1: Features) -> Matches:
     """The cheapest matches in which each keypoint occurs once, and no two lie together in both images."""
-    idx0, idx1 = features0.descriptor_keypoint_idx[found.rows], features1.descriptor_keypoint_idx[found.columns]
+    idx0, idx1 = found.keypoints(features0, features1)
     kept = one_to_one(idx0, idx1, found.costs)
     places: FloatArray = np.concatenate(
         [features0.keypoints_px[idx0[kept]], features1.keypoints_px[idx1[kept]]], axis=1, dtype=np.float64
