@@ -29,6 +29,8 @@ _PROPOSALS = 48  # of a cluster, the best supported
 _REFINEMENTS = 2
 # Area of a triangle of neighbours over the square of its longer side at the match: flatter ones give no affinity.
 _FLATTEST = 0.1
+# Neighbours closer than float32 tells apart span no affinity; its terms would overflow.
+_LEAST_AREA_PX = 1e-6
 _NEARBY_CLUSTERS = 4
 _KMEANS_STEPS = 8
 _TINY = 1e-12
@@ -153,7 +155,7 @@ def _local_affinities(
     pairs = np.array(list(combinations(range(count), 2)))
     a, b = move0[:, pairs[:, 0]], move0[:, pairs[:, 1]]
     area = a[0] * b[1] - a[1] * b[0]
-    usable = np.abs(area) > _FLATTEST * np.maximum((a**2).sum(axis=0), (b**2).sum(axis=0))
+    usable = np.abs(area) > np.maximum(_FLATTEST * np.maximum((a**2).sum(axis=0), (b**2).sum(axis=0)), _LEAST_AREA_PX)
     over = np.divide(1.0, area, out=np.zeros_like(area), where=usable)
     # Rows of the affinity that maps the moves a, b of a pair to theirs in image 1.
     of_a, of_b = move1[:, pairs[:, 0]] * over, move1[:, pairs[:, 1]] * over
