@@ -77,6 +77,9 @@ def _sample(context: Context) -> set[str]:
 def _pixels(image: Image, trial: _Trial) -> int:
     """What an image is worked on as: its own pixels, or those of all its views."""
     views = simulate.views_of(trial.task.views)
+    source = trial.task.views.source
+    if source.enhancer.beside and not source.spared:
+        views *= 2
     return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
 
 

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -135,6 +136,15 @@ class Context:
                 camera = self.block.camera(self.image_by_id[other_id])
                 found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
         return tuple(found)
+
+    def under_one_sun(self, image_id: str, minutes: float) -> bool:
+        """Whether an image and all that it is paired with are known to be taken within so many minutes."""
+        images = self.image_by_id
+        times = [images[i].time for i in (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))]
+        if minutes <= 0.0 or not all(times):
+            return False
+        taken, *others = (datetime.fromisoformat(time) for time in times)
+        return all(abs((other - taken).total_seconds()) <= 60.0 * minutes for other in others)
 
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """What strategies with these `needs` read of one image's geometry."""

@@ -31,7 +31,8 @@ class EnhanceTask:
     """One image to enhance.
 
     mask: file or None. sky_rotation: the attitude where the image sees above the horizon, else None. scale: stored
-    raster to the raster worked on (--max-size). colour: whether a later stage reads the picture's colours.
+    raster to the raster worked on (--max-size). colour: whether a later stage reads the picture's colours. spared: no
+    pair needs this image enhanced, so that later stages take it as it is.
     """
 
     image_id: str
@@ -42,6 +43,7 @@ class EnhanceTask:
     scale: float
     colour: bool
     enhancer: Enhancer
+    spared: bool
     workspace: Workspace
     fingerprint: str
 
@@ -76,9 +78,15 @@ def make_task(context: Context, image: Image) -> EnhanceTask:
         scale=scale,
         colour=colour,
         enhancer=settings.enhance,
+        spared=_is_spared(context, image),
         workspace=context.workspace,
         fingerprint=fingerprint(*parts),
     )
+
+
+def _is_spared(context: Context, image: Image) -> bool:
+    enhancer = context.settings.enhance
+    return enhancer.beside and context.under_one_sun(image.image_id, enhancer.one_sun_minutes)
 
 
 def load_source(task: EnhanceTask, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
@@ -130,6 +138,14 @@ def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhance
     return pixels, valid, task.enhancer(pixels, valid)
 
 
+def for_views(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
+    """The same for the stages after this one: a spared image as it was taken."""
+    if not task.spared:
+        return enhanced(task)
+    pixels, valid = load_source(task, colour=task.colour)
+    return pixels, valid, Enhanced(pixels)
+
+
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing.
 
@@ -147,6 +163,14 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     if picture or result.info:
         facts = task.workspace.enhanced(task.image_id, ".json")
         write_json(facts, {"fingerprint": task.fingerprint, "picture": picture, **result.info})
+
+
+def keep_for_views(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
+    """The same for the stages after this one: of a spared image what this stage made for itself stays."""
+    if not task.spared:
+        keep(task, result, picture=picture)
+    elif _facts(task).get("fingerprint") != task.fingerprint:
+        keep(task, result, picture=False)
 
 
 def _run_task(task: EnhanceTask) -> str:
@@ -168,9 +192,12 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: EnhanceTask) -> bool:
     """Whether the picture on file is the one that the task would make."""
-    facts = task.workspace.enhanced(task.image_id, ".json")
+    found = _facts(task)
     picture = task.workspace.enhanced(task.image_id, ".png")
-    if not (picture.is_file() and facts.is_file()):
-        return False
-    found = read_json(facts)
-    return found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))
+    return picture.is_file() and found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))
+
+
+def _facts(task: EnhanceTask) -> dict[str, Any]:
+    """What the image's JSON file says, {} without one."""
+    path = task.workspace.enhanced(task.image_id, ".json")
+    return read_json(path) if path.is_file() else {}

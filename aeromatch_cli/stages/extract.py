@@ -64,7 +64,7 @@ def run_task(task: ExtractTask) -> Extracted:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)
     features = _in_stored_frame(features, source.scale)
-    enhance.keep(source, enhancement, picture=task.keep_images)
+    enhance.keep_for_views(source, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
     return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
@@ -114,7 +114,8 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 def _is_done(task: ExtractTask) -> bool:
     if features_fingerprint(task.path) != task.fingerprint:
         return False
-    return not task.keep_images or (enhance.is_done(task.views.source) and simulate.is_done(task.views))
+    source = task.views.source
+    return not task.keep_images or ((source.spared or enhance.is_done(source)) and simulate.is_done(task.views))
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:

@@ -43,7 +43,7 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     ground_z_m = context.ground_z_m(image.image_id)
     geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
     as_taken = context.settings.extract.follows_north and context.lacks_north(image.image_id)
-    own = fingerprint(source.fingerprint, simulator, geometry, as_taken)
+    own = fingerprint(source.fingerprint, source.spared, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)
     return SimulateTask(source, pose, ground_z_m, context.block.gsd_m, neighbours, as_taken, simulator, own)
@@ -63,7 +63,7 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
 
     With an enhancement `beside` the source that changed anything, all views of the source and then all of that.
     """
-    pixels, valid, result = enhance.enhanced(task.source)
+    pixels, valid, result = enhance.for_views(task.source)
     grays = [(to_gray8(result.pixels), False)]
     if task.source.enhancer.beside and result.pixels is not pixels:
         grays = [(to_gray8(pixels), False), (grays[0][0], True)]

@@ -69,12 +69,16 @@ class ViewPixels:
 class Enhancer(Protocol):
     """needs_colour: False where the strategy takes gray pixels, which decode faster.
     beside: whether the picture as it was taken has views too, so that every pair can use what suits it.
+    one_sun_minutes: with beside, images whose partners were all taken within this time are left as they are.
     """
 
     needs_colour: ClassVar[bool]
 
     @property
     def beside(self) -> bool: ...
+
+    @property
+    def one_sun_minutes(self) -> float: ...
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced: ...
 

@@ -9,19 +9,16 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.strategies import Enhanced, Strategy
+from aeromatch_cli.strategies import Enhanced
+from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
 
 
-class ClaheEnhancement(Strategy):
+class ClaheEnhancement(Beside):
     """Local contrast everywhere, shadow or not; hue stays."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["clahe"] = "clahe"
-    beside: bool = Field(
-        False,
-        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
-    )
     clip_limit: float = Field(2.0, gt=0.0, le=100.0, description="Bound on a tile's slope of mapping, OpenCV's unit.")
     tiles: int = Field(8, ge=1, le=256, description="Tiles across and down the picture.")
 

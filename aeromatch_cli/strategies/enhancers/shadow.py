@@ -14,21 +14,19 @@ from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.nets.shadow import WEIGHTS_PATH
-from aeromatch_cli.strategies import Enhanced, Strategy
+from aeromatch_cli.strategies import Enhanced
+from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.relight import relit
 from aeromatch_cli.strategies.enhancers.shadow_mask import make_overview, shadow_share, soft_mask
 from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regions, gain_field, region_table
 
 
-class ShadowEnhancement(Strategy):
+class ShadowEnhancement(Beside):
     """Shadows lifted to the light around them; a picture without shadow passes unchanged."""
 
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
-    beside: bool = Field(
-        True,
-        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
-    )
+    beside: bool = Field(True, description=Beside.model_fields["beside"].description)
     detection_px: int = Field(768, ge=64, le=4096, description="Longer side at which shadow is looked for.")
     max_gain: float = Field(
         6.0, ge=1.0, le=64.0, description="Most light given to a region, as a factor; a clear sky lacks this much sun."

@@ -12,22 +12,19 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.strategies import Enhanced, Strategy
+from aeromatch_cli.strategies import Enhanced
+from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
 
 _STRIP_ROWS = 256
 _WHITE_PERCENTILE = 99.8  # of pictures deeper than 8 bits, whose white is not known
 
 
-class WallisEnhancement(Strategy):
+class WallisEnhancement(Beside):
     """Local mean and contrast made alike everywhere, shadow or not; hue stays."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["wallis"] = "wallis"
-    beside: bool = Field(
-        False,
-        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
-    )
     window_share: float = Field(
         0.04, gt=0.0, le=1.0, description="Side of the neighbourhood as a share of the picture's longer side."
     )

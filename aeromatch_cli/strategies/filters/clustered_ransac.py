@@ -26,11 +26,12 @@ class ClusteredRansac(Strategy):
     The number of clusters follows the colour content: dominant colours of the matched places in image 0 (see
     `colour.dominant_colours`), or one per 64 matches where the extractor keeps no colours; never so many that they
     hold less than 24 matches on average. Small structures, trees and facades that make no plane are kept by local
-    support. Where planes and support do not explain min_inliers matches there is too little to judge by: everything is
-    left to the filters after this one, and the verdict is "not verifiable".
+    support; the more of a pair's matches are explained, the less of it is asked, for where few are wrong, being alone
+    is no sign of being wrong. Where planes and support do not explain min_inliers matches there is too little to judge
+    by: everything is left to the filters after this one, and the verdict is "not verifiable".
     """
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["clustered-ransac"] = "clustered-ransac"
     clusters: int = Field(0, ge=0, description="Clusters at most; 0 = as many as dominant colours.")
@@ -39,14 +40,17 @@ class ClusteredRansac(Strategy):
         3.0, gt=0.0, description="Largest distance to a plane, larger of both directions, undistorted pixels."
     )
     support: float = Field(
-        2.0, gt=0.0, description="Neighbours that must move with a match on no plane, weighted by how well (0-6)."
+        3.0,
+        gt=0.0,
+        description="Neighbours that must move with a match on no plane, weighted by how well (0-6); fewer where this "
+        "and the planes explain more than half of the matches.",
     )
     min_inliers: int = Field(15, ge=8, description="Fewer matches, or fewer explained ones, are not verifiable.")
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has the homography of the plane with most matches, and distances to each match's own plane."""
         found, usable = self.find_planes(candidates, geometry, seed)
-        explained = (found.labels >= 0) | (found.support >= self.support)
+        explained = self._explained(found)
         if not len(found.homographies) or explained.sum() < self.min_inliers:
             reason = f"{int(explained.sum())} of {len(usable)} matches lie on planes, {self.min_inliers} needed"
             return Verdict(keep=usable, state="not verifiable", reason=reason)
@@ -62,6 +66,13 @@ class ClusteredRansac(Strategy):
             model=found.homographies[largest],
             errors_px=errors,
         )
+
+    def _explained(self, found: Planes) -> BoolArray:
+        """Which matches (N,) lie on planes or have support enough."""
+        strictly = (found.labels >= 0) | (found.support >= self.support)
+        wrong = 1.0 - strictly.mean() if len(strictly) else 1.0
+        needed = self.support * min(1.0, 2.0 * wrong)
+        return np.asarray((found.labels >= 0) | ((found.support > 0.0) & (found.support >= needed)))
 
     def find_planes(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> tuple[Planes, BoolArray]:
         """The planes among the matches that have undistorted pixels, and which of those given (M,) these are."""

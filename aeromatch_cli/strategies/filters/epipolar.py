@@ -24,7 +24,7 @@ class Epipolar(Gated):
     narrowed to `sigmas` of it: what is locally consistent but globally impossible goes, and so do near misses.
     """
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["epipolar"] = "epipolar"
     model: Literal["relative_pose", "fundamental"] = Field(
@@ -34,7 +34,7 @@ class Epipolar(Gated):
     sigmas: float = Field(
         6.0, gt=0.0, description="Half-width of the band in standard deviations of its matches, at most threshold_px."
     )
-    narrowest_px: float = Field(1.0, gt=0.0, description="The band is no narrower than this on either side.")
+    narrowest_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""

@@ -1,0 +1,22 @@
+"""What enhancers have in common: whether the picture as it was taken stays in use."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from aeromatch_cli.strategies import Strategy
+
+
+class Beside(Strategy):
+    """An enhancer whose picture is used instead of the one that was taken, or beside it."""
+
+    beside: bool = Field(
+        False,
+        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
+    )
+    one_sun_minutes: float = Field(
+        20.0,
+        ge=0.0,
+        description="With beside: an image whose partners were all taken within so many minutes of it is left as it "
+        "is (the sun moves by 5 degrees in 20 minutes, so their shadows are alike); 0, or an unknown time: never.",
+    )
