@@ -15,7 +15,9 @@ from aeromatch_cli.strategies.enhancers.tone import Tone, tone_of
 # Light below this is taken for this: the noise of a dark pixel is no colour.
 _DARKEST_LIGHT = 0.004
 _LOG_LIMIT, _COLOUR_LIMIT, _COLOUR_SCALE = 4.0, 3.0, 2.0
-# Probabilities this much steeper around one half are shares of shadow: what is likely shadow is wholly so.
+# A dark roof called shadow is worse than a shadow left alone: what is no likelier than this counts half.
+_LIKELY = 0.7
+# Probabilities are this much steeper around it as shares of shadow: what is likely shadow is wholly so.
 _STEEPNESS = 4.0
 # Borders follow the picture's own edges over this many pixels of the overview, where they are this clear.
 _GUIDE_RADIUS_PX, _GUIDE_EPSILON = 5, 0.01**2
@@ -100,7 +102,7 @@ def shadow_share(overview: Overview) -> FloatArray:
     coarse = _logits(np.asarray(cv2.resize(inputs, half, interpolation=cv2.INTER_AREA)))
     logits = 0.5 * (_logits(inputs) + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR))
     probability = 1.0 / (1.0 + np.exp(-np.clip(logits, -30.0, 30.0)))
-    share = np.clip(_STEEPNESS * (probability - 0.5) + 0.5, 0.0, 1.0)
+    share = np.clip(_STEEPNESS * (probability - _LIKELY) + 0.5, 0.0, 1.0)
     return np.asarray(np.where(overview.valid, share, 0.0), dtype=np.float32)
 
 
