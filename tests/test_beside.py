@@ -1,0 +1,85 @@
+"""Pictures beside those that were taken: which images get them, what stays on file, and the preset that uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from conftest import QUICK, Site, invoke
+from PIL import Image
+
+from aeromatch_cli.formats import read_features
+from aeromatch_cli.workspace import read_json
+
+BESIDE = ("--set", "enhance=clahe", "--set", "enhance.beside=true")
+_EXIF_IFD, _DATE_TIME_ORIGINAL = 0x8769, 36867
+
+
+def take_at(site: Site, clock: Callable[[int], str]) -> None:
+    """Write capture times "HH:MM:SS" by the number of the image in the order of names."""
+    for number, name in enumerate(site.names()):
+        path = site.images / name
+        with Image.open(path) as picture:
+            tags = picture.getexif()
+            tags.get_ifd(_EXIF_IFD)[_DATE_TIME_ORIGINAL] = f"2024:06:21 {clock(number)}"
+            picture.save(path, exif=tags)
+
+
+def enhanced_views(site: Site) -> dict[str, bool]:
+    """By image id: whether its features come from an enhanced picture too."""
+    features = {path.stem: read_features(path) for path in (site.work / "features").glob("*.npz")}
+    return {image_id: bool(found.view_enhanced.any()) for image_id, found in features.items()}
+
+
+def test_without_capture_times_every_image_has_both_pictures(site: Site) -> None:
+    assert site("extract", *BESIDE).code == 0
+    assert set(enhanced_views(site).values()) == {True}
+    budget = next(float(value) for key, _, value in (o.partition("=") for o in QUICK) if key == "extract.keypoints")
+    for path in (site.work / "features").glob("*.npz"):
+        found = read_features(path)
+        of_enhanced = found.view_enhanced[found.view_idx]
+        assert len(of_enhanced) == 2 * (~of_enhanced).sum() == 2 * budget  # as many descriptors in either
+
+
+def test_images_of_one_sun_are_left_as_they_are(site: Site) -> None:
+    take_at(site, lambda number: f"12:{5 * number:02d}:00")  # five images within 20 minutes
+    assert site("extract", *BESIDE).code == 0
+    assert set(enhanced_views(site).values()) == {False}
+    alone = site.another_workspace("alone")
+    assert site("extract", "--workspace", alone).code == 0
+    for path in sorted((site.work / "features").glob("*.npz")):
+        spared, plain = read_features(path), read_features(alone / "features" / path.name)
+        assert np.array_equal(spared.keypoints_px, plain.keypoints_px)
+        assert np.array_equal(spared.descriptors, plain.descriptors)
+
+
+def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> None:
+    take_at(site, lambda number: "12:00:00" if number else "12:21:00")
+    chained = (*BESIDE, "--set", "pairs=sequential", "--set", "pairs.window=1")
+    assert site("extract", *chained).code == 0
+    assert [both for _, both in sorted(enhanced_views(site).items())] == [True, True, False, False, False]
+    assert site("extract", *chained, "--set", "enhance.one_sun_minutes=21").code == 0
+    assert set(enhanced_views(site).values()) == {False}
+
+
+def test_what_enhance_made_of_a_spared_image_stays(site: Site) -> None:
+    take_at(site, lambda _: "12:00:00")
+    assert site("enhance", *BESIDE).code == 0
+    made = {path.name: path.stat().st_mtime_ns for path in (site.work / "enhanced").iterdir()}
+    assert len([name for name in made if name.endswith(".png")]) == len(site.names())
+    assert site("extract", *BESIDE).code == 0
+    assert {path.name: path.stat().st_mtime_ns for path in (site.work / "enhanced").iterdir()} == made
+    # Of other settings: nobody is to take it for this one's.
+    assert site("extract", *BESIDE, "--set", "enhance.clip_limit=3").code == 0
+    assert list((site.work / "enhanced").iterdir()) == []
+
+
+def test_preset_fusion_verifies_the_block(site: Site) -> None:
+    outcome = invoke("run", "fusion", *site.options("--json"))
+    assert outcome.code == 0
+    assert True in enhanced_views(site).values()
+    report = read_json(site.work / "reports" / "filter.json")
+    assert report["facts"]["pairs"] == {"verified": 10}
+    assert (site.work / "export" / "colmap" / "database.db").is_file()
+    shown = (site.work / "report" / "index.html").read_text(encoding="utf-8")
+    assert "Shadow %" in shown
