@@ -93,3 +93,15 @@ def test_wallis_is_the_same_wherever_its_strips_end(monkeypatch):
     whole = enhance("wallis", pixels).pixels
     monkeypatch.setattr(wallis, "_STRIP_ROWS", 17)
     assert np.abs(enhance("wallis", pixels).pixels.astype(int) - whole).max() <= 1
+
+
+def test_wallis_leaves_nodata_out_of_its_neighbourhoods():
+    whole = np.random.default_rng(0).integers(60, 120, (200, 300)).astype(np.uint8)
+    valid = np.ones(whole.shape, dtype=bool)
+    valid[:, :100] = False
+    framed = np.where(valid, whole, 0).astype(np.uint8)
+    beside = np.s_[:, 101:106]
+    expected = enhance("wallis", whole).pixels[beside].astype(int)
+    found = enhance("wallis", framed, valid).pixels[beside].astype(int)
+    taken_in = enhance("wallis", framed).pixels[beside].astype(int)
+    assert np.abs(found - expected).mean() < 3.0 < 15.0 < np.abs(taken_in - expected).mean()

@@ -23,7 +23,7 @@ class ClaheEnhancement(Beside):
     tiles: int = Field(8, ge=1, le=256, description="Tiles across and down the picture.")
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
-        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask."""
+        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask. What is not valid counts like the rest."""
         import cv2
 
         source = np.ascontiguousarray(brightness(pixels))

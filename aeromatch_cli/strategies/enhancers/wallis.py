@@ -34,12 +34,13 @@ class WallisEnhancement(Beside):
     brightness: float = Field(0.9, ge=0.0, le=1.0, description="How far the mean is changed: 0 not, 1 wholly.")
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
-        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask."""
+        """pixels (H, W) or (H, W, C) uint8 or uint16; no mask. What is not valid counts in no neighbourhood."""
         source = brightness(pixels)
-        white = 255.0 if pixels.dtype == np.uint8 else max(1.0, float(np.percentile(source, _WHITE_PERCENTILE)))
-        return Enhanced(with_brightness(pixels, source, self._filtered(source, white)))
+        known = source if valid is None or not valid.any() else source[valid]
+        white = 255.0 if pixels.dtype == np.uint8 else max(1.0, float(np.percentile(known, _WHITE_PERCENTILE)))
+        return Enhanced(with_brightness(pixels, source, self._filtered(source, valid, white)))
 
-    def _filtered(self, source: NDArray[Any], white: float) -> NDArray[Any]:
+    def _filtered(self, source: NDArray[Any], valid: BoolArray | None, white: float) -> NDArray[Any]:
         """g = (f - m) c S / (c s + (1 - c) S) + b M + (1 - b) m, m and s the local mean and spread, M and S wanted."""
         import cv2
 
@@ -50,8 +51,15 @@ class WallisEnhancement(Beside):
         for top in range(0, len(source), _STRIP_ROWS):
             first, last = max(0, top - half), min(len(source), top + _STRIP_ROWS + half)
             values = source[first:last].astype(np.float32)
-            mean = cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT)
-            square = cv2.sqrBoxFilter(values, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
+            counted = values
+            if valid is not None:
+                seen = valid[first:last].astype(np.float32)
+                counted = values * seen
+                share = np.maximum(cv2.blur(seen, (side, side), borderType=cv2.BORDER_REFLECT), np.float32(1e-6))
+            mean = cv2.blur(counted, (side, side), borderType=cv2.BORDER_REFLECT)
+            square = cv2.sqrBoxFilter(counted, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT)
+            if valid is not None:
+                mean, square = mean / share, square / share
             spread = np.sqrt(np.maximum(square - mean.astype(np.float64) ** 2, 0.0)).astype(np.float32)
             slope = self.contrast * wanted / (self.contrast * spread + (1.0 - self.contrast) * wanted + 1e-3 * white)
             level = self.brightness * self.mean * white + (1.0 - self.brightness) * mean
