@@ -66,7 +66,8 @@ def _strategy_lines(strategy: Strategy, *, chained: bool) -> list[str]:
 
 
 def _settings_lines(settings: BaseModel) -> Iterator[str]:
-    for key, field in type(settings).model_fields.items():
+    fields = type(settings).model_fields
+    for key, field in sorted(fields.items(), key=lambda item: item[0] != "name"):  # stable: the rest keeps its order
         yield from _comment(field.description)
         if get_origin(field.annotation) is Literal and key != "name":
             yield f"# One of: {', '.join(map(str, get_args(field.annotation)))}"

@@ -7,7 +7,7 @@ top-left pixel of the stored raster.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -217,6 +217,10 @@ class PairGeometry:
     pose0: Pose | None
     pose1: Pose | None
     ground_z_m: float | None
+
+    def turned(self) -> PairGeometry:
+        """The same seen from image 1."""
+        return replace(self, camera0=self.camera1, camera1=self.camera0, pose0=self.pose1, pose1=self.pose0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,8 @@
 """Train the network that tells shadow from dark ground (strategy `shadow`) on rendered scenes with exact truth.
 
-Renders --blocks blocks of 8 small pictures each (scenes, flights, heights and suns drawn from their seeds, 100 and on;
-a city and a suburb are left out and only measured), trains a small U-Net for --steps steps on random pieces of them and
-writes its weights, batch normalisation folded in, as float16 safetensors for
-aeromatch_cli/nets/shadow.py.
+Renders --blocks blocks of training_blocks (a city and a suburb are left out and only measured), trains a small U-Net
+for --steps steps on random pieces of them and writes its weights, batch normalisation folded in, as float16
+safetensors for aeromatch_cli/nets/shadow.py.
 
 Since truth says how much of the sun each pixel lacks, materials and light are changed apart: dark materials and greens
 made darker, patches and strips of other albedo painted over sun and shadow alike, shadow weakened or taken away as by
@@ -29,42 +28,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
+from training_blocks import IMAGES, LEFT_OUT, render
 
 from aeromatch_cli.strategies.enhancers.shadow_mask import Overview, network_inputs
 from aeromatch_cli.strategies.enhancers.tone import Tone
-from aeromatch_cli.synthetic import PRESETS, render_block
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path
 
-ORDER = (
-    "city", "suburb", "city", "farmland", "city", "hills", "suburb", "city", "water-edge", "desert", "city", "grass",
-)  # fmt: skip
-FLIGHTS = ("mixed", "nadir", "mixed", "oblique")
-FIRST_SEED, LEFT_OUT = 100, (16, 18)  # a city and a suburb
 WIDTHS = (16, 24, 40, 56, 64)
 PIECE_PX, BATCH = 160, 12
 SCALES = (0.5, 1.3)  # of the rendered pictures
 DECAY = 0.997
 SKY = 2
 Piece = tuple[NDArray[np.float32], NDArray[np.uint8]]
-
-
-def render(out: Path, block_idx: int) -> Path:
-    """Folder of one block; its settings depend on its number alone."""
-    seed, preset = FIRST_SEED + block_idx, ORDER[block_idx % len(ORDER)]
-    rng = np.random.default_rng(seed)
-    flight = FLIGHTS[int(rng.integers(len(FLIGHTS)))]
-    height_m = PRESETS[preset].height_m * float(np.exp(rng.uniform(np.log(0.6), np.log(1.8))))
-    sun_deg = float(rng.uniform(0.0, 360.0)), float(rng.uniform(18.0, 70.0))
-    if preset in ("grass", "desert") and rng.random() < 0.5:
-        sun_deg = sun_deg[0], 88.0  # next to no shadow at all
-    folder = out / f"{preset}-{seed}"
-    if not (folder / "truth.json").is_file():
-        render_block(
-            folder, preset, seed=seed, width_px=640, height_px=480, images=8, flight=flight, height_m=height_m,
-            sun_deg=sun_deg,
-        )  # fmt: skip
-    return folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +259,7 @@ def main() -> None:
     from safetensors.numpy import save_file
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--blocks", type=int, default=41, help="rendered blocks of 8 pictures, at least 19")
+    parser.add_argument("--blocks", type=int, default=41, help=f"rendered blocks of {IMAGES} pictures, at least 19")
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--rate", type=float, default=2e-3, help="learning rate, falls to nothing over the steps")
     parser.add_argument("--start", type=Path, metavar="STATE", help="state.pt of another run to start from")

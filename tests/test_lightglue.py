@@ -7,6 +7,7 @@ import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from torch import Tensor
 
 from aeromatch_cli.data import Camera, Features, FloatArray, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.lightglue import Dimensions, build_lightglue, canonical_keys, load_lightglue
+from aeromatch_cli.nets.lightglue import Dimensions, Side, log_assignment, normalised
+from aeromatch_cli.nets.lightglue import LightGlue as Network
+from aeromatch_cli.nets.lightglue_file import canonical_keys, load_lightglue
 from aeromatch_cli.strategies.matchers import lightglue
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue, _wrapped_rad
 
@@ -29,8 +32,7 @@ GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, Non
 def seeded_tensors(dimensions: Dimensions) -> dict[str, Tensor]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
-        state = build_lightglue(dimensions).state_dict()
-        thresholds = state.pop("confidence_thresholds")
+        state = Network(dimensions).state_dict()
         random = {key: torch.randn_like(value) * 0.1 for key, value in state.items()}
     # Close to the identity, so that similar descriptors match; attention that heeds positions.
     for key, value in random.items():
@@ -40,7 +42,12 @@ def seeded_tensors(dimensions: Dimensions) -> dict[str, Tensor]:
             value += 4.0
         if key == "posenc.Wr.weight" or "Wqkv.weight" in key:
             value *= 5.0
-    return random | {"confidence_thresholds": thresholds}
+    return random | {"confidence_thresholds": torch.full((dimensions.n_layers,), 0.9)}
+
+
+def recipe(weights: str, **settings: Any) -> LightGlue:
+    """In full precision, so that tests can compare to the last digits."""
+    return LightGlue(weights=weights, **{"precision": "float32", **settings})
 
 
 def old_style(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -131,37 +138,75 @@ def as_dict(matches: Matches) -> dict[tuple[int, int], float]:
 @pytest.mark.parametrize("style", STYLES)
 def test_every_key_style_gives_the_same_network(dimensions: Dimensions, style: str, tmp_path: Path) -> None:
     tensors = seeded_tensors(dimensions)
-    network, inferred = load_lightglue(write(tmp_path / "weights.pth", STYLES[style](tensors)))
-    assert inferred == dimensions
+    network = load_lightglue(write(tmp_path / "weights.pth", STYLES[style](tensors)))
+    assert network.dimensions == dimensions
     loaded = network.state_dict()
-    assert loaded.keys() == tensors.keys()
-    assert all(torch.equal(loaded[key], tensors[key]) for key in tensors)
+    assert loaded.keys() == tensors.keys() - {"confidence_thresholds"}
+    assert all(torch.equal(loaded[key], tensors[key]) for key in loaded)
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
 
 
-def test_output_equals_kornias_own(tmp_path: Path) -> None:
-    from kornia.feature import LightGlue as KorniaLightGlue
-
-    tensors = seeded_tensors(SIFT)
-    conf = dataclasses.asdict(SIFT) | {"flash": False, "depth_confidence": -1, "width_confidence": -1}
-    theirs = KorniaLightGlue(features=None, **conf).eval()
-    theirs.load_state_dict(tensors, strict=True)
-    ours, _ = load_lightglue(write(tmp_path / "weights.pth", old_style(tensors)))
-    sift = features(50)
-    image = {
-        "keypoints": torch.from_numpy(sift.view_keypoints_px)[None],
+def as_image(sift: Features, shift_px: float = 0.0) -> dict[str, Tensor]:
+    """As kornia wants it."""
+    return {
+        "keypoints": torch.from_numpy(sift.view_keypoints_px)[None] + shift_px,
         "descriptors": torch.nn.functional.normalize(torch.from_numpy(sift.descriptors).float(), dim=-1)[None],
         "scales": torch.from_numpy(sift.view_size_px / 2)[None],
         "oris": torch.from_numpy(np.deg2rad(sift.view_orientation_deg))[None],
         "image_size": torch.tensor([[650.0, 490.0]]),
     }
-    other = image | {"keypoints": image["keypoints"] + 3.0}
+
+
+def as_side(image: dict[str, Tensor]) -> Side:
+    places = [normalised(image["keypoints"], image["image_size"]), image["scales"][..., None], image["oris"][..., None]]
+    return Side(torch.cat(places, dim=-1), image["descriptors"])
+
+
+@pytest.mark.parametrize(
+    ("depth", "width", "exits", "prunes"),
+    [(-1.0, -1.0, False, False), (0.5, -1.0, True, False), (-1.0, 0.9, False, True), (0.9999, 0.9, False, True)],
+    ids=["all", "exit", "pruned", "pruned where certain"],
+)
+def test_matches_equal_kornias(tmp_path: Path, depth: float, width: float, exits: bool, prunes: bool) -> None:
+    from kornia.feature import LightGlue as KorniaLightGlue
+
+    tensors = seeded_tensors(SIFT)
+    for layer in range(SIFT.n_layers - 1):  # confident and not, so that exits and pruning happen to some keypoints
+        tensors[f"token_confidence.{layer}.token.0.bias"] += 2.2
+        tensors[f"log_assignment.{layer}.matchability.bias"] -= 6.0
+    conf = dataclasses.asdict(SIFT) | {"flash": False, "depth_confidence": depth, "width_confidence": width}
+    theirs = KorniaLightGlue(features=None, filter_threshold=0.02, **conf).eval()
+    theirs.load_state_dict(tensors | {"confidence_thresholds": theirs.confidence_thresholds}, strict=True)
+    ours = load_lightglue(write(tmp_path / "weights.pth", old_style(tensors)))
+    image, other = as_image(features(80)), as_image(features(80), 3.0)
     with torch.inference_mode():
-        expected, found = theirs({"image0": image, "image1": other}), ours({"image0": image, "image1": other})
-    assert len(expected["matches"][0]) > 20
-    assert torch.equal(expected["log_assignment"], found["log_assignment"])
-    assert torch.equal(expected["matches"][0], found["matches"][0])
+        expected = theirs({"image0": image, "image1": other})
+    options = {"threshold": 0.02, "depth_confidence": depth, "width_confidence": width}
+    pairs, scores = ours.match(as_side(image), as_side(other), **options)
+    assert len(pairs) > (3 if exits else 20)  # an early layer of an untrained network finds few
+    assert torch.equal(expected["matches"][0], pairs)
+    torch.testing.assert_close(expected["scores"][0], scores, atol=1e-4, rtol=0.0)
+    pruned = int((expected["prune0"] < expected["prune0"].max()).sum())
+    assert (expected["stop"] < SIFT.n_layers, pruned > 0) == (exits, prunes)
+
+
+def test_the_assignment_equals_kornias(tmp_path: Path) -> None:
+    from kornia.feature import LightGlue as KorniaLightGlue
+
+    tensors = seeded_tensors(SIFT)
+    conf = dataclasses.asdict(SIFT) | {"flash": False, "depth_confidence": -1, "width_confidence": -1}
+    theirs = KorniaLightGlue(features=None, **conf).eval()
+    theirs.load_state_dict(tensors | {"confidence_thresholds": theirs.confidence_thresholds}, strict=True)
+    ours = load_lightglue(write(tmp_path / "weights.pth", tensors))
+    image, other = as_image(features(50)), as_image(features(60, seed=1), 3.0)
+    with torch.inference_mode():
+        expected = theirs({"image0": image, "image1": other})["log_assignment"]
+        *_, (x0, x1) = ours.states(as_side(image), as_side(other))
+        pairs, none0, none1 = log_assignment(ours.assignment(SIFT.n_layers - 1), x0, x1)
+    torch.testing.assert_close(expected[:, :-1, :-1], pairs, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(expected[:, :-1, -1], none0, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(expected[:, -1, :-1], none1, atol=1e-4, rtol=1e-5)
 
 
 def test_the_old_style_needs_whole_names() -> None:
@@ -210,14 +255,12 @@ def test_other_networks_are_refused(tmp_path: Path) -> None:
         load_lightglue(write(path, twice))
 
 
-def test_building_leaves_random_state_and_switches_alone() -> None:
+def test_loading_leaves_the_random_state_alone(weights: str) -> None:
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)
-    flash = torch.backends.cuda.flash_sdp_enabled()
-    build_lightglue(SIFT)
+    load_lightglue(Path(weights))
     assert torch.equal(torch.rand(3), expected)
-    assert torch.backends.cuda.flash_sdp_enabled() == flash
 
 
 def test_nothing_is_downloaded(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,12 +268,12 @@ def test_nothing_is_downloaded(weights: str, monkeypatch: pytest.MonkeyPatch) ->
         raise AssertionError("a connection was opened")
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
-    assert len(LightGlue(weights=weights, threshold=0.05)(features(40), features(40), GEOMETRY).indices) > 0
+    assert len(recipe(weights, threshold=0.05)(features(40), features(40), GEOMETRY).indices) > 0
 
 
 def test_equal_pictures_match_point_by_point(weights: str) -> None:
     first, second = features(200), noisy(features(200), 2.0)
-    matches = LightGlue(weights=weights)(first, second, GEOMETRY)
+    matches = recipe(weights)(first, second, GEOMETRY)
     assert (matches.indices.dtype, matches.scores.dtype, matches.view_pairs.dtype) == (np.int32, np.float32, np.int16)
     assert len(matches.indices) > 150
     assert (matches.indices[:, 0] == matches.indices[:, 1]).mean() > 0.95
@@ -245,8 +288,8 @@ def test_equal_pictures_match_point_by_point(weights: str) -> None:
 def test_the_order_of_keypoints_only_renames_matches(weights: str) -> None:
     first, second = features(150), noisy(features(150), 2.0)
     order = np.random.default_rng(2).permutation(150)
-    plain = as_dict(LightGlue(weights=weights)(first, second, GEOMETRY))
-    shuffled = as_dict(LightGlue(weights=weights)(first, permuted(second, order), GEOMETRY))
+    plain = as_dict(recipe(weights)(first, second, GEOMETRY))
+    shuffled = as_dict(recipe(weights)(first, permuted(second, order), GEOMETRY))
     renamed = {(i, int(order[j])): score for (i, j), score in shuffled.items()}
     assert renamed.keys() == plain.keys()
     np.testing.assert_allclose([renamed[key] for key in plain], list(plain.values()), atol=1e-4)
@@ -254,21 +297,21 @@ def test_the_order_of_keypoints_only_renames_matches(weights: str) -> None:
 
 def test_swapping_the_images_swaps_the_matches(weights: str) -> None:
     first, second = features(150), noisy(features(170), 2.0)
-    forth = as_dict(LightGlue(weights=weights)(first, second, GEOMETRY))
-    back = as_dict(LightGlue(weights=weights)(second, first, GEOMETRY))
+    forth = as_dict(recipe(weights)(first, second, GEOMETRY))
+    back = as_dict(recipe(weights)(second, first, GEOMETRY))
     assert {(j, i) for i, j in back} == forth.keys()
 
 
 def test_the_same_call_gives_the_same_bits(weights: str) -> None:
     first, second = features(150), noisy(features(150), 2.0)
-    runs = [LightGlue(weights=weights)(first, second, GEOMETRY) for _ in range(2)]
+    runs = [recipe(weights)(first, second, GEOMETRY) for _ in range(2)]
     np.testing.assert_array_equal(runs[0].indices, runs[1].indices)
     np.testing.assert_array_equal(runs[0].scores, runs[1].scores)
 
 
 @pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 30), (30, 0), (1, 1), (1, 30), (2, 1)])
 def test_few_keypoints_are_no_error(weights: str, count0: int, count1: int) -> None:
-    matches = LightGlue(weights=weights, threshold=0.0)(features(count0), features(count1, seed=1), GEOMETRY)
+    matches = recipe(weights, threshold=0.0)(features(count0), features(count1, seed=1), GEOMETRY)
     assert matches.indices.shape == (len(matches.scores), 2)
     assert matches.view_pairs.shape == matches.indices.shape
     assert len(matches.indices) <= min(count0, count1)
@@ -276,9 +319,14 @@ def test_few_keypoints_are_no_error(weights: str, count0: int, count1: int) -> N
 
 def test_images_without_views_match_nothing(weights: str) -> None:
     nothing = dataclasses.replace(
-        features(0), view_sizes_px=np.zeros((0, 2), np.int32), view_angles_deg=np.zeros(0, np.float32)
+        features(0),
+        view_sizes_px=np.zeros((0, 2), np.int32),
+        view_angles_deg=np.zeros(0, np.float32),
+        view_directions=np.zeros((0, 3), np.float32),
+        view_gsd_m=np.zeros(0, np.float32),
+        view_enhanced=np.zeros(0, bool),
     )
-    assert LightGlue(weights=weights)(nothing, features(20), GEOMETRY).indices.shape == (0, 2)
+    assert recipe(weights)(nothing, features(20), GEOMETRY).indices.shape == (0, 2)
 
 
 def test_points_over_the_border_are_clipped(weights: str) -> None:
@@ -286,25 +334,25 @@ def test_points_over_the_border_are_clipped(weights: str) -> None:
     moved = original.view_keypoints_px.copy()
     moved[:3] = [[-0.8, 5.0], [639.9, 479.9], [10.0, -3.0]]
     outside = dataclasses.replace(original, view_keypoints_px=moved)
-    assert len(LightGlue(weights=weights)(outside, outside, GEOMETRY).indices) > 40
+    assert len(recipe(weights)(outside, outside, GEOMETRY).indices) > 40
 
 
 def test_several_views_are_merged_one_to_one(weights: str) -> None:
     pictures0 = [features(60), features(60, seed=9)]
-    pictures1 = [noisy(features(60), 2.0), features(60, seed=8)]
-    recipe = LightGlue(weights=weights, threshold=0.01)
+    pictures1 = [features(60, seed=8), features(60, seed=7)]
+    matcher = recipe(weights, threshold=0.01)
     # By hand: the matches of all four view pairs, best first, each keypoint once.
     found = [
         (score, key, (v0, v1))
         for v0 in range(2)
         for v1 in range(2)
-        for key, score in as_dict(recipe(pictures0[v0], pictures1[v1], GEOMETRY)).items()
+        for key, score in as_dict(matcher(pictures0[v0], pictures1[v1], GEOMETRY)).items()
     ]
     expected: dict[tuple[int, int], tuple[float, tuple[int, int]]] = {}
     for score, key, views in sorted(found, reverse=True):
         if all(key[0] != i and key[1] != j for i, j in expected):
             expected[key] = (score, views)
-    matches = recipe(two_views(*pictures0), two_views(*pictures1), GEOMETRY)
+    matches = matcher(two_views(*pictures0), two_views(*pictures1), GEOMETRY)
     assert as_dict(matches) == {key: score for key, (score, _) in expected.items()}
     assert [tuple(v) for v in matches.view_pairs.tolist()] == [expected[key][1] for key in sorted(expected)]
     assert len({views for _, views in expected.values()}) > 1
@@ -312,7 +360,7 @@ def test_several_views_are_merged_one_to_one(weights: str) -> None:
 
 def test_the_budget_keeps_the_strongest(weights: str) -> None:
     first = features(100)
-    matches = LightGlue(weights=weights, max_keypoints=30)(first, first, GEOMETRY)
+    matches = recipe(weights, max_keypoints=30)(first, first, GEOMETRY)
     strongest = np.argsort(-first.responses)[:30]
     assert len(matches.indices) > 15
     assert set(matches.indices.ravel().tolist()) <= set(strongest.tolist())
@@ -320,10 +368,10 @@ def test_the_budget_keeps_the_strongest(weights: str) -> None:
 
 def test_scale_and_orientation_reach_the_network(weights: str) -> None:
     first, second = features(100), noisy(features(100), 2.0)
-    plain = as_dict(LightGlue(weights=weights, threshold=0.0)(first, second, GEOMETRY))
+    plain = as_dict(recipe(weights, threshold=0.0)(first, second, GEOMETRY))
     turned_by_360 = dataclasses.replace(second, view_orientation_deg=second.view_orientation_deg - np.float32(360.0))
     np.testing.assert_allclose(
-        list(as_dict(LightGlue(weights=weights, threshold=0.0)(first, turned_by_360, GEOMETRY)).values()),
+        list(as_dict(recipe(weights, threshold=0.0)(first, turned_by_360, GEOMETRY)).values()),
         list(plain.values()),
         atol=1e-3,
     )
@@ -331,7 +379,7 @@ def test_scale_and_orientation_reach_the_network(weights: str) -> None:
         {"view_orientation_deg": second.view_orientation_deg + 90},
         {"view_size_px": second.view_size_px * 4},
     ):
-        changed = LightGlue(weights=weights, threshold=0.0)(first, dataclasses.replace(second, **change), GEOMETRY)
+        changed = recipe(weights, threshold=0.0)(first, dataclasses.replace(second, **change), GEOMETRY)
         shared = plain.keys() & as_dict(changed).keys()
         assert max(abs(as_dict(changed)[key] - plain[key]) for key in shared) > 1e-3
 
@@ -379,50 +427,52 @@ def by_hand() -> Features:
 class Recorder:
     """Stands for the network: keeps what it is given, matches nothing."""
 
-    def __init__(self) -> None:
-        self.given: list[dict[str, dict[str, Tensor]]] = []
+    def __init__(self, dimensions: Dimensions) -> None:
+        self.dimensions = dimensions
+        self.given: list[tuple[Side, Side]] = []
 
-    def __call__(self, given: dict[str, dict[str, Tensor]]) -> dict[str, list[Tensor]]:
-        self.given.append(given)
-        return {"matches": [torch.zeros((0, 2), dtype=torch.int64)], "scores": [torch.zeros(0)]}
+    def match(self, side0: Side, side1: Side, **options: float) -> tuple[Tensor, Tensor]:
+        self.given.append((side0, side1))
+        return torch.zeros((0, 2), dtype=torch.int64), torch.zeros(0)
+
+
+def given_to(recorder: Recorder, weights: str, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Side, Side]]:
+    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, "cpu", {}))
+    recipe(weights)(by_hand(), by_hand(), GEOMETRY)
+    return recorder.given
 
 
 def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder = Recorder()
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, SIFT, "cpu"))
-    LightGlue(weights=weights)(by_hand(), by_hand(), GEOMETRY)
-    assert len(recorder.given) == 4  # every view with every view
-    first, last = recorder.given[0]["image0"], recorder.given[3]["image1"]
-    assert recorder.given[1]["image0"]["image_size"].tolist() == [[640, 480]]
-    assert recorder.given[1]["image1"]["image_size"].tolist() == [[200, 100]]
-    assert first["image_size"].tolist() == [[640, 480]]
-    # From the corner of the picture, and clipped to it.
-    assert first["keypoints"].tolist() == [[[10.5, 20.75], [0.0, 480.0]]]
-    assert last["keypoints"].tolist() == [[[150.5, 60.5]]]
-    assert first["scales"].tolist() == [[1.5, 4.0]]
-    np.testing.assert_allclose(first["oris"].numpy(), [[-np.pi / 2, np.pi]], atol=1e-6)
-    np.testing.assert_allclose(last["oris"].numpy(), [[np.pi / 4]], atol=1e-6)
-    np.testing.assert_allclose(first["descriptors"][0, 0, :3].numpy(), [0.6, 0.8, 0.0], atol=1e-6)
-    np.testing.assert_allclose(torch.linalg.norm(first["descriptors"], dim=2).numpy(), [[1.0, 1.0]], atol=1e-6)
-    assert all(value.dtype == torch.float32 for value in first.values())
+    given = given_to(Recorder(SIFT), weights, monkeypatch)
+    assert len(given) == 4  # every view with every view
+    first, last = given[0][0], given[3][1]
+    # From the corner of the picture, clipped to it, middle 0, half the longer side 1.
+    points = [[(10.5 - 320) / 320, (20.75 - 240) / 320], [-1.0, 0.75]]
+    np.testing.assert_allclose(first.places[0, :, :2].numpy(), points, atol=1e-6)
+    np.testing.assert_allclose(last.places[0, :, :2].numpy(), [[0.505, 0.105]], atol=1e-6)
+    assert first.places[0, :, 2].tolist() == [1.5, 4.0]
+    np.testing.assert_allclose(first.places[0, :, 3].numpy(), [-np.pi / 2, np.pi], atol=1e-6)
+    np.testing.assert_allclose(last.places[0, :, 3].numpy(), [np.pi / 4], atol=1e-6)
+    np.testing.assert_allclose(first.descriptors[0, 0, :3].numpy(), [0.6, 0.8, 0.0], atol=1e-6)
+    np.testing.assert_allclose(torch.linalg.norm(first.descriptors, dim=2).numpy(), [[1.0, 1.0]], atol=1e-6)
+    assert (first.places.dtype, first.descriptors.dtype) == (torch.float32, torch.float32)
 
 
 def test_networks_without_scale_and_orientation_get_none(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorder, plain = Recorder(), dataclasses.replace(SIFT, add_scale_ori=False)
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, plain, "cpu"))
-    LightGlue(weights=weights)(by_hand(), by_hand(), GEOMETRY)
-    assert recorder.given[0]["image0"].keys() == {"keypoints", "descriptors", "image_size"}
+    given = given_to(Recorder(dataclasses.replace(SIFT, add_scale_ori=False)), weights, monkeypatch)
+    assert given[0][0].places.shape == (1, 2, 2)
 
 
 def test_other_descriptors_are_refused(weights: str) -> None:
     short = features(20)
     short = dataclasses.replace(short, descriptors=short.descriptors[:, :64])
     with pytest.raises(ConfigError, match="length 128, the extractor makes 64"):
-        LightGlue(weights=weights)(short, short, GEOMETRY)
+        recipe(weights)(short, short, GEOMETRY)
 
 
 def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    monkeypatch.setattr("aeromatch_cli.nets.weights.SHIPPED_LIGHTGLUE", tmp_path / "absent.safetensors")
     with pytest.raises(ConfigError, match=r"needs a weights file.*aeromatch weights add"):
         LightGlue().fingerprint_files()
     with pytest.raises(ConfigError, match=r"no such file.*aeromatch weights add"):
@@ -430,17 +480,17 @@ def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_fingerprint_files_and_schema(weights: str) -> None:
-    recipe = LightGlue(weights=weights)
-    assert recipe.fingerprint_files() == (weights,)
-    assert hash(recipe) == hash(LightGlue(weights=weights))
+    matcher = recipe(weights)
+    assert matcher.fingerprint_files() == (weights,)
+    assert hash(matcher) == hash(recipe(weights))
     with pytest.raises(ValidationError):
         LightGlue(weight="x")  # type: ignore[call-arg]
 
 
 def test_a_replaced_file_is_loaded_again(tmp_path: Path) -> None:
     path = tmp_path / "weights.pth"
-    recipe = LightGlue(weights=str(write(path, seeded_tensors(SIFT))))
-    assert len(recipe(features(50), features(50), GEOMETRY).indices) > 20
+    matcher = LightGlue(weights=str(write(path, seeded_tensors(SIFT))))
+    assert len(matcher(features(50), features(50), GEOMETRY).indices) > 20
     write(path, {"conv1.weight": torch.zeros(3, 3)})
     with pytest.raises(ConfigError, match="not a LightGlue"):
-        recipe(features(50), features(50), GEOMETRY)
+        matcher(features(50), features(50), GEOMETRY)

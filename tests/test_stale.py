@@ -84,7 +84,7 @@ def test_an_attitude_that_filter_rejects_is_a_failure_with_a_way_out(site: Site)
 
 
 def test_missing_weights_are_noticed_before_anything_is_made(site: Site) -> None:
-    outcome = site("run", "--set", "match=lightglue")
+    outcome = site("run", "--set", "match=lightglue", "--set", "match.weights=absent.safetensors")
     assert outcome.code == 2
     assert not (site.work / "features").exists()
 

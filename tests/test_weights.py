@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.lightglue import Dimensions, build_lightglue
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.weights import (
     WeightsCheck,
     add_weights,
@@ -34,7 +34,7 @@ def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def lightglue_file(tmp_path: Path) -> Path:
     path = tmp_path / "small.safetensors"
-    save_file(build_lightglue(DIMENSIONS).state_dict(), path)
+    save_file(LightGlue(DIMENSIONS).state_dict(), path)
     return path
 
 
@@ -90,7 +90,7 @@ def test_a_taken_name_is_not_overwritten(lightglue_file: Path, tmp_path: Path) -
     namesake = tmp_path / "again" / "small.safetensors"
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
-        changed = {key: torch.randn_like(value) for key, value in build_lightglue(DIMENSIONS).state_dict().items()}
+        changed = {key: torch.randn_like(value) for key, value in LightGlue(DIMENSIONS).state_dict().items()}
     save_file(changed, namesake)
     with pytest.raises(ConfigError, match="exists with other content"):
         add_weights(namesake)

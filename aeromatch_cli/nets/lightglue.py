@@ -1,34 +1,28 @@
-"""LightGlue from a weights file: kornia's implementation, the file's own dimensions, loaded strictly.
+"""LightGlue: attention within and between the keypoints of two pictures, then one assignment. Architecture only.
 
-Source: Lindenberger, Sarlin and Pollefeys, LightGlue: Local Feature Matching at Light Speed, ICCV 2023.
-Implementation: kornia.feature.LightGlue (Apache-2.0), built with `features=None`, which never downloads.
+Source: Lindenberger, Sarlin and Pollefeys, LightGlue: Local Feature Matching at Light Speed, ICCV 2023. Tensors have
+the names of kornia.feature.LightGlue (the published checkpoints'), so that either reads the other's files; this forward
+is there because kornia's computes in float32 only and keeps the whole assignment matrix.
 """
 
 from __future__ import annotations
 
-import re
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.weights import read_tensors
-
-# Made by the constructor from the number of layers, so a file may leave it out.
-_DERIVED = frozenset({"confidence_thresholds"})
-_OLD_LAYER_KEY = re.compile(r"^(self|cross)_attn\.(\d+)\.")
-_LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
-_POSITION_KEY = "posenc.Wr.weight"
-_WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
-_MAX_NAMED = 3
+# Rows of the assignment that are scored at once: the matrix of 2048 points twice is 32 MB otherwise.
+_ROWS = 512
 
 
 @dataclass(frozen=True)
 class Dimensions:
-    """What the tensors of a file say of its network.
+    """What makes a network.
 
     input_dim: length of a descriptor. add_scale_ori: whether keypoints carry scale and orientation (SIFT).
     """
@@ -40,108 +34,251 @@ class Dimensions:
     add_scale_ori: bool
 
 
-def canonical_keys(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors under kornia's names: without the prefix `matcher.`, and with the first releases' `self_attn.N.` and
-    `cross_attn.N.` as `transformers.N.self_attn.` and `transformers.N.cross_attn.`.
+@dataclass(frozen=True)
+class Side:
+    """One picture's keypoints, B pictures at once.
 
-    Raises ValueError where two names of the file mean the same tensor.
+    places: (B, N, 2 or 4) float32, x and y from `normalised`, then scale (half the size in pixels) and orientation in
+    radians where the network wants them. descriptors: (B, N, input_dim) float.
     """
-    renamed: dict[str, Tensor] = {}
-    for key, value in tensors.items():
-        name = _OLD_LAYER_KEY.sub(r"transformers.\2.\1_attn.", key.removeprefix("matcher."))
-        if name in renamed:
-            raise ValueError(f"{key} is given twice")
-        renamed[name] = value
-    return renamed
+
+    places: Tensor
+    descriptors: Tensor
 
 
-def infer_dimensions(tensors: dict[str, Tensor]) -> Dimensions:
-    """Dimensions from the shapes of canonical tensors. Raises ValueError where they are not a LightGlue's."""
-    missing = [key for key in (_POSITION_KEY, _WIDTH_KEY) if key not in tensors or tensors[key].ndim != 2]
-    if missing:
-        raise ValueError(f"it has no {' and no '.join(missing)}")
-    descriptor_dim = int(tensors[_WIDTH_KEY].shape[0])
-    half_head_dim, position_dim = (int(size) for size in tensors[_POSITION_KEY].shape)
-    if position_dim not in (2, 4):
-        raise ValueError(f"its keypoints have {position_dim} coordinates; only 2 or 4 (with scale, orientation) work")
-    num_heads, rest = divmod(descriptor_dim, 2 * half_head_dim)
-    if rest or num_heads == 0:
-        raise ValueError(f"{_POSITION_KEY} and {_WIDTH_KEY} disagree")
-    projection = tensors.get("input_proj.weight")
-    layers = {int(match.group(1)) for key in tensors if (match := _LAYER_KEY.match(key))}
-    return Dimensions(
-        input_dim=descriptor_dim if projection is None else int(projection.shape[-1]),
-        descriptor_dim=descriptor_dim,
-        n_layers=len(layers),
-        num_heads=num_heads,
-        add_scale_ori=position_dim == 4,
-    )
+def normalised(points_px: Tensor, size_px: Tensor) -> Tensor:
+    """Points (..., N, 2), pixels from the picture's corner, with the middle at 0 and the longer half side at 1.
 
-
-def build_lightglue(
-    dimensions: Dimensions,
-    *,
-    filter_threshold: float = 0.1,
-    depth_confidence: float = -1.0,
-    width_confidence: float = -1.0,
-) -> nn.Module:
-    """An untrained LightGlue; neither torch's random state nor its global switches are changed.
-
-    Confidences of -1 switch early stopping and point pruning off.
+    size_px: (..., 2) width, height.
     """
-    from kornia.feature import LightGlue
-
-    # kornia's attention sets this process-wide switch when it is built.
-    flash_enabled = torch.backends.cuda.flash_sdp_enabled()
-    try:
-        with torch.random.fork_rng(devices=[]):
-            return LightGlue(
-                features=None,  # type: ignore[arg-type]
-                input_dim=dimensions.input_dim,
-                descriptor_dim=dimensions.descriptor_dim,
-                n_layers=dimensions.n_layers,
-                num_heads=dimensions.num_heads,
-                add_scale_ori=dimensions.add_scale_ori,
-                flash=False,  # its flash path computes in half precision
-                filter_threshold=filter_threshold,
-                depth_confidence=depth_confidence,
-                width_confidence=width_confidence,
-            )
-    finally:
-        torch.backends.cuda.enable_flash_sdp(flash_enabled)
+    half = size_px / 2.0
+    return (points_px - half.unsqueeze(-2)) / half.amax(dim=-1)[..., None, None]
 
 
-def load_lightglue(path: Path, *, device: str = "cpu", **options: float) -> tuple[nn.Module, Dimensions]:
-    """The network of a weights file in float32, in evaluation mode, without gradients. options: of `build_lightglue`.
+class FourierEncoding(nn.Module):
+    """Rotary position code: every pair of channels is turned by an angle that is linear in the place."""
 
-    Every tensor of the network comes from the file and every tensor of the file goes into the network; only the
-    derived buffer `confidence_thresholds` may be absent. Raises ConfigError otherwise.
+    def __init__(self, places_dim: int, head_dim: int) -> None:
+        super().__init__()
+        self.Wr = nn.Linear(places_dim, head_dim // 2, bias=False)
+        nn.init.normal_(self.Wr.weight.data, mean=0.0, std=1.0)
+
+    def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Cosines and sines (B, 1, N, head_dim) of places (B, N, P), in float32."""
+        angles = functional.linear(places, self.Wr.weight.float()).unsqueeze(1)
+        return angles.cos().repeat_interleave(2, dim=-1), angles.sin().repeat_interleave(2, dim=-1)
+
+
+def _turned(x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
+    """x (B, H, N, head_dim) with its pairs of channels turned."""
+    pairs = x.unflatten(-1, (-1, 2))
+    crossed = torch.stack((-pairs[..., 1], pairs[..., 0]), dim=-1).flatten(-2)
+    return x * code[0] + crossed * code[1]
+
+
+def _mixer(dim: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(2 * dim, 2 * dim), nn.LayerNorm(2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
+
+
+class SelfBlock(nn.Module):
+    """Attention among the keypoints of one picture, aware of their relative places."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.Wqkv = nn.Linear(dim, 3 * dim)
+        self.out_proj = nn.Linear(dim, dim)
+        self.ffn = _mixer(dim)
+
+    def forward(self, x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
+        """x (B, N, dim) -> the same."""
+        query, key, value = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(1, 2).unbind(-1)
+        query, key = _turned(query, code), _turned(key, code)
+        message = functional.scaled_dot_product_attention(query, key, value.contiguous())
+        message = self.out_proj(message.transpose(1, 2).flatten(-2))
+        return x + self.ffn(torch.cat([x, message], dim=-1))
+
+
+class CrossBlock(nn.Module):
+    """Attention of each picture's keypoints to the other's, both ways with one similarity."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.to_qk = nn.Linear(dim, dim)
+        self.to_v = nn.Linear(dim, dim)
+        self.to_out = nn.Linear(dim, dim)
+        self.ffn = _mixer(dim)
+
+    def forward(self, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor]:
+        """x0 (B, M, dim), x1 (B, N, dim) -> the same."""
+        key0, key1, value0, value1 = (self._by_head(of(x)) for of in (self.to_qk, self.to_v) for x in (x0, x1))
+        return self._mixed(x0, key0, key1, value1), self._mixed(x1, key1, key0, value0)
+
+    def _by_head(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2).contiguous()
+
+    def _mixed(self, x: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        message = functional.scaled_dot_product_attention(query, key, value)
+        message = self.to_out(message.transpose(1, 2).flatten(-2))
+        return x + self.ffn(torch.cat([x, message], dim=-1))
+
+
+class Layer(nn.Module):
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.self_attn = SelfBlock(dim, heads)
+        self.cross_attn = CrossBlock(dim, heads)
+
+
+class Assignment(nn.Module):
+    """Which keypoints have a partner, and which one."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.matchability = nn.Linear(dim, 1)
+        self.final_proj = nn.Linear(dim, dim)
+
+    def logits(self, x: Tensor) -> Tensor:
+        """Log odds (B, N) that a keypoint has a partner."""
+        return self.matchability(x).squeeze(-1)
+
+    def similarity(self, x0: Tensor, x1: Tensor) -> Tensor:
+        """(B, M, N) of x0 (B, M, dim) and x1 (B, N, dim)."""
+        scale = x0.shape[-1] ** -0.25
+        return (self.final_proj(x0) * scale) @ (self.final_proj(x1) * scale).transpose(-1, -2)
+
+
+class Confidence(nn.Module):
+    """Whether a keypoint's assignment will not change in later layers."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.token = nn.Sequential(nn.Linear(dim, 1), nn.Sigmoid())
+
+    def logits(self, x: Tensor) -> Tensor:
+        """(B, N); no gradient reaches the keypoints' states."""
+        return self.token[0](x.detach()).squeeze(-1)
+
+
+class LightGlue(nn.Module):
+    """The whole network. Its parameters' type decides in which precision layers compute; places stay float32."""
+
+    def __init__(self, dimensions: Dimensions) -> None:
+        super().__init__()
+        self.dimensions = dimensions
+        dim, heads, count = dimensions.descriptor_dim, dimensions.num_heads, dimensions.n_layers
+        same = dimensions.input_dim == dim
+        self.input_proj = nn.Identity() if same else nn.Linear(dimensions.input_dim, dim)
+        self.posenc = FourierEncoding(4 if dimensions.add_scale_ori else 2, dim // heads)
+        self.transformers = nn.ModuleList([Layer(dim, heads) for _ in range(count)])
+        self.log_assignment = nn.ModuleList([Assignment(dim) for _ in range(count)])
+        self.token_confidence = nn.ModuleList([Confidence(dim) for _ in range(count - 1)])
+
+    @property
+    def layers(self) -> list[Layer]:
+        return [cast(Layer, module) for module in self.transformers]
+
+    def assignment(self, index: int) -> Assignment:
+        """The head after layer `index`."""
+        return cast(Assignment, self.log_assignment[index])
+
+    def confidence(self, index: int) -> Confidence:
+        """The head after layer `index`; the last layer has none."""
+        return cast(Confidence, self.token_confidence[index])
+
+    def begin(self, side: Side) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """States (B, N, dim) and position code of one side."""
+        kind = self.posenc.Wr.weight.dtype
+        cosines, sines = self.posenc(side.places)
+        return self.input_proj(side.descriptors.to(kind)), (cosines.to(kind), sines.to(kind))
+
+    def states(self, side0: Side, side1: Side) -> Iterator[tuple[Tensor, Tensor]]:
+        """States (B, M, dim), (B, N, dim) of both sides after each layer: what training looks at."""
+        (x0, code0), (x1, code1) = self.begin(side0), self.begin(side1)
+        for layer in self.layers:
+            x0, x1 = layer.cross_attn(layer.self_attn(x0, code0), layer.self_attn(x1, code1))
+            yield x0, x1
+
+    @torch.inference_mode()
+    def match(
+        self, side0: Side, side1: Side, *, threshold: float, depth_confidence: float, width_confidence: float
+    ) -> tuple[Tensor, Tensor]:
+        """Index pairs (K, 2) int64, sorted by the first, and scores (K,) float32 of one pair of pictures (B = 1).
+
+        depth_confidence: share of keypoints that must be certain to stop before the last layer, -1 never.
+        width_confidence: a certain keypoint goes where its probability of having no partner is larger, -1 never.
+        """
+        (x0, code0), (x1, code1) = self.begin(side0), self.begin(side1)
+        total = x0.shape[1] + x1.shape[1]
+        kept = [torch.arange(x.shape[1], device=x.device) for x in (x0, x1)]
+        last = len(self.transformers) - 1
+        for index, layer in enumerate(self.layers):
+            if min(len(kept[0]), len(kept[1])) == 0:
+                return torch.zeros((0, 2), dtype=torch.int64), torch.zeros(0)
+            x0, x1 = layer.cross_attn(layer.self_attn(x0, code0), layer.self_attn(x1, code1))
+            if index == last:
+                break
+            certain = [torch.ones(x.shape[:2], dtype=torch.bool, device=x.device) for x in (x0, x1)]
+            if depth_confidence > 0.0:
+                logits = [self.confidence(index).logits(x).float() for x in (x0, x1)]
+                certain = [torch.sigmoid(logit) >= _certain_above(index, last + 1) for logit in logits]
+                uncertain = sum(int((~flags).sum()) for flags in certain)
+                if 1.0 - uncertain / total > depth_confidence:
+                    break
+            if width_confidence > 0.0:
+                x0, code0, kept[0] = self._pruned(index, x0, code0, kept[0], certain[0], width_confidence)
+                x1, code1, kept[1] = self._pruned(index, x1, code1, kept[1], certain[1], width_confidence)
+        if min(len(kept[0]), len(kept[1])) == 0:
+            return torch.zeros((0, 2), dtype=torch.int64), torch.zeros(0)
+        rows, columns, scores = mutual_best(self.assignment(index), x0, x1)
+        good = scores > threshold
+        pairs = torch.stack([kept[0][rows[good]], kept[1][columns[good]]], dim=1)
+        return pairs, scores[good]
+
+    def _pruned(
+        self, index: int, x: Tensor, code: tuple[Tensor, Tensor], kept: Tensor, certain: Tensor, confidence: float
+    ) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
+        probability = torch.sigmoid(self.assignment(index).logits(x).float())
+        stays = torch.nonzero(((probability > 1.0 - confidence) | ~certain)[0]).squeeze(1)
+        if len(stays) == x.shape[1]:
+            return x, code, kept
+        return x[:, stays], (code[0][:, :, stays], code[1][:, :, stays]), kept[stays]
+
+
+def _certain_above(index: int, layers: int) -> float:
+    """Confidence from which a keypoint counts as certain after layer `index` of so many."""
+    return 0.8 + 0.1 * math.exp(-4.0 * index / layers)
+
+
+def log_assignment(head: Assignment, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Log probability (B, M, N) of each pair, and (B, M), (B, N) that a keypoint has no partner, in float32."""
+    similarity = head.similarity(x0, x1).float()
+    logits0, logits1 = head.logits(x0).float(), head.logits(x1).float()
+    both = functional.logsigmoid(logits0)[:, :, None] + functional.logsigmoid(logits1)[:, None]
+    pairs = 2.0 * similarity - similarity.logsumexp(2, keepdim=True) - similarity.logsumexp(1, keepdim=True) + both
+    return pairs, functional.logsigmoid(-logits0), functional.logsigmoid(-logits1)
+
+
+def mutual_best(head: Assignment, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows, columns (K,) and scores (K,) float32 of the pairs that are each other's best, of one pair of pictures.
+
+    The same as the mutual maxima of exp(log_assignment), rows in blocks.
     """
-    source = read_tensors(path)
-    try:
-        tensors = canonical_keys(source)
-        dimensions = infer_dimensions(tensors)
-        network = build_lightglue(dimensions, **options)
-        _check_same_tensors(network.state_dict(), tensors)
-    except ValueError as error:
-        raise ConfigError(f"weights file {path} is not a LightGlue: {error}") from error
-    complete = {key: tensors.get(key, value) for key, value in network.state_dict().items()}
-    network.load_state_dict(complete, strict=True)
-    return network.to(device=device, dtype=torch.float32).eval().requires_grad_(False), dimensions
-
-
-def _check_same_tensors(expected: dict[str, Any], given: dict[str, Tensor]) -> None:
-    missing = sorted(expected.keys() - given.keys() - _DERIVED)
-    unexpected = sorted(given.keys() - expected.keys() - _DERIVED)
-    shapes = [
-        f"{key} {tuple(given[key].shape)} instead of {tuple(expected[key].shape)}"
-        for key in sorted(expected.keys() & given.keys())
-        if expected[key].shape != given[key].shape
-    ]
-    problems = [
-        f"{what}: {', '.join(keys[:_MAX_NAMED])}" + (f" and {len(keys) - _MAX_NAMED} more" * (len(keys) > _MAX_NAMED))
-        for what, keys in (("missing", missing), ("unexpected", unexpected), ("wrong shape", shapes))
-        if keys
-    ]
-    if problems:
-        raise ValueError("; ".join(problems))
+    similarity = head.similarity(x0, x1)[0].float()
+    by_row, by_column = similarity.logsumexp(1), similarity.logsumexp(0)
+    weight0 = functional.logsigmoid(head.logits(x0)[0].float()) - by_row
+    weight1 = functional.logsigmoid(head.logits(x1)[0].float()) - by_column
+    best0 = torch.empty(len(weight0), dtype=torch.int64, device=x0.device)
+    value1 = torch.full((len(weight1),), -math.inf, device=x0.device)
+    best1 = torch.zeros(len(weight1), dtype=torch.int64, device=x0.device)
+    value0 = torch.empty(len(weight0), device=x0.device)
+    for start in range(0, len(weight0), _ROWS):
+        scores = 2.0 * similarity[start : start + _ROWS] + weight0[start : start + _ROWS, None] + weight1
+        value0[start : start + _ROWS], best0[start : start + _ROWS] = scores.max(1)
+        value, row = scores.max(0)
+        better = value > value1
+        value1 = torch.where(better, value, value1)
+        best1 = torch.where(better, row + start, best1)
+    rows = torch.nonzero(best1[best0] == torch.arange(len(best0), device=best0.device)).squeeze(1)
+    return rows, best0[rows], value0[rows].exp()

@@ -21,6 +21,8 @@ from aeromatch_cli.errors import ConfigError, WorkspaceError
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Where scripts/train_lightglue.py's result belongs.
+SHIPPED_LIGHTGLUE = Path(__file__).parent / "trained" / "lightglue.safetensors"
 SUFFIXES = (".safetensors", ".pth", ".pt")
 
 _INDEX_NAME = "index.json"
@@ -143,7 +145,7 @@ def _write_index(folder: Path, entries: Mapping[str, WeightsEntry]) -> None:
 
 
 def _architecture(path: Path) -> str:
-    from aeromatch_cli.nets.lightglue import load_lightglue
+    from aeromatch_cli.nets.lightglue_file import load_lightglue
 
     load_lightglue(path)
     return "lightglue"

@@ -1,4 +1,4 @@
-"""LightGlue: an attention network that matches the keypoints of both images jointly, from a weights file.
+"""LightGlue: an attention network that matches the keypoints of both images jointly.
 
 Every view is matched in its own frame, because the network reads positions, scales and orientations as it saw them
 in training. Conventions of the published SIFT weights: keypoints from the image corner (ours + 0.5), scale = size / 2,
@@ -9,84 +9,138 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry
+from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.geometry.prediction import Windows
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.views import appearances
+from aeromatch_cli.strategies.matchers.guided import Found
+from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.search import Search, Where, joined
 
-if TYPE_CHECKING:
-    from aeromatch_cli.nets.lightglue import Dimensions
+# Around the keypoints that are left of a view, as in training.
+_FRAME_PX = 4.0
 
 
-class LightGlue(Strategy):
-    """LightGlue with own weights (Lindenberger et al., ICCV 2023)."""
+class LightGlue(Search):
+    """LightGlue (Lindenberger et al., ICCV 2023) with weights from a file.
 
+    Pairs that the mutual ratio test settles (`ample`) never reach the network, which takes a hundred times as long.
+    """
+
+    version: ClassVar[int] = 2
+    quick_differs: ClassVar[bool] = True
     name: Literal["lightglue"] = "lightglue"
+    ample: int = Field(
+        500,
+        ge=1,
+        description="Where the mutual ratio test finds so many matches, its matches are taken, and network, enhanced "
+        "pictures and guided search left out: they cost more than they add. Larger than `extract.keypoints`: never.",
+    )
     weights: str | None = Field(
         None,
         description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`).",
         json_schema_extra={"path": "or name"},
     )
-    threshold: float = Field(0.1, ge=0.0, le=1.0, description="Smallest score of a match.")
+    threshold: float = Field(0.1, ge=0.0, le=1.0, description="Smallest probability of a match.")
+    overlap: bool = Field(
+        True, description="Only keypoints that the other image may show, as far as poses and ground tell, are compared."
+    )
     depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
     width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
     max_keypoints: int = Field(
-        4096,
-        ge=1,
-        description="Strongest descriptors kept per view; memory grows with its square (1.2 GB at 4096).",
+        4096, ge=1, description="Strongest descriptors kept per view; time grows with its square."
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="Of the network's layers; auto is bfloat16 where the processor has it."
     )
     device: Literal["cpu", "auto"] = Field("cpu", description="`auto` takes CUDA where there is one.")
 
-    def fingerprint_files(self) -> tuple[str, ...]:
-        """Paths of the files whose SHA-256 belongs to the fingerprint. Raises ConfigError without weights."""
-        from aeromatch_cli.nets.weights import resolve_weights
+    def reads(self) -> frozenset[str]:
+        """Nothing of the geometry, unless guided or limited to the overlap."""
+        return self.needs if self.guided or self.overlap else frozenset()
 
-        if self.weights is None:
+    def fingerprint_files(self) -> tuple[str, ...]:
+        """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
+        from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE, resolve_weights
+
+        if self.weights is not None:
+            return (str(resolve_weights(self.weights)),)
+        if not SHIPPED_LIGHTGLUE.is_file():
             raise ConfigError(
                 "matcher lightglue needs a weights file: set `match.weights` to its path, or add it with "
                 "`aeromatch weights add PATH` and set `match.weights` to its name"
             )
-        return (str(resolve_weights(self.weights)),)
+        return (str(SHIPPED_LIGHTGLUE),)
 
-    def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches:
-        """Match every view of image 0 with every view of image 1; one-to-one by best score over all of them.
+    def quick_scan(self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry) -> Found:
+        """The mutual ratio test; nothing where no number of its matches would do."""
+        if self.ample > min(len(features0.keypoints_px), len(features1.keypoints_px)):
+            return joined([])
+        return Nearest().scan(features0, features1, alike, geometry, None)
+
+    def scan(
+        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
+    ) -> Found:
+        """Matches of all view pairs that are alike, costs 1 - probability.
 
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.
         """
         (path,) = self.fingerprint_files()
         matcher = _matcher(path, _content_stamp(path), self)
-        views0 = [self._view(features0, idx) for idx in range(len(features0.view_sizes_px))]
-        views1 = [self._view(features1, idx) for idx in range(len(features1.view_sizes_px))]
-        found = [_Found.empty()]
-        compared = np.any(appearances(features0, features1), axis=0)
-        for idx0, view0 in enumerate(views0):
-            for idx1, view1 in enumerate(views1):
-                if compared[idx0, idx1] and len(view0.points_px) and len(view1.points_px):
-                    pairs, scores = matcher.match(view0, view1)
-                    indices = np.stack([view0.keypoint_idx[pairs[:, 0]], view1.keypoint_idx[pairs[:, 1]]], axis=1)
-                    found.append(_Found(indices, scores, np.full_like(indices, (idx0, idx1))))
-        return _merged(found)
+        seen0, seen1 = self._in_overlap(features0, features1, geometry)
+        parts = []
+        for view0, view1 in np.argwhere(alike):
+            side0, side1 = self._view(features0, int(view0), seen0), self._view(features1, int(view1), seen1)
+            if len(side0.rows) and len(side1.rows):
+                pairs, scores = matcher.match(side0, side1)
+                parts.append((side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores.astype(np.float64)))
+        found = joined(parts)
+        if where is not None and where.windows is not None:
+            idx0, idx1 = found.keypoints(features0, features1)
+            found = found.take(where.windows.take(idx0).contain(where.places_px[idx1]))
+        return found.take(one_to_one(*found.keypoints(features0, features1), found.costs))
 
-    def _view(self, features: Features, view: int) -> _ViewInput:
+    def _in_overlap(
+        self, features0: Features, features1: Features, geometry: PairGeometry
+    ) -> tuple[BoolArray, BoolArray]:
+        """Which keypoints (K0,), (K1,) the other image may show."""
+        everything = [np.ones(len(features.keypoints_px), dtype=bool) for features in (features0, features1)]
+        forward = self.windows(features0, geometry) if self.overlap else None
+        backward = self.windows(features1, geometry.turned()) if self.overlap else None
+        if forward is None or backward is None:
+            return everything[0], everything[1]
+        return _meets(forward, undistort(geometry.camera1, features1.keypoints_px)), _meets(
+            backward, undistort(geometry.camera0, features0.keypoints_px)
+        )
+
+    def _view(self, features: Features, view: int, seen: BoolArray) -> _Side:
         rows = np.flatnonzero(features.view_idx == view)
+        total = len(rows)
+        rows = rows[seen[features.descriptor_keypoint_idx[rows]]]
+        culled = len(rows) < total
         if len(rows) > self.max_keypoints:
             strength = features.responses[features.descriptor_keypoint_idx[rows]]
             rows = np.sort(rows[np.argsort(-strength, kind="stable")[: self.max_keypoints]])
         size_px = np.asarray(features.view_sizes_px[view], dtype=np.float32)
-        points = features.view_keypoints_px[rows].astype(np.float32) + np.float32(COLMAP_OFFSET_PX)
-        return _ViewInput(
-            keypoint_idx=features.descriptor_keypoint_idx[rows],
-            # The network refuses points outside; sub-pixel refinement can push one over the border.
-            points_px=np.clip(points, 0.0, size_px),
+        # Sub-pixel refinement can push a point over the border.
+        points = np.clip(features.view_keypoints_px[rows].astype(np.float32) + np.float32(COLMAP_OFFSET_PX), 0, size_px)
+        if culled and len(rows):
+            low = points.min(axis=0) - np.float32(_FRAME_PX)
+            size_px = points.max(axis=0) + np.float32(_FRAME_PX) - low
+            points = points - low
+        return _Side(
+            rows=rows,
+            points_px=points,
             scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
             orientations_rad=_wrapped_rad(features.view_orientation_deg[rows]),
             descriptors=_as_float(features.descriptors[rows]),
@@ -95,10 +149,13 @@ class LightGlue(Strategy):
 
 
 @dataclass(frozen=True, eq=False)
-class _ViewInput:
-    """One view as the network wants it. points_px: (N, 2) from the corner; size_px: (2,) width, height."""
+class _Side:
+    """The keypoints of one view that are compared.
 
-    keypoint_idx: IntArray
+    rows: (N,) of the image's descriptors. points_px: (N, 2) from the corner; size_px: (2,) width, height.
+    """
+
+    rows: IntArray
     points_px: FloatArray
     scales_px: FloatArray
     orientations_rad: FloatArray
@@ -107,50 +164,36 @@ class _ViewInput:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Matches of one view pair. indices: (M, 2) keypoints; scores: (M,); views: (M, 2)."""
-
-    indices: IntArray
-    scores: FloatArray
-    views: IntArray
-
-    @classmethod
-    def empty(cls) -> _Found:
-        return cls(np.zeros((0, 2), np.int32), np.zeros(0, np.float32), np.zeros((0, 2), np.int32))
-
-
-@dataclass(frozen=True, eq=False)
 class _Matcher:
     network: Any
-    dimensions: Dimensions
     device: str
+    options: dict[str, float]
 
-    def match(self, view0: _ViewInput, view1: _ViewInput) -> tuple[IntArray, FloatArray]:
+    def match(self, side0: _Side, side1: _Side) -> tuple[IntArray, FloatArray]:
         """Row pairs (M, 2) and scores (M,)."""
+        pairs, scores = self.network.match(self._tensors(side0), self._tensors(side1), **self.options)
+        return pairs.cpu().numpy(), scores.cpu().numpy()
+
+    def _tensors(self, side: _Side) -> Any:
         import torch
 
-        with torch.inference_mode():
-            result = self.network({"image0": self._tensors(view0), "image1": self._tensors(view1)})
-        return result["matches"][0].cpu().numpy(), result["scores"][0].float().cpu().numpy()
+        from aeromatch_cli.nets.lightglue import Side, normalised
 
-    def _tensors(self, view: _ViewInput) -> dict[str, Any]:
-        import torch
-
-        length = view.descriptors.shape[1]
-        if length != self.dimensions.input_dim:
+        length, dimensions = side.descriptors.shape[1], self.network.dimensions
+        if length != dimensions.input_dim:
             raise ConfigError(
-                f"these LightGlue weights expect descriptors of length {self.dimensions.input_dim}, the extractor "
+                f"these LightGlue weights expect descriptors of length {dimensions.input_dim}, the extractor "
                 f"makes {length}; use weights trained for it"
             )
-        arrays = {"keypoints": view.points_px, "descriptors": view.descriptors, "image_size": view.size_px}
-        if self.dimensions.add_scale_ori:
-            arrays |= {"scales": view.scales_px, "oris": view.orientations_rad}
-        return {key: torch.from_numpy(np.ascontiguousarray(a))[None].to(self.device) for key, a in arrays.items()}
+        places = normalised(torch.from_numpy(side.points_px), torch.from_numpy(side.size_px))
+        if dimensions.add_scale_ori:
+            more = np.stack([side.scales_px, side.orientations_rad], axis=1)
+            places = torch.cat([places, torch.from_numpy(more)], dim=1)
+        descriptors = torch.from_numpy(np.ascontiguousarray(side.descriptors))
+        return Side(places[None].to(self.device), descriptors[None].to(self.device))
 
 
 def _content_stamp(path: str) -> tuple[int, int]:
-    from pathlib import Path
-
     status = Path(path).stat()
     return status.st_size, status.st_mtime_ns
 
@@ -158,21 +201,36 @@ def _content_stamp(path: str) -> tuple[int, int]:
 @lru_cache(maxsize=2)
 def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _Matcher:
     """The network, built once per process; the stamp makes a replaced file load again."""
-    from pathlib import Path
-
     import torch
 
-    from aeromatch_cli.nets.lightglue import load_lightglue
+    from aeromatch_cli.nets.lightglue_file import load_lightglue
 
     device = "cuda" if recipe.device == "auto" and torch.cuda.is_available() else "cpu"
-    network, dimensions = load_lightglue(
-        Path(path),
-        device=device,
-        filter_threshold=recipe.threshold,
-        depth_confidence=recipe.depth_confidence,
-        width_confidence=recipe.width_confidence,
-    )
-    return _Matcher(network, dimensions, device)
+    network = load_lightglue(Path(path), device=device)
+    native = torch.cuda.is_bf16_supported() if device == "cuda" else _has_bfloat16()
+    if recipe.precision == "bfloat16" or (recipe.precision == "auto" and native):
+        network = network.to(dtype=torch.bfloat16)
+    names = ("threshold", "depth_confidence", "width_confidence")
+    return _Matcher(network, device, {name: getattr(recipe, name) for name in names})
+
+
+def _has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 itself; emulated it is slower than float32."""
+    import torch
+
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+def _meets(windows: Windows, points_px: FloatArray) -> BoolArray:
+    """Whether each window's box reaches into the box of the points (N, 2); a window of nothing does not."""
+    usable = points_px[np.isfinite(points_px).all(axis=1)]
+    if not len(usable):
+        return np.zeros(len(windows.centers_px), dtype=bool)
+    reach = np.einsum("nij,ni->nj", np.abs(windows.axes), windows.halves_px)
+    with np.errstate(invalid="ignore"):
+        low, high = windows.centers_px - reach, windows.centers_px + reach
+        inside = (high >= usable.min(axis=0)) & (low <= usable.max(axis=0))
+    return np.asarray(inside.all(axis=1))
 
 
 def _wrapped_rad(angles_deg: FloatArray) -> FloatArray:
@@ -187,19 +245,3 @@ def _as_float(descriptors: NDArray[Any]) -> FloatArray:
         return descriptors.astype(np.float32)
     values = descriptors.astype(np.float32)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1.0)
-
-
-def _merged(found: list[_Found]) -> Matches:
-    """The best-scored matches in which each keypoint occurs once, sorted by keypoint of image 0."""
-    indices = np.concatenate([item.indices for item in found])
-    scores = np.concatenate([item.scores for item in found])
-    views = np.concatenate([item.views for item in found])
-    # Equal scores fall to the lower indices, whatever the order in which the network listed them.
-    order = np.lexsort((views[:, 1], views[:, 0], indices[:, 1], indices[:, 0]))
-    rows = order[one_to_one(indices[order, 0], indices[order, 1], -scores[order])]
-    rows = rows[np.argsort(indices[rows, 0], kind="stable")]
-    return Matches(
-        indices=indices[rows].astype(np.int32),
-        scores=scores[rows].astype(np.float32),
-        view_pairs=views[rows].astype(np.int16),
-    )

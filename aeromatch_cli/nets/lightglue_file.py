@@ -1,0 +1,95 @@
+"""LightGlue's weights files: every key style, the file's own dimensions, loaded strictly."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.weights import read_tensors
+
+# kornia's constructor makes it from the number of layers, so a file may have it or leave it out.
+_DERIVED = frozenset({"confidence_thresholds"})
+_OLD_LAYER_KEY = re.compile(r"^(self|cross)_attn\.(\d+)\.")
+_LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
+_POSITION_KEY = "posenc.Wr.weight"
+_WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
+_MAX_NAMED = 3
+
+
+def canonical_keys(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors under kornia's names: without the prefix `matcher.`, and with the first releases' `self_attn.N.` and
+    `cross_attn.N.` as `transformers.N.self_attn.` and `transformers.N.cross_attn.`.
+
+    Raises ValueError where two names of the file mean the same tensor.
+    """
+    renamed: dict[str, Tensor] = {}
+    for key, value in tensors.items():
+        name = _OLD_LAYER_KEY.sub(r"transformers.\2.\1_attn.", key.removeprefix("matcher."))
+        if name in renamed:
+            raise ValueError(f"{key} is given twice")
+        renamed[name] = value
+    return renamed
+
+
+def infer_dimensions(tensors: dict[str, Tensor]) -> Dimensions:
+    """Dimensions from the shapes of canonical tensors. Raises ValueError where they are not a LightGlue's."""
+    missing = [key for key in (_POSITION_KEY, _WIDTH_KEY) if key not in tensors or tensors[key].ndim != 2]
+    if missing:
+        raise ValueError(f"it has no {' and no '.join(missing)}")
+    descriptor_dim = int(tensors[_WIDTH_KEY].shape[0])
+    half_head_dim, position_dim = (int(size) for size in tensors[_POSITION_KEY].shape)
+    if position_dim not in (2, 4):
+        raise ValueError(f"its keypoints have {position_dim} coordinates; only 2 or 4 (with scale, orientation) work")
+    num_heads, rest = divmod(descriptor_dim, 2 * half_head_dim)
+    if rest or num_heads == 0:
+        raise ValueError(f"{_POSITION_KEY} and {_WIDTH_KEY} disagree")
+    projection = tensors.get("input_proj.weight")
+    layers = {int(match.group(1)) for key in tensors if (match := _LAYER_KEY.match(key))}
+    return Dimensions(
+        input_dim=descriptor_dim if projection is None else int(projection.shape[-1]),
+        descriptor_dim=descriptor_dim,
+        n_layers=len(layers),
+        num_heads=num_heads,
+        add_scale_ori=position_dim == 4,
+    )
+
+
+def load_lightglue(path: Path, *, device: str = "cpu") -> LightGlue:
+    """The network of a weights file in float32, in evaluation mode, without gradients.
+
+    Every tensor of the network comes from the file and every tensor of the file goes into the network; only the
+    derived buffer `confidence_thresholds` may be there or not. Raises ConfigError otherwise.
+    """
+    source = read_tensors(path)
+    try:
+        tensors = canonical_keys(source)
+        with torch.random.fork_rng(devices=[]):
+            network = LightGlue(infer_dimensions(tensors))
+        _check_same_tensors(network.state_dict(), tensors)
+    except ValueError as error:
+        raise ConfigError(f"weights file {path} is not a LightGlue: {error}") from error
+    network.load_state_dict({key: tensors[key] for key in network.state_dict()}, strict=True)
+    return network.to(device=device, dtype=torch.float32).eval().requires_grad_(False)
+
+
+def _check_same_tensors(expected: dict[str, Any], given: dict[str, Tensor]) -> None:
+    missing = sorted(expected.keys() - given.keys() - _DERIVED)
+    unexpected = sorted(given.keys() - expected.keys() - _DERIVED)
+    shapes = [
+        f"{key} {tuple(given[key].shape)} instead of {tuple(expected[key].shape)}"
+        for key in sorted(expected.keys() & given.keys())
+        if expected[key].shape != given[key].shape
+    ]
+    problems = [
+        f"{what}: {', '.join(keys[:_MAX_NAMED])}" + (f" and {len(keys) - _MAX_NAMED} more" * (len(keys) > _MAX_NAMED))
+        for what, keys in (("missing", missing), ("unexpected", unexpected), ("wrong shape", shapes))
+        if keys
+    ]
+    if problems:
+        raise ValueError("; ".join(problems))

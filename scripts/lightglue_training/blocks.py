@@ -1,0 +1,75 @@
+"""Stage 2: pairs of rendered blocks, with parallax, occlusion, oblique views and two suns, truth by ray casting.
+
+Each block is looked at twice: as the preset `baseline` does (north-up ground views from noisy poses, upright), and in
+the stored pictures (descriptors along their gradients).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.config import load
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.formats import read_features
+from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.synthetic import load_truth
+from lightglue_training.sides import Partners, Seen, partners, seen
+
+RECIPES = ((), ("simulate=none", "extract.orientation=gradient"))
+KEYPOINTS = 1500
+LEAST_PARTNERS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two sides, their truth, and whether two suns shone on them."""
+
+    side0: Seen
+    side1: Seen
+    truth: Partners
+    two_suns: bool
+
+
+def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[str, ...], ...] = RECIPES) -> list[Pair]:
+    """Every pair of a rendered block with partners enough, of each recipe."""
+    truth = load_truth(folder)
+    found = []
+    for recipe in recipes:
+        sides = dict(_sides(folder, recipe, keypoints))
+        for name0, name1 in combinations(sorted(sides), 2):
+            side0, side1 = sides[name0], sides[name1]
+            there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
+            there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
+            there0[hidden0], there1[hidden1] = np.nan, np.nan
+            found_partners = partners(side0.places_px, side1.places_px, there0, there1)
+            if (found_partners.of0 >= 0).sum() >= LEAST_PARTNERS:
+                found.append(Pair(side0, side1, found_partners, _sun(folder, name0) != _sun(folder, name1)))
+    return found
+
+
+def _sides(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tuple[str, Seen]]:
+    with tempfile.TemporaryDirectory() as scratch:
+        block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
+        block["cameras"] = str(folder / "block.json")
+        own = [f"extract.keypoints={keypoints}", "pairs=exhaustive", *recipe]
+        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
+        context, _ = pairs.prepare(load("baseline", own, block, **top), Executor("serial", 1))
+        for image in context.block.images:
+            task = extract.task_of(context, image.image_id)
+            extract.run_task(task)
+            features = read_features(task.path)
+            if len(features.descriptors):
+                yield image.name, seen(features)
+
+
+def _sun(folder: Path, name: str) -> int:
+    import json
+
+    facts = json.loads((folder / "synth.json").read_text(encoding="utf-8"))
+    return int(next(image["sortie"] for image in facts["images"] if image["name"] == name))

@@ -1,0 +1,97 @@
+"""What the network sees of a picture, and pairs of such with their truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from aeromatch_cli.data import Features
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+
+CORRECT_PX, WRONG_PX = 3.0, 5.0  # a partner lies within the one; without any within the other there is none
+NONE, UNKNOWN = -1, -2
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One view. points_px: (N, 2) from the view's corner; sizes_px, angles_rad: (N,); descriptors: (N, 128) uint8;
+    size_px: (2,) width, height; places_px: (N, 2) of the same keypoints where truth speaks of them."""
+
+    points_px: Array
+    sizes_px: Array
+    angles_rad: Array
+    descriptors: Array
+    size_px: Array
+    places_px: Array
+
+    def take(self, rows: Array) -> Seen:
+        values = (self.points_px, self.sizes_px, self.angles_rad, self.descriptors)
+        return Seen(*(value[rows] for value in values), self.size_px, self.places_px[rows])
+
+    def arrays(self) -> dict[str, Array]:
+        return vars(self)
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array]) -> Seen:
+        return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
+
+
+def seen(features: Features, view: int = 0) -> Seen:
+    """A view of extracted features; places are source pixels."""
+    rows = np.flatnonzero(features.view_idx == view)
+    turned = np.deg2rad(180.0 - np.mod(180.0 - features.view_orientation_deg[rows].astype(np.float64), 360.0))
+    return Seen(
+        points_px=(features.view_keypoints_px[rows] + np.float32(COLMAP_OFFSET_PX)).astype(np.float32),
+        sizes_px=features.view_size_px[rows].astype(np.float32),
+        angles_rad=turned.astype(np.float32),
+        descriptors=features.descriptors[rows],
+        size_px=features.view_sizes_px[view].astype(np.float32),
+        places_px=features.keypoints_px[features.descriptor_keypoint_idx[rows]].astype(np.float32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Partners:
+    """Truth of a pair: the partner of every keypoint of either side, NONE, or UNKNOWN."""
+
+    of0: Array
+    of1: Array
+
+
+def partners(places0_px: Array, places1_px: Array, there0_px: Array, there1_px: Array) -> Partners:
+    """From keypoints (M, 2), (N, 2) and where they truly are in the other picture (not finite: nowhere).
+
+    Partners are each other's nearest, within CORRECT_PX in both directions. A keypoint is without partner where no
+    other lies within WRONG_PX in either direction; in between nothing is known.
+    """
+    forward, backward = _nearest(there0_px, places1_px), _nearest(there1_px, places0_px)
+    of0, of1 = (np.where(near[0] > WRONG_PX, NONE, UNKNOWN) for near in (forward, backward))
+    # Of several descriptors of one place any may be the partner: distances decide by 1e-3 px, ties by order.
+    candidates = np.flatnonzero(forward[0] <= CORRECT_PX)
+    mates = forward[1][candidates]
+    back = np.linalg.norm(np.nan_to_num(there1_px[mates], nan=1e9) - places0_px[candidates], axis=1)
+    good = (back <= CORRECT_PX) & (backward[1][mates] == candidates)
+    of0[candidates[good]], of1[mates[good]] = mates[good], candidates[good]
+    # What another keypoint of the same place has taken, or who is near in one direction only, is unknown.
+    for own, near in ((of0, forward), (of1, backward)):
+        own[(own == NONE) & (near[0] <= WRONG_PX)] = UNKNOWN
+    reached1 = np.unique(forward[1][forward[0] <= WRONG_PX])
+    reached0 = np.unique(backward[1][backward[0] <= WRONG_PX])
+    of1[reached1] = np.where(of1[reached1] == NONE, UNKNOWN, of1[reached1])
+    of0[reached0] = np.where(of0[reached0] == NONE, UNKNOWN, of0[reached0])
+    return Partners(of0.astype(np.int32), of1.astype(np.int32))
+
+
+def _nearest(points_px: Array, others_px: Array) -> tuple[Array, Array]:
+    """Distance and row of the nearest other of each point; far away and 0 where there is none."""
+    distance, row = np.full(len(points_px), np.inf), np.zeros(len(points_px), np.int64)
+    known = np.flatnonzero(np.isfinite(points_px).all(axis=1))
+    if len(known) and len(others_px):
+        distance[known], row[known] = cKDTree(others_px).query(points_px[known])
+    return distance, row

@@ -1,0 +1,125 @@
+"""Recall at the mutual ratio test's own precision, and whether scores mean what they say, on pairs never trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from aeromatch_cli.nets.lightglue import LightGlue, Side
+from aeromatch_cli.strategies.matchers.scan import mutual_nearest
+from lightglue_training.batches import as_side
+from lightglue_training.blocks import Pair
+from lightglue_training.sides import UNKNOWN, Array, Seen
+
+RATIO, LEAST_SCORE = 0.8, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Matches of many pairs together: scores (M,), whether each is right (M,), and how many there were to find."""
+
+    scores: Array
+    right: Array
+    possible: int
+
+    @property
+    def recall(self) -> float:
+        return float(self.right.sum()) / max(self.possible, 1)
+
+    @property
+    def precision(self) -> float:
+        return float(self.right.mean()) if len(self.right) else 1.0
+
+    def recall_at(self, precision: float) -> float:
+        """Largest recall of the best-scored matches among which as large a share is right."""
+        order = np.argsort(-self.scores, kind="stable")
+        right = np.cumsum(self.right[order])
+        good = right / np.arange(1, len(right) + 1) >= precision
+        return float(right[good].max(initial=0)) / max(self.possible, 1)
+
+    def wrong_at(self, recall: float) -> int:
+        """Wrong matches among the best-scored ones that reach a recall; -1 where none do."""
+        order = np.argsort(-self.scores, kind="stable")
+        right = np.cumsum(self.right[order])
+        enough = np.flatnonzero(right >= recall * self.possible)
+        return int(enough[0] + 1 - right[enough[0]]) if len(enough) else -1
+
+
+def judged(answers: Iterable[tuple[Pair, Array, Array]]) -> Found:
+    """answers: pair, matches (M, 2) as rows of its sides, scores (M,). What truth does not know is left out."""
+    scores, right, possible = [np.zeros(0)], [np.zeros(0, bool)], 0
+    for pair, indices, values in answers:
+        partner = pair.truth.of0[indices[:, 0]]
+        known = (partner != UNKNOWN) & (pair.truth.of1[indices[:, 1]] != UNKNOWN)
+        scores.append(values[known])
+        right.append((partner == indices[:, 1])[known])
+        possible += int((pair.truth.of0 >= 0).sum())
+    return Found(np.concatenate(scores), np.concatenate(right), possible)
+
+
+def by_ratio(pair: Pair) -> tuple[Array, Array]:
+    """The mutual ratio test: matches (M, 2) and 1 - d1/d2."""
+    ids = [np.arange(len(side.points_px)) for side in (pair.side0, pair.side1)]
+    rows, columns, ratios = mutual_nearest(
+        pair.side0.descriptors, pair.side1.descriptors, *ids, ratio=RATIO, ratio_both=False, limits=None
+    )
+    return np.stack([rows, columns], axis=1), 1.0 - ratios
+
+
+def by_network(network: LightGlue, pair: Pair) -> tuple[Array, Array]:
+    """Matches (M, 2) and scores, all layers, nothing pruned."""
+    device = next(network.parameters()).device
+    sides = [_on(as_side([side]), device) for side in (pair.side0, pair.side1)]
+    indices, scores = network.match(*sides, threshold=LEAST_SCORE, depth_confidence=-1.0, width_confidence=-1.0)
+    return indices.cpu().numpy(), scores.cpu().numpy()
+
+
+def _on(side: Side, device: torch.device) -> Side:
+    return Side(side.places.to(device), side.descriptors.to(device))
+
+
+def thinned(pairs: Sequence[Pair], keypoints: int, limit: int) -> list[Pair]:
+    """Every so many-th pair, `limit` of them, with at most `keypoints` on either side (the first ones of a shuffle)."""
+    step = max(1, len(pairs) // limit)
+    return [_cut(pair, keypoints) for pair in pairs[::step][:limit]]
+
+
+def _cut(pair: Pair, keypoints: int) -> Pair:
+    from lightglue_training.batches import _ANY, _renamed
+    from lightglue_training.sides import Partners
+
+    rng = np.random.default_rng(0)
+    rows = [np.sort(rng.permutation(len(s.points_px))[:keypoints]) for s in (pair.side0, pair.side1)]
+    lookups = [np.full(len(s.points_px), _ANY) for s in (pair.side0, pair.side1)]
+    for lookup, kept in zip(lookups, rows, strict=True):
+        lookup[kept] = np.arange(len(kept))
+    truth = Partners(_renamed(pair.truth.of0[rows[0]], lookups[1]), _renamed(pair.truth.of1[rows[1]], lookups[0]))
+    sides: list[Seen] = [side.take(kept) for side, kept in zip((pair.side0, pair.side1), rows, strict=True)]
+    return Pair(sides[0], sides[1], truth, pair.two_suns)
+
+
+def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[str, float]]:
+    """Figures by set: the ratio test's recall and precision, and the network's recall there."""
+    rows = {}
+    for name, pairs in sets.items():
+        ratio = judged((pair, *by_ratio(pair)) for pair in pairs)
+        own = judged((pair, *by_network(network, pair)) for pair in pairs)
+        rows[name] = {
+            "pairs": len(pairs),
+            "ratio_precision": ratio.precision,
+            "ratio_recall": ratio.recall,
+            "recall": own.recall_at(ratio.precision),
+            "recall_at_0.1": _above(own, 0.1).recall,
+            "precision_at_0.1": _above(own, 0.1).precision,
+            "ratio_wrong": int((~ratio.right).sum()),
+            "wrong_at_its_recall": own.wrong_at(ratio.recall),
+        }
+    return rows
+
+
+def _above(found: Found, threshold: float) -> Found:
+    kept = found.scores >= threshold
+    return Found(found.scores[kept], found.right[kept], found.possible)

@@ -1,0 +1,236 @@
+"""Train the LightGlue that ships with the package: SIFT keypoints of aerial images, 6 layers of 128 channels.
+
+Stage 1 learns from homography pairs: pictures of --trained-on (real blocks below --data) and of rendered blocks, warped
+and developed anew (lightglue_training.homographies). Stage 2 mixes them with pairs of the rendered blocks themselves
+(lightglue_training.blocks): parallax, occlusion, oblique views, two suns. The last part of stage 2 sees more keypoints
+and trains the confidence heads. Every pair is cut to equally many keypoints, turned and scaled at random, so that no
+two steps see the same. The learning rate falls along a cosine; what is kept is a moving average of the weights.
+
+Validation knows neither the pictures nor the scenes: homography pairs of --unseen and of two rendered blocks that are
+left out, and the pairs of these two. Beside it stands the mutual ratio test (0.8) on the same keypoints.
+
+The same on the CPU and on a CUDA device, both in bfloat16; the batch of a CUDA device is larger, the number of pairs is
+the same. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it was. Writes
+OUT/lightglue.safetensors (float16), OUT/log.json and OUT/curves.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightglue_training.batches import Batch, batch_of, piece
+from lightglue_training.blocks import Pair
+from lightglue_training.data import prepare, read_block, read_groups
+from lightglue_training.loss import loss_of
+from lightglue_training.validation import report, thinned
+
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue, Side
+
+DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
+DECAY, CLIP = 0.999, 1.0
+REPORT_EVERY = 16_000  # pairs
+
+
+@dataclass(frozen=True)
+class Phase:
+    """pairs: to be seen. count: keypoints of either side. rendered: share of pairs of rendered blocks."""
+
+    name: str
+    pairs: int
+    count: int
+    rendered: float
+    confidence: bool = False
+
+
+def phases(scale: float) -> tuple[Phase, ...]:
+    return (
+        Phase("homographies", round(240_000 * scale), 256, 0.0),
+        Phase("blocks", round(160_000 * scale), 384, 0.6),
+        Phase("many", round(32_000 * scale), 768, 0.6, confidence=True),
+    )
+
+
+def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen: int) -> Batch:
+    """The batch after so many pairs."""
+    rng = np.random.default_rng([seen, 17])
+    pieces = []
+    for _ in range(size):
+        source = stage2 if rng.random() < phase.rendered else stage1
+        pair = source[int(rng.integers(len(source)))]
+        upright = not pair.side0.angles_rad.any()
+        # Upright descriptors do not turn with the picture.
+        sides = (pair.side0, pair.side1, pair.truth)
+        pieces.append(piece(*sides, phase.count, rng, free=not upright))
+    return batch_of(pieces, phase.count)
+
+
+def on(batch: Batch, device: str) -> Batch:
+    def side(given: Side) -> Side:
+        return Side(given.places.to(device), given.descriptors.to(device))
+
+    return Batch(side(batch.side0), side(batch.side1), batch.partners0.to(device), batch.partners1.to(device))
+
+
+@dataclass
+class Run:
+    """Everything that a resumed run needs."""
+
+    network: LightGlue
+    average: LightGlue
+    optimiser: torch.optim.Optimizer
+    seen: int
+    log: list[dict[str, Any]]
+
+    def save(self, path: Path) -> None:
+        parts = (self.network, self.average, self.optimiser)
+        partly = path.with_suffix(".partly")
+        torch.save((self.seen, self.log, *(part.state_dict() for part in parts)), partly)
+        partly.replace(path)
+
+    @classmethod
+    def begin(cls, path: Path, device: str, rate: float) -> Run:
+        torch.manual_seed(0)
+        network = LightGlue(DIMENSIONS).to(device)
+        run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
+        if path.is_file():
+            run.seen, run.log, *states = torch.load(path, map_location=device, weights_only=False)
+            for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
+                part.load_state_dict(state)
+        return run
+
+
+def train(args: argparse.Namespace, device: str) -> Run | None:
+    """The finished run, or None where --minutes ended it before."""
+    plan = phases(args.scale)
+    total = sum(phase.pairs for phase in plan)
+    stage1 = [p for path in sorted((args.out / "data" / "stage1").glob("*.npz")) for p in read_groups(path)]
+    stage2 = [p for path in sorted((args.out / "data" / "stage2").glob("*.npz")) for p in read_block(path)]
+    sets = validation_sets(args.out / "data")
+    state, started = args.out / "state.pt", time.monotonic()
+    run = Run.begin(state, device, args.rate)
+    print(f"{len(stage1)} homography pairs, {len(stage2)} rendered pairs, {run.seen} of {total} pairs seen", flush=True)
+    losses: list[tuple[float, float, float]] = []
+    while run.seen < total:
+        phase = _phase(plan, run.seen)
+        size = max(1, args.batch * 256 // phase.count)
+        for group in run.optimiser.param_groups:
+            group["lr"] = args.rate * _rate(run.seen, total)
+        losses.append(step(run, on(drawn(stage1, stage2, phase, size, run.seen), device), phase, device))
+        before, run.seen = run.seen, run.seen + size
+        if run.seen // REPORT_EVERY > before // REPORT_EVERY or run.seen >= total:
+            row = {"seen": run.seen, "phase": phase.name, "minutes": round((time.monotonic() - started) / 60, 1)}
+            row |= dict(zip(("loss", "partner", "none"), np.mean(losses, axis=0).round(4).tolist(), strict=True))
+            run.log.append(row | {"unseen": report(run.average.eval(), sets)})
+            print(json.dumps(run.log[-1]), flush=True)
+            losses = []
+            run.save(state)
+            draw_curves(run.log, args.out / "curves.png")
+        if args.minutes and time.monotonic() - started > 60.0 * args.minutes:
+            run.save(state)
+            return None
+    return run
+
+
+def _phase(plan: tuple[Phase, ...], seen: int) -> Phase:
+    for phase in plan:
+        if seen < phase.pairs:
+            return phase
+        seen -= phase.pairs
+    return plan[-1]
+
+
+def _rate(seen: int, total: int) -> float:
+    """Of the learning rate: a short rise, then a cosine to nothing."""
+    return min(1.0, (seen + 1) / 8_000) * (0.5 + 0.5 * math.cos(math.pi * seen / total)) + 0.005
+
+
+def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, float, float]:
+    run.network.train()
+    with torch.autocast(device, dtype=torch.bfloat16):
+        loss = loss_of(run.network, batch, confidence=phase.confidence)
+    run.optimiser.zero_grad(set_to_none=True)
+    loss.total.backward()
+    torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
+    run.optimiser.step()
+    keep = min(DECAY, (run.seen + 1) / (run.seen + 1000))
+    with torch.no_grad():
+        for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
+            old.lerp_(new, 1.0 - keep)
+    return float(loss.total), loss.partner, loss.none
+
+
+def validation_sets(data: Path) -> dict[str, list[Pair]]:
+    """Unseen pairs by name, cut so that validation takes seconds."""
+    first = [p for path in sorted((data / "unseen1").glob("*.npz")) for p in read_groups(path)]
+    second = [p for path in sorted((data / "unseen2").glob("*.npz")) for p in read_block(path)]
+    turned = [pair for pair in first if pair.side0.angles_rad.any()]
+    upright = [pair for pair in first if not pair.side0.angles_rad.any()]
+    return {
+        "homography, turned": thinned(turned, 512, 40),
+        "homography, upright": thinned(upright, 512, 40),
+        "rendered, one sun": thinned([pair for pair in second if not pair.two_suns], 1024, 40),
+        "rendered, two suns": thinned([pair for pair in second if pair.two_suns], 1024, 40),
+    }
+
+
+def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
+    """Recall at the ratio test's precision, and what that test recalls (dashed), by pairs seen."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.5), dpi=110, layout="constrained")
+    axes, losses = figure.subplots(1, 2)
+    seen = [row["seen"] for row in log]
+    for number, name in enumerate(log[-1]["unseen"]):
+        axes.plot(seen, [row["unseen"][name]["recall"] for row in log], color=f"C{number}", label=name)
+        axes.axhline(log[-1]["unseen"][name]["ratio_recall"], color=f"C{number}", linestyle="--", linewidth=0.8)
+    axes.set(xlabel="pairs seen", ylabel="recall at the ratio test's precision (dashed: its recall)", ylim=(0.0, 1.0))
+    axes.legend(frameon=False, fontsize=8)
+    for name in ("loss", "partner", "none"):
+        losses.plot(seen, [row[name] for row in log], label=name)
+    losses.set(xlabel="pairs seen", ylabel="loss")
+    losses.legend(frameon=False, fontsize=8)
+    figure.savefig(path)
+
+
+def main() -> None:
+    from safetensors.torch import save_file
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
+    add("--trained-on", default="sheffield,caliterra,brighton", help="real blocks whose pictures are warped")
+    add("--unseen", default="ochota,lewis,seneca", help="real blocks for validation only")
+    add("--groups", type=int, default=2400, help="groups of four homography views")
+    add("--blocks", type=int, default=60, help="rendered blocks, at least 19")
+    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
+    add("--scale", type=float, default=1.0, help="of the number of pairs of every phase")
+    add("--batch", type=int, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
+    add("--rate", type=float, default=6e-4, help="largest learning rate")
+    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
+    add("--only-data", action="store_true", help="make the data and stop")
+    add("--out", type=Path, required=True)
+    args = parser.parse_args()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    args.batch = args.batch or (96 if device == "cuda" else 16)
+    args.rendered = args.rendered or args.out / "blocks"
+    torch.set_num_threads(args.jobs)
+    prepare(args.out / "data", args.data, args.trained_on.split(","), args.unseen.split(","), args)
+    run = None if args.only_data else train(args, device)
+    if run is not None:
+        weights = {name: value.half().cpu().contiguous() for name, value in run.average.state_dict().items()}
+        save_file(weights, args.out / "lightglue.safetensors")
+        (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

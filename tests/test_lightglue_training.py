@@ -1,0 +1,147 @@
+"""Truth, pieces and figures of scripts/train_lightglue.py, on places known by construction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lightglue_training.batches import batch_of, piece
+from lightglue_training.blocks import Pair
+from lightglue_training.data import read_groups, write_groups
+from lightglue_training.homographies import SIZE_PX, make_group
+from lightglue_training.loss import loss_of
+from lightglue_training.sides import NONE, UNKNOWN, Partners, Seen, partners
+from lightglue_training.validation import Found, by_ratio, judged, thinned
+
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(5)
+    texture = sum(cv2.GaussianBlur(rng.random((700, 800)), (0, 0), s) * s for s in (1.5, 3.0, 6.0, 12.0))
+    gray = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    path = tmp_path_factory.mktemp("picture") / "texture.png"
+    cv2.imwrite(str(path), gray)
+    return path
+
+
+def side(points: np.ndarray, seed: int = 0, turned: bool = True) -> Seen:
+    rng = np.random.default_rng(seed)
+    count = len(points)
+    descriptors = rng.integers(0, 100, (count, 128)).astype(np.uint8)
+    angles = rng.uniform(-3, 3, count) if turned else np.zeros(count)
+    sizes = rng.uniform(2, 9, count).astype(np.float32)
+    points = points.astype(np.float32)
+    return Seen(points, sizes, angles.astype(np.float32), descriptors, np.float32([640, 480]), points)
+
+
+def test_partners_are_mutual_and_near_and_the_rest_is_none_or_unknown() -> None:
+    places0 = np.array([[10.0, 10.0], [50.0, 10.0], [90.0, 10.0], [130.0, 10.0], [170.0, 10.0]])
+    places1 = np.array([[11.0, 10.0], [54.0, 10.0], [300.0, 10.0], [131.0, 10.0], [132.5, 10.0]])
+    there0, there1 = places0.copy(), places1.copy()  # the identity
+    there0[4] = np.nan  # hidden in the other picture
+    found = partners(places0, places1, there0, there1)
+    #                              near  4 px off  no one   nearer of two  hidden
+    assert found.of0.tolist() == [0, UNKNOWN, NONE, 3, NONE]
+    #                              near  4 px off  no one  nearer  farther of two
+    assert found.of1.tolist() == [0, UNKNOWN, NONE, 3, UNKNOWN]
+
+
+def test_homography_truth_joins_places_of_the_same_point(picture: Path) -> None:
+    group = make_group([picture], 3)
+    truth = group.truth(0, 1)
+    matched = np.flatnonzero(truth.of0 >= 0)
+    assert len(matched) > 50
+    to_base = [np.linalg.inv(matrix) for matrix in group.matrices]
+    base = [cv2.perspectiveTransform(view.places_px[None].astype(np.float64), m)[0] for view, m in
+            zip(group.views, to_base, strict=True)]  # fmt: skip
+    scale = np.sqrt(abs(np.linalg.det(to_base[0][:2, :2])))
+    apart = np.linalg.norm(base[0][matched] - base[1][truth.of0[matched]], axis=1)
+    assert np.median(apart) < 2.0 * scale
+    assert all(tuple(view.size_px) == SIZE_PX for view in group.views)
+
+
+def test_a_file_of_groups_reads_back(picture: Path, tmp_path: Path) -> None:
+    write_groups(tmp_path / "x.npz", [picture], 7, 1)
+    pairs, group = read_groups(tmp_path / "x.npz"), make_group([picture], 7)
+    assert len(pairs) == 6
+    assert np.array_equal(pairs[0].side0.descriptors, group.views[0].descriptors)
+    assert np.array_equal(pairs[5].truth.of1, group.truth(2, 3).of1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_piece_keeps_partners_together(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, [640, 480], (300, 2))
+    order = rng.permutation(300)
+    truth = Partners(np.argsort(order).astype(np.int32), order.astype(np.int32))
+    first = side(points)
+    given = first, first.take(order), truth
+    side0, side1, cut = piece(*given, 120, rng, free=True)
+    assert len(side0.points_px) == len(side1.points_px) == 120
+    joined = np.flatnonzero(cut.of0 >= 0)
+    assert len(joined) > 10
+    assert np.array_equal(side0.descriptors[joined], side1.descriptors[cut.of0[joined]])
+    assert np.array_equal(cut.of1[cut.of0[joined]], joined)
+    gone = np.flatnonzero(cut.of0 == NONE)
+    assert not {d.tobytes() for d in side0.descriptors[gone]} & {d.tobytes() for d in side1.descriptors}
+    # One turn and one scale for the whole picture: distances and orientations change together.
+    turn = np.mod(side0.angles_rad - first.take(_rows_of(first, side0)).angles_rad, 2 * np.pi)
+    assert np.ptp(np.unwrap(np.sort(turn))) == pytest.approx(0.0, abs=1e-4)
+    assert (side0.points_px >= -1e-3).all()
+    assert (side0.points_px <= side0.size_px + 1e-3).all()
+
+
+def _rows_of(whole: Seen, part: Seen) -> np.ndarray:
+    rows = {d.tobytes(): n for n, d in enumerate(whole.descriptors)}
+    return np.array([rows[d.tobytes()] for d in part.descriptors])
+
+
+def test_a_small_network_learns_a_batch_by_heart() -> None:
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    first = side(rng.uniform(0, [640, 480], (40, 2)))
+    truth = Partners(np.arange(40, dtype=np.int32), np.arange(40, dtype=np.int32))
+    batch = batch_of([(first, first, truth), (first.take(np.arange(30)), side(np.zeros((20, 2)), 9),
+                      Partners(np.full(30, NONE, np.int32), np.full(20, NONE, np.int32)))], 40)  # fmt: skip
+    network = LightGlue(Dimensions(128, 32, 2, 1, True))
+    optimiser = torch.optim.AdamW(network.parameters(), 3e-3)
+    losses = []
+    for _ in range(60):
+        loss = loss_of(network, batch, confidence=True)
+        optimiser.zero_grad()
+        loss.total.backward()
+        optimiser.step()
+        losses.append(loss.partner + loss.none)
+    assert losses[-1] < 0.2 * losses[0]
+    pairs, scores = network.eval().match(
+        *(type(s)(s.places[:1], s.descriptors[:1]) for s in (batch.side0, batch.side1)),
+        threshold=0.1, depth_confidence=-1.0, width_confidence=-1.0,
+    )  # fmt: skip
+    assert len(pairs) > 35
+    assert (pairs[:, 0] == pairs[:, 1]).all()
+    assert float(scores.mean()) > 0.5
+
+
+def test_recall_at_a_precision_and_wrong_at_a_recall() -> None:
+    found = Found(np.array([0.9, 0.8, 0.7, 0.6, 0.5]), np.array([True, True, False, True, False]), 10)
+    assert (found.recall, found.precision) == (0.3, 0.6)
+    assert (found.recall_at(1.0), found.recall_at(0.75), found.recall_at(0.7)) == (0.2, 0.3, 0.3)
+    assert (found.wrong_at(0.2), found.wrong_at(0.3), found.wrong_at(0.4)) == (0, 1, -1)
+
+
+def test_the_ratio_test_is_judged_by_truth() -> None:
+    points = np.random.default_rng(1).uniform(0, [640, 480], (60, 2))
+    first = side(points)
+    truth = Partners(np.arange(60, dtype=np.int32), np.arange(60, dtype=np.int32))
+    truth.of0[:10], truth.of1[:10] = UNKNOWN, UNKNOWN
+    truth.of0[10:20], truth.of1[10:20] = NONE, NONE
+    pair = Pair(first, first, truth, False)
+    found = judged([(pair, *by_ratio(pair))])
+    assert found.possible == 40
+    assert (found.right.sum(), (~found.right).sum()) == (40, 10)  # unknown ones are not counted
+    assert len(thinned([pair] * 5, 30, 2)) == 2
