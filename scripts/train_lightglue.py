@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 from lightglue_training.batches import Batch, batch_of, piece
-from lightglue_training.blocks import Pair
+from lightglue_training.blocks import LEAST_PARTNERS, Pair
 from lightglue_training.data import prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import report, thinned
@@ -37,7 +37,7 @@ from aeromatch_cli.nets.lightglue import Dimensions, LightGlue, Side
 
 DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
-REPORT_EVERY = 16_000  # pairs
+REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
     total = sum(phase.pairs for phase in plan)
     stage1 = [p for path in sorted((args.out / "data" / "stage1").glob("*.npz")) for p in read_groups(path)]
     stage2 = [p for path in sorted((args.out / "data" / "stage2").glob("*.npz")) for p in read_block(path)]
+    stage1, stage2 = ([pair for pair in pairs if usable(pair)] for pairs in (stage1, stage2))
     sets = validation_sets(args.out / "data")
     state, started = args.out / "state.pt", time.monotonic()
     run = Run.begin(state, device, args.rate)
@@ -134,10 +135,17 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
             losses = []
             run.save(state)
             draw_curves(run.log, args.out / "curves.png")
+        elif run.seen // SAVE_EVERY > before // SAVE_EVERY:
+            run.save(state)
         if args.minutes and time.monotonic() - started > 60.0 * args.minutes:
             run.save(state)
             return None
     return run
+
+
+def usable(pair: Pair) -> bool:
+    """Whether there is something to learn from it."""
+    return int((pair.truth.of0 >= 0).sum()) >= LEAST_PARTNERS
 
 
 def _phase(plan: tuple[Phase, ...], seen: int) -> Phase:
@@ -172,6 +180,7 @@ def validation_sets(data: Path) -> dict[str, list[Pair]]:
     """Unseen pairs by name, cut so that validation takes seconds."""
     first = [p for path in sorted((data / "unseen1").glob("*.npz")) for p in read_groups(path)]
     second = [p for path in sorted((data / "unseen2").glob("*.npz")) for p in read_block(path)]
+    first, second = ([pair for pair in pairs if usable(pair)] for pairs in (first, second))
     turned = [pair for pair in first if pair.side0.angles_rad.any()]
     upright = [pair for pair in first if not pair.side0.angles_rad.any()]
     return {

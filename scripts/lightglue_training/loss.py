@@ -36,7 +36,7 @@ def loss_of(network: LightGlue, batch: Batch, *, confidence: bool) -> Loss:
     total = sum(positive + negative for positive, negative in layers) / (2.0 * len(layers))
     if confidence:
         total = total + _confidence_loss(network, answers, states)
-    return Loss(total, float(layers[-1][0]), float(layers[-1][1]))
+    return Loss(total, float(layers[-1][0].detach()), float(layers[-1][1].detach()))
 
 
 def _assignment_loss(

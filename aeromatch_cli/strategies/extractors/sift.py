@@ -28,7 +28,7 @@ _STABLE_SIZE_PX = 6.0
 class Sift(Strategy):
     """SIFT keypoints and RootSIFT descriptors of all views of one image."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["sift"] = "sift"
     keypoints: int = Field(
@@ -46,7 +46,11 @@ class Sift(Strategy):
         description="Turn descriptors to their gradients, or never (upright: one descriptor per point, orientation 0); "
         "auto is upright in views whose axes follow the world's.",
     )
-    contrast_threshold: float = Field(0.01, gt=0.0, description="Smallest contrast, divided by octave_layers inside.")
+    contrast_threshold: float = Field(
+        0.004,
+        gt=0.0,
+        description="Smallest contrast, divided by octave_layers inside; so low that dull ground fills its budget too.",
+    )
     edge_threshold: float = Field(10.0, gt=1.0, description="Largest ratio of the two curvatures.")
     octave_layers: int = Field(3, ge=1, description="Scales per octave.")
     sigma: float = Field(1.6, gt=0.5, description="Blur of the first scale, pixels of the doubled image.")
