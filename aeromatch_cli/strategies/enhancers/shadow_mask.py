@@ -15,8 +15,9 @@ from aeromatch_cli.strategies.enhancers.tone import Tone, tone_of
 # Light below this is taken for this: the noise of a dark pixel is no colour.
 _DARKEST_LIGHT = 0.004
 _LOG_LIMIT, _COLOUR_LIMIT, _COLOUR_SCALE = 4.0, 3.0, 2.0
-# A dark roof called shadow is worse than a shadow left alone: what is no likelier than this counts half.
-_LIKELY = 0.7
+# A dark roof called shadow is worse than a shadow left alone: what is no likelier than this counts half. Of a gray
+# picture the network is never as sure.
+_LIKELY, _LIKELY_GRAY = 0.7, 0.5
 # Probabilities are this much steeper around it as shares of shadow: what is likely shadow is wholly so.
 _STEEPNESS = 4.0
 # Borders follow the picture's own edges over this many pixels of the overview, where they are this clear.
@@ -35,6 +36,11 @@ class Overview:
     valid: BoolArray
     light: FloatArray
     tone: Tone
+
+    @property
+    def has_colour(self) -> bool:
+        """Whether its bands differ anywhere."""
+        return bool((self.levels != self.levels[..., :1]).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +108,8 @@ def shadow_share(overview: Overview) -> FloatArray:
     coarse = _logits(np.asarray(cv2.resize(inputs, half, interpolation=cv2.INTER_AREA)))
     logits = 0.5 * (_logits(inputs) + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR))
     probability = 1.0 / (1.0 + np.exp(-np.clip(logits, -30.0, 30.0)))
-    share = np.clip(_STEEPNESS * (probability - _LIKELY) + 0.5, 0.0, 1.0)
+    likely = _LIKELY if overview.has_colour else _LIKELY_GRAY
+    share = np.clip(_STEEPNESS * (probability - likely) + 0.5, 0.0, 1.0)
     return np.asarray(np.where(overview.valid, share, 0.0), dtype=np.float32)
 
 
