@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import shutil
+import signal
 import sqlite3
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -22,6 +23,11 @@ from aeromatch_cli.synthetic import render_block
 IMAGES, WIDTH, HEIGHT = 5, 320, 240
 # Quick settings: few keypoints, one process.
 QUICK = ("--jobs", "1", "--set", "extract.keypoints=400")
+
+
+def heed_interrupts() -> None:
+    """In a child before its program starts: background jobs of a shell ignore Ctrl-C, and so would their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from conftest import heed_interrupts
 
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
@@ -175,7 +176,9 @@ def test_ctrl_c_leaves_no_worker_behind(tmp_path: Path) -> None:
     script.write_text(SCRIPT.format(guard="if __name__ == '__main__':"))
     marks = tmp_path / "marks"
     marks.mkdir()
-    process = subprocess.Popen([sys.executable, str(script), str(marks)], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(marks)], stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    )
     deadline = time.monotonic() + 20
     while len(list(marks.iterdir())) < 2 and time.monotonic() < deadline:
         time.sleep(0.05)

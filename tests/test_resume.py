@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site, contents
+from conftest import IMAGES, Site, contents, heed_interrupts
 
 from aeromatch_cli.formats import row_fingerprints
 from aeromatch_cli.workspace import Workspace
@@ -289,7 +289,8 @@ def start(site: Site, work: Path, *more: object) -> subprocess.Popen[str]:
     options = [str(option) for option in site.options("--workspace", work, "--jobs", "2", "--json", *more)]
     command = [sys.executable, "-m", "aeromatch_cli.cli", "run", "baseline", *options]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, start_new_session=True, **pipes)  # type: ignore[call-overload,no-any-return]
+    pipes |= {"start_new_session": True, "preexec_fn": heed_interrupts}
+    return subprocess.Popen(command, **pipes)  # type: ignore[call-overload,no-any-return]
 
 
 def wait_for_files(process: subprocess.Popen[str], work: Path, count: int) -> None:
