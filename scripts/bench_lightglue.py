@@ -6,8 +6,8 @@ scenes, suns and flights of training_blocks with other numbers. Reliability: sha
 
 Seconds a pair with 2048 keypoints on either side, features excluded, one process with --threads, median of 20 after a
 warm-up: this forward in both precisions, kornia's with the same weights and kornia's of the official size (9 layers of
-256, random weights), then what culling, early exit and pruning add on the rendered pairs. On a CUDA device also pairs a
-second. Writes OUT/lightglue.md and OUT/lightglue.json; OUT/data keeps the pairs.
+256, random weights), then what early exit and pruning add. Writes OUT/lightglue.md and
+OUT/lightglue.json; OUT/data keeps the pairs.
 """
 
 from __future__ import annotations
@@ -148,8 +148,7 @@ def _kornia(dimensions: Dimensions, device: str, weights: LightGlue | None) -> C
 
 def _own(network: LightGlue, device: str, **options: float) -> Callable[[Pair], Any]:
     def match(pair: Pair) -> Any:
-        sides = [as_side([side]) for side in (pair.side0, pair.side1)]
-        sides = [type(side)(side.places.to(device), side.descriptors.to(device)) for side in sides]
+        sides = [as_side([side]).to(device) for side in (pair.side0, pair.side1)]
         return network.match(*sides, threshold=0.1, **(EVERYTHING | options))
 
     return match

@@ -33,7 +33,7 @@ from lightglue_training.data import prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import report, thinned
 
-from aeromatch_cli.nets.lightglue import Dimensions, LightGlue, Side
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 
 DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
@@ -74,10 +74,7 @@ def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen:
 
 
 def on(batch: Batch, device: str) -> Batch:
-    def side(given: Side) -> Side:
-        return Side(given.places.to(device), given.descriptors.to(device))
-
-    return Batch(side(batch.side0), side(batch.side1), batch.partners0.to(device), batch.partners1.to(device))
+    return Batch(*(part.to(device) for part in (batch.side0, batch.side1, batch.partners0, batch.partners1)))
 
 
 @dataclass
@@ -145,7 +142,7 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
 
 def usable(pair: Pair) -> bool:
     """Whether there is something to learn from it."""
-    return int((pair.truth.of0 >= 0).sum()) >= LEAST_PARTNERS
+    return pair.truth.count >= LEAST_PARTNERS
 
 
 def _phase(plan: tuple[Phase, ...], seen: int) -> Phase:

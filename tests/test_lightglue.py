@@ -21,7 +21,7 @@ from aeromatch_cli.nets.lightglue import Dimensions, Side, log_assignment, norma
 from aeromatch_cli.nets.lightglue import LightGlue as Network
 from aeromatch_cli.nets.lightglue_file import canonical_keys, load_lightglue
 from aeromatch_cli.strategies.matchers import lightglue
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue, _wrapped_rad
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue, wrapped_rad
 
 SIFT = Dimensions(input_dim=128, descriptor_dim=64, n_layers=3, num_heads=2, add_scale_ori=True)
 PLAIN = Dimensions(input_dim=32, descriptor_dim=32, n_layers=2, num_heads=1, add_scale_ori=False)
@@ -397,7 +397,7 @@ def test_scale_and_orientation_reach_the_network(weights: str) -> None:
     ],
 )
 def test_orientations_are_wrapped_half_open(degrees: float, radians: float) -> None:
-    wrapped: FloatArray = _wrapped_rad(np.array([degrees], np.float32))
+    wrapped: FloatArray = wrapped_rad(np.array([degrees], np.float32))
     np.testing.assert_allclose(wrapped, [radians], atol=1e-6)
 
 

@@ -45,6 +45,9 @@ class Side:
     places: Tensor
     descriptors: Tensor
 
+    def to(self, device: str | torch.device) -> Side:
+        return Side(self.places.to(device), self.descriptors.to(device))
+
 
 def normalised(points_px: Tensor, size_px: Tensor) -> Tensor:
     """Points (..., N, 2), pixels from the picture's corner, with the middle at 0 and the longer half side at 1.
@@ -100,7 +103,7 @@ class SelfBlock(nn.Module):
 
 
 class CrossBlock(nn.Module):
-    """Attention of each picture's keypoints to the other's, both ways with one similarity."""
+    """Attention of each picture's keypoints to the other's, both ways."""
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()

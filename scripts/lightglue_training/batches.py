@@ -8,9 +8,7 @@ import numpy as np
 import torch
 
 from aeromatch_cli.nets.lightglue import Side, normalised
-from lightglue_training.sides import NONE, UNKNOWN, Array, Partners, Seen
-
-_ANY = 1 << 30
+from lightglue_training.sides import UNKNOWN, Array, Partners, Seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +29,7 @@ def piece(
     The keypoints around a place have a picture of their own, as after culling to an overlap, in half of the cases.
     """
     rows0, rows1 = _rows(side0, side1, truth, count, rng)
-    lookup0, lookup1 = np.full(len(side0.points_px), _ANY), np.full(len(side1.points_px), _ANY)
-    lookup0[rows0], lookup1[rows1] = np.arange(len(rows0)), np.arange(len(rows1))
-    cut = Partners(_renamed(truth.of0[rows0], lookup1), _renamed(truth.of1[rows1], lookup0))
+    cut = truth.take(rows0, rows1)
     framed = rng.random() < 0.5
     turn = rng.uniform(-np.pi, np.pi) if free else 0.0
     scale = float(np.exp(rng.uniform(np.log(0.6), np.log(1.7))))
@@ -56,14 +52,6 @@ def _rows(side0: Seen, side1: Seen, truth: Partners, count: int, rng: np.random.
         distance = (np.abs(side.points_px - side.points_px[middle] - off) * wide).max(axis=1)
         rows.append(np.sort(np.argsort(distance, kind="stable")[:count]))
     return rows[0], rows[1]
-
-
-def _renamed(partners: Array, lookup: Array) -> Array:
-    """Partners that were cut away are none."""
-    out = partners.astype(np.int64)
-    there = out >= 0
-    out[there] = lookup[out[there]]
-    return np.where(out == _ANY, NONE, out)
 
 
 def _framed(side: Seen, framed: bool, turn: float, scale: float) -> Seen:

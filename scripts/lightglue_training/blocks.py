@@ -6,6 +6,7 @@ the stored pictures (descriptors along their gradients).
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ class Pair:
 
 def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[str, ...], ...] = RECIPES) -> list[Pair]:
     """Every pair of a rendered block with partners enough, of each recipe."""
-    truth = load_truth(folder)
+    truth, suns = load_truth(folder), _suns(folder)
     found = []
     for recipe in recipes:
         sides = dict(_sides(folder, recipe, keypoints))
@@ -48,8 +49,8 @@ def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[s
             there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
             there0[hidden0], there1[hidden1] = np.nan, np.nan
             found_partners = partners(side0.places_px, side1.places_px, there0, there1)
-            if (found_partners.of0 >= 0).sum() >= LEAST_PARTNERS:
-                found.append(Pair(side0, side1, found_partners, _sun(folder, name0) != _sun(folder, name1)))
+            if found_partners.count >= LEAST_PARTNERS:
+                found.append(Pair(side0, side1, found_partners, suns[name0] != suns[name1]))
     return found
 
 
@@ -68,8 +69,7 @@ def _sides(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tu
                 yield image.name, seen(features)
 
 
-def _sun(folder: Path, name: str) -> int:
-    import json
-
+def _suns(folder: Path) -> dict[str, int]:
+    """The sortie of every picture; each has a sun of its own."""
     facts = json.loads((folder / "synth.json").read_text(encoding="utf-8"))
-    return int(next(image["sortie"] for image in facts["images"] if image["name"] == name))
+    return {image["name"]: int(image["sortie"]) for image in facts["images"]}

@@ -25,8 +25,8 @@ SHARD = 50  # groups of homography views in a file
 def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[str], args: Any) -> None:
     """Every file that is not there yet.
 
-    trained_on, unseen: real blocks below `data` whose pictures are warped for training and for validation; the last
-    of the groups of a shard are of rendered pictures.
+    trained_on, unseen: real blocks below `data` whose pictures are warped for training and for validation; every
+    fourth shard is of rendered pictures.
     """
     for folder in ("stage1", "stage2", "unseen1", "unseen2"):
         (out / folder).mkdir(parents=True, exist_ok=True)
@@ -115,9 +115,9 @@ def read_groups(path: Path) -> list[Pair]:
         views = sorted(
             {int(name.split(".")[1]) for name in arrays if name.startswith(f"{number}.") and "of" not in name}
         )
-        sides = [Seen.of(_part(arrays, f"{number}.{view}.")) for view in views]
+        sides = [_side(arrays, f"{number}.{view}.") for view in views]
         for a, b in combinations(views, 2):
-            found.append(Pair(sides[a], sides[b], Partners(**_part(arrays, f"{number}.{a}{b}.")), False))
+            found.append(Pair(sides[a], sides[b], _truth(arrays, f"{number}.{a}{b}."), False))
     return found
 
 
@@ -131,19 +131,15 @@ def read_block(path: Path) -> list[Pair]:
     for number in heads:
         first, second, two_suns = (int(v) for v in arrays[f"pair.{number}"])
         for index in (first, second):
-            known.setdefault(index, Seen.of(_part(arrays, f"side.{index}.")))
-        truth = Partners(**_part(arrays, f"pair.{number}."))
+            known.setdefault(index, _side(arrays, f"side.{index}."))
+        truth = _truth(arrays, f"pair.{number}.")
         found.append(Pair(known[first], known[second], truth, bool(two_suns)))
     return found
 
 
-def _part(arrays: dict[str, Any], prefix: str) -> dict[str, Any]:
-    if not prefix.startswith("side."):
-        return {name: arrays[prefix + name] for name in ("of0", "of1") if prefix + name in arrays} or _side(
-            arrays, prefix
-        )
-    return _side(arrays, prefix)
+def _side(arrays: dict[str, Any], prefix: str) -> Seen:
+    return Seen(**{name: arrays[prefix + name] for name in Seen.__dataclass_fields__})
 
 
-def _side(arrays: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {name: arrays[prefix + name] for name in Seen.__dataclass_fields__}
+def _truth(arrays: dict[str, Any], prefix: str) -> Partners:
+    return Partners(arrays[prefix + "of0"], arrays[prefix + "of1"])

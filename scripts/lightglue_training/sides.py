@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Features
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.strategies.matchers.lightglue import wrapped_rad
 
 CORRECT_PX, WRONG_PX = 3.0, 5.0  # a partner lies within the one; without any within the other there is none
 NONE, UNKNOWN = -1, -2
@@ -37,19 +37,14 @@ class Seen:
     def arrays(self) -> dict[str, Array]:
         return vars(self)
 
-    @classmethod
-    def of(cls, arrays: Mapping[str, Array]) -> Seen:
-        return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
-
 
 def seen(features: Features, view: int = 0) -> Seen:
     """A view of extracted features; places are source pixels."""
     rows = np.flatnonzero(features.view_idx == view)
-    turned = np.deg2rad(180.0 - np.mod(180.0 - features.view_orientation_deg[rows].astype(np.float64), 360.0))
     return Seen(
         points_px=(features.view_keypoints_px[rows] + np.float32(COLMAP_OFFSET_PX)).astype(np.float32),
         sizes_px=features.view_size_px[rows].astype(np.float32),
-        angles_rad=turned.astype(np.float32),
+        angles_rad=wrapped_rad(features.view_orientation_deg[rows]),
         descriptors=features.descriptors[rows],
         size_px=features.view_sizes_px[view].astype(np.float32),
         places_px=features.keypoints_px[features.descriptor_keypoint_idx[rows]].astype(np.float32),
@@ -63,6 +58,23 @@ class Partners:
     of0: Array
     of1: Array
 
+    @property
+    def count(self) -> int:
+        """How many keypoints have a partner."""
+        return int((self.of0 >= 0).sum())
+
+    def take(self, rows0: Array, rows1: Array) -> Partners:
+        """Of the given rows of either side, by their new numbers; whose partner is not among them has none."""
+        return Partners(_renumbered(self.of0[rows0], rows1), _renumbered(self.of1[rows1], rows0))
+
+
+def _renumbered(partners: Array, rows: Array) -> Array:
+    numbers = np.full(max(int(rows.max(initial=-1)), int(partners.max(initial=-1))) + 1, NONE, np.int64)
+    numbers[rows] = np.arange(len(rows))
+    out = partners.astype(np.int64)
+    out[out >= 0] = numbers[out[out >= 0]]
+    return out
+
 
 def partners(places0_px: Array, places1_px: Array, there0_px: Array, there1_px: Array) -> Partners:
     """From keypoints (M, 2), (N, 2) and where they truly are in the other picture (not finite: nowhere).
@@ -72,15 +84,12 @@ def partners(places0_px: Array, places1_px: Array, there0_px: Array, there1_px: 
     """
     forward, backward = _nearest(there0_px, places1_px), _nearest(there1_px, places0_px)
     of0, of1 = (np.where(near[0] > WRONG_PX, NONE, UNKNOWN) for near in (forward, backward))
-    # Of several descriptors of one place any may be the partner: distances decide by 1e-3 px, ties by order.
     candidates = np.flatnonzero(forward[0] <= CORRECT_PX)
     mates = forward[1][candidates]
     back = np.linalg.norm(np.nan_to_num(there1_px[mates], nan=1e9) - places0_px[candidates], axis=1)
     good = (back <= CORRECT_PX) & (backward[1][mates] == candidates)
     of0[candidates[good]], of1[mates[good]] = mates[good], candidates[good]
-    # What another keypoint of the same place has taken, or who is near in one direction only, is unknown.
-    for own, near in ((of0, forward), (of1, backward)):
-        own[(own == NONE) & (near[0] <= WRONG_PX)] = UNKNOWN
+    # Who is near in the other direction only is unknown.
     reached1 = np.unique(forward[1][forward[0] <= WRONG_PX])
     reached0 = np.unique(backward[1][backward[0] <= WRONG_PX])
     of1[reached1] = np.where(of1[reached1] == NONE, UNKNOWN, of1[reached1])

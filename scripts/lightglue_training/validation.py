@@ -6,13 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from aeromatch_cli.nets.lightglue import LightGlue, Side
+from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.scan import mutual_nearest
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair
-from lightglue_training.sides import UNKNOWN, Array, Seen
+from lightglue_training.sides import UNKNOWN, Array
 
 RATIO, LEAST_SCORE = 0.8, 0.01
 
@@ -72,13 +71,9 @@ def by_ratio(pair: Pair) -> tuple[Array, Array]:
 def by_network(network: LightGlue, pair: Pair) -> tuple[Array, Array]:
     """Matches (M, 2) and scores, all layers, nothing pruned."""
     device = next(network.parameters()).device
-    sides = [_on(as_side([side]), device) for side in (pair.side0, pair.side1)]
+    sides = [as_side([side]).to(device) for side in (pair.side0, pair.side1)]
     indices, scores = network.match(*sides, threshold=LEAST_SCORE, depth_confidence=-1.0, width_confidence=-1.0)
     return indices.cpu().numpy(), scores.cpu().numpy()
-
-
-def _on(side: Side, device: torch.device) -> Side:
-    return Side(side.places.to(device), side.descriptors.to(device))
 
 
 def thinned(pairs: Sequence[Pair], keypoints: int, limit: int) -> list[Pair]:
@@ -88,17 +83,9 @@ def thinned(pairs: Sequence[Pair], keypoints: int, limit: int) -> list[Pair]:
 
 
 def _cut(pair: Pair, keypoints: int) -> Pair:
-    from lightglue_training.batches import _ANY, _renamed
-    from lightglue_training.sides import Partners
-
     rng = np.random.default_rng(0)
-    rows = [np.sort(rng.permutation(len(s.points_px))[:keypoints]) for s in (pair.side0, pair.side1)]
-    lookups = [np.full(len(s.points_px), _ANY) for s in (pair.side0, pair.side1)]
-    for lookup, kept in zip(lookups, rows, strict=True):
-        lookup[kept] = np.arange(len(kept))
-    truth = Partners(_renamed(pair.truth.of0[rows[0]], lookups[1]), _renamed(pair.truth.of1[rows[1]], lookups[0]))
-    sides: list[Seen] = [side.take(kept) for side, kept in zip((pair.side0, pair.side1), rows, strict=True)]
-    return Pair(sides[0], sides[1], truth, pair.two_suns)
+    rows0, rows1 = (np.sort(rng.permutation(len(s.points_px))[:keypoints]) for s in (pair.side0, pair.side1))
+    return Pair(pair.side0.take(rows0), pair.side1.take(rows1), pair.truth.take(rows0, rows1), pair.two_suns)
 
 
 def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[str, float]]:

@@ -105,9 +105,8 @@ class LightGlue(Search):
                 pairs, scores = matcher.match(side0, side1)
                 parts.append((side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores.astype(np.float64)))
         found = joined(parts)
-        if where is not None and where.windows is not None:
-            idx0, idx1 = found.keypoints(features0, features1)
-            found = found.take(where.windows.take(idx0).contain(where.places_px[idx1]))
+        if where is not None:
+            found = where.within(found, features0, features1)
         return found.take(one_to_one(*found.keypoints(features0, features1), found.costs))
 
     def _in_overlap(
@@ -142,7 +141,7 @@ class LightGlue(Search):
             rows=rows,
             points_px=points,
             scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
-            orientations_rad=_wrapped_rad(features.view_orientation_deg[rows]),
+            orientations_rad=wrapped_rad(features.view_orientation_deg[rows]),
             descriptors=_as_float(features.descriptors[rows]),
             size_px=size_px,
         )
@@ -233,7 +232,7 @@ def _meets(windows: Windows, points_px: FloatArray) -> BoolArray:
     return np.asarray(inside.all(axis=1))
 
 
-def _wrapped_rad(angles_deg: FloatArray) -> FloatArray:
+def wrapped_rad(angles_deg: FloatArray) -> FloatArray:
     """Radians in (-pi, pi]."""
     degrees = np.asarray(angles_deg, dtype=np.float64)
     return np.deg2rad(180.0 - np.mod(180.0 - degrees, 360.0)).astype(np.float32)

@@ -27,9 +27,7 @@ class Nearest(Search):
         self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
     ) -> Found:
         """Matches of all view pairs that are alike, costs d1/d2."""
-        limits = None
-        if where is not None and where.windows is not None:
-            limits = Limits(where.windows.forms(), where.places_px)
+        limits = None if where is None else Limits(where.windows.forms(), where.places_px)
         parts = []
         for view0, view1 in np.argwhere(alike):
             of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)

@@ -24,13 +24,18 @@ _SAME_MATCH_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Where:
-    """Windows in image 1 for the keypoints of image 0, None where unknown, and image 1's keypoints as they see them.
+    """Windows in image 1 for the keypoints of image 0, and image 1's keypoints as they see them.
 
     places_px: (K1, 2) undistorted.
     """
 
-    windows: Windows | None
+    windows: Windows
     places_px: FloatArray
+
+    def within(self, found: Found, features0: Features, features1: Features) -> Found:
+        """Those of the matches that lie in their windows."""
+        idx0, idx1 = found.keypoints(features0, features1)
+        return found.take(self.windows.take(idx0).contain(self.places_px[idx1]))
 
 
 class Search(Strategy):
@@ -75,11 +80,10 @@ class Search(Strategy):
         alike = like_views(features0, features1, self.max_direction_deg)
         pictures = [alike & which for which in appearances(features0, features1)]
         windows = self.windows(features0, geometry) if self.guided else None
-        where = Where(windows, undistort(geometry.camera1, features1.keypoints_px))
+        where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
         found = self.quick_scan(features0, features1, pictures[0], geometry)
-        if windows is not None:
-            idx0, idx1 = found.keypoints(features0, features1)
-            found = found.take(windows.take(idx0).contain(where.places_px[idx1]))
+        if where is not None:
+            found = where.within(found, features0, features1)
         if len(found.rows) < self.ample:
             found = self._search_harder(found, features0, features1, geometry, pictures, where)
         return _matches(found, features0, features1)
@@ -104,20 +108,21 @@ class Search(Strategy):
         features1: Features,
         geometry: PairGeometry,
         pictures: list[BoolArray],
-        where: Where,
+        where: Where | None,
     ) -> Found:
         """Matches where those of the pictures as taken, `first`, are few. pictures: view pairs of each kind."""
-        limits = where if where.windows is not None else None
-        again = limits is not None or self.quick_differs
+        again = where is not None or self.quick_differs
         scans = [
-            self.scan(features0, features1, views, geometry, limits) if index or again else first
+            self.scan(features0, features1, views, geometry, where) if index or again else first
             for index, views in enumerate(pictures)
         ]
         # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
         chosen = max(range(len(scans)), key=lambda index: len(scans[index].rows))
         if not self.guided:
             return scans[chosen]
-        return search_again(scans[chosen], features0, features1, geometry, pictures[chosen], where.windows)
+        return search_again(
+            scans[chosen], features0, features1, geometry, pictures[chosen], where.windows if where else None
+        )
 
     def windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
         """Where every keypoint of image 0 may lie in image 1, None where that is unknown."""
