@@ -170,7 +170,7 @@ def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, floa
     with torch.no_grad():
         for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
             old.lerp_(new, 1.0 - keep)
-    return float(loss.total), loss.partner, loss.none
+    return float(loss.total.detach()), loss.partner, loss.none
 
 
 def validation_sets(data: Path) -> dict[str, list[Pair]]:

@@ -18,6 +18,8 @@ from torch.nn import functional
 
 # Rows of the assignment that are scored at once: the matrix of 2048 points twice is 32 MB otherwise.
 _ROWS = 512
+# Rows of an attention matrix that are worked on at once: what belongs to them fits a processor's cache.
+_QUERIES = 256
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,20 @@ def _turned(x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
     return x * code[0] + crossed * code[1]
 
 
+def attended(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """Softmax of query . key / sqrt(head_dim), over the keys, of the values: (B, H, M, head_dim).
+
+    In bfloat16 a CPU is twice as fast this way as in torch's fused kernel, which does not use its matrix instructions.
+    """
+    if value.dtype is not torch.bfloat16 or value.device.type != "cpu":
+        return functional.scaled_dot_product_attention(query, key, value)
+    columns = key.to(value.dtype).transpose(-1, -2)
+    scaled = (query * query.shape[-1] ** -0.5).to(value.dtype)
+    with torch.autocast("cpu", enabled=False):
+        parts = [torch.softmax(rows @ columns, dim=-1) @ value for rows in scaled.split(_QUERIES, dim=2)]
+    return torch.cat(parts, dim=2) if len(parts) > 1 else parts[0]
+
+
 def _mixer(dim: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(2 * dim, 2 * dim), nn.LayerNorm(2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
 
@@ -97,7 +113,7 @@ class SelfBlock(nn.Module):
         """x (B, N, dim) -> the same."""
         query, key, value = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(1, 2).unbind(-1)
         query, key = _turned(query, code), _turned(key, code)
-        message = functional.scaled_dot_product_attention(query, key, value.contiguous())
+        message = attended(query, key, value.contiguous())
         message = self.out_proj(message.transpose(1, 2).flatten(-2))
         return x + self.ffn(torch.cat([x, message], dim=-1))
 
@@ -122,7 +138,7 @@ class CrossBlock(nn.Module):
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2).contiguous()
 
     def _mixed(self, x: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        message = functional.scaled_dot_product_attention(query, key, value)
+        message = attended(query, key, value)
         message = self.to_out(message.transpose(1, 2).flatten(-2))
         return x + self.ffn(torch.cat([x, message], dim=-1))
 
