@@ -6,7 +6,8 @@ scenes, suns and flights of training_blocks with other numbers. Reliability: sha
 
 Seconds a pair with 2048 keypoints on either side, features excluded, one process with --threads, median of 20 after a
 warm-up: this forward in both precisions, kornia's with the same weights and kornia's of the official size (9 layers of
-256, random weights), then what early exit and pruning add. Writes OUT/lightglue.md and
+256, random weights), then what early exit and pruning add; two processes beside two threads; and the whole matcher over
+the pairs of a rendered block, with what saves time switched on step by step. Writes OUT/lightglue.md and
 OUT/lightglue.json; OUT/data keeps the pairs.
 """
 
@@ -15,8 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,23 +24,22 @@ from typing import Any
 import numpy as np
 import torch
 from common import write_readme
-from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair, block_pairs
+from lightglue_training.costs import block_table, forward_table, jobs_table
 from lightglue_training.data import pictures as pictures_of
 from lightglue_training.data import read_block, read_groups, write_block, write_groups
-from lightglue_training.validation import Found, by_network, by_ratio, judged
+from lightglue_training.validation import Found, compared
 from training_blocks import render
 
-from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import load_lightglue
 from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
+from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import write_text
 
-OFFICIAL = Dimensions(input_dim=128, descriptor_dim=256, n_layers=9, num_heads=4, add_scale_ori=True)
-TIMED_KEYPOINTS, REPEATS = 2048, 20
+TIMED_KEYPOINTS = 2048
 FIRST_BLOCK = 1000  # numbers of the blocks, far from those trained on
 EDGES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-EVERYTHING = {"depth_confidence": -1.0, "width_confidence": -1.0}
 
 
 def pairs_of(args: argparse.Namespace) -> dict[str, list[Pair]]:
@@ -71,8 +70,7 @@ def accuracy_rows(network: LightGlue, sets: dict[str, list[Pair]]) -> tuple[list
     """Figures of each set, and the network's matches of all of them."""
     rows, everything = [], []
     for name, pairs in sets.items():
-        ratio = judged((pair, *by_ratio(pair)) for pair in pairs)
-        own = judged((pair, *by_network(network, pair)) for pair in pairs)
+        ratio, own = compared(network, pairs)
         everything.append(own)
         recall, wrong = own.recall_at(ratio.precision), own.wrong_at(ratio.recall)
         rows.append({
@@ -113,70 +111,6 @@ def reliability_table(found: Found) -> str:
     return "\n".join(lines)
 
 
-def median_seconds(work: Callable[[], object], device: str) -> float:
-    """Of REPEATS calls after one that does not count."""
-    taken = []
-    for _ in range(1 + REPEATS):
-        started = time.perf_counter()
-        work()
-        if device == "cuda":
-            torch.cuda.synchronize()
-        taken.append(time.perf_counter() - started)
-    return float(np.median(taken[1:]))
-
-
-def _kornia(dimensions: Dimensions, device: str, weights: LightGlue | None) -> Callable[[Pair], Any]:
-    from kornia.feature import LightGlue as Kornia
-
-    torch.manual_seed(0)
-    conf = dict(vars(dimensions)) | {"flash": False} | EVERYTHING
-    theirs = Kornia(features=None, **conf).eval().to(device)
-    if weights is not None:
-        theirs.load_state_dict(weights.state_dict(), strict=False)
-
-    def image(side: Any) -> dict[str, torch.Tensor]:
-        arrays = {"keypoints": side.points_px, "scales": side.sizes_px / 2, "oris": side.angles_rad}
-        arrays |= {"image_size": side.size_px, "descriptors": side.descriptors / 512.0}
-        return {k: torch.from_numpy(np.asarray(v, np.float32))[None].to(device) for k, v in arrays.items()}
-
-    def match(pair: Pair) -> Any:
-        with torch.inference_mode():
-            return theirs({"image0": image(pair.side0), "image1": image(pair.side1)})
-
-    return match
-
-
-def _own(network: LightGlue, device: str, **options: float) -> Callable[[Pair], Any]:
-    def match(pair: Pair) -> Any:
-        sides = [as_side([side]).to(device) for side in (pair.side0, pair.side1)]
-        return network.match(*sides, threshold=0.1, **(EVERYTHING | options))
-
-    return match
-
-
-def speed_table(network: LightGlue, pair: Pair, device: str) -> str:
-    """Every way on the same pair; both sides have 2048 keypoints."""
-    half = LightGlue(network.dimensions).to(device).eval()
-    half.load_state_dict(network.state_dict())
-    half = half.to(dtype=torch.bfloat16)
-    ways = {
-        "kornia, official size, float32": _kornia(OFFICIAL, device, None),
-        "kornia, these weights, float32": _kornia(network.dimensions, device, network),
-        "own forward, float32": _own(network, device),
-        "own forward, bfloat16": _own(half, device),
-        "+ early exit": _own(half, device, depth_confidence=0.95),
-        "+ early exit and pruning": _own(half, device, depth_confidence=0.95, width_confidence=0.99),
-    }
-    lines = ["| forward | seconds a pair | x official (goal 0.25) |", "|---|---|---|"]
-    base = 0.0
-    for name, way in ways.items():
-        seconds = median_seconds(partial(way, pair), device)
-        base = base or seconds
-        lines.append(f"| {name} | {seconds:.3f} | {seconds / base:.2f} |")
-        print(lines[-1], flush=True)
-    return "\n".join(lines)
-
-
 def full_pair(sets: dict[str, list[Pair]]) -> Pair:
     """The first rendered pair of which either side has as many keypoints as are timed."""
     for pair in (*sets["rendered, one sun"], *sets["rendered, two suns"]):
@@ -184,6 +118,13 @@ def full_pair(sets: dict[str, list[Pair]]) -> Pair:
             rows = np.arange(TIMED_KEYPOINTS)
             return Pair(pair.side0.take(rows), pair.side1.take(rows), pair.truth, pair.two_suns)
     raise SystemExit(f"no rendered pair has {TIMED_KEYPOINTS} keypoints on either side: give more --blocks")
+
+
+def rendered_block(args: argparse.Namespace) -> Path:
+    folder: Path = args.out / "blocks" / f"city-mixed-seed{args.seed}"
+    if not (folder / "truth.json").is_file():
+        render_block(folder, "city", seed=args.seed, width_px=1000, height_px=750, images=12, flight="mixed")
+    return folder
 
 
 def main() -> None:
@@ -213,7 +154,11 @@ def main() -> None:
     if "speed" in args.parts:
         where = f"{args.threads} threads" if device == "cpu" else torch.cuda.get_device_name()
         text += [f"Seconds a pair with {TIMED_KEYPOINTS} keypoints on either side ({where}):"]
-        text += [speed_table(network, full_pair(sets), device)]
+        text += [forward_table(network, full_pair(sets), device)]
+        text += [f"Pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
+        text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
+        if device == "cpu":
+            text += [jobs_table(args.weights, full_pair(sets))]
     write_text(args.out / "lightglue.json", json.dumps(facts, indent=1) + "\n")
     whole = "\n\n".join(text) + "\n"
     write_text(args.out / "lightglue.md", whole)

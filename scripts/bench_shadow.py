@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_readme
+from common import peak_mb, write_readme
 from numpy.typing import NDArray
 
 from aeromatch_cli.errors import AeromatchError
@@ -106,12 +106,6 @@ def label_rows(images: Path) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def peak_mb() -> float:
-    """Largest resident memory of this process; getrusage would count its parent's before the exec, too."""
-    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    return int(status.partition("VmHWM:")[2].split()[0]) / 1024.0
 
 
 def cost(name: str, picture: Path) -> dict[str, Any]:

@@ -14,3 +14,9 @@ def write_readme(text: str, name: str) -> None:
     if not (found and closed):
         raise SystemExit(f"{path} lacks the markers {start} and {end}: add them where the table belongs")
     path.write_text(f"{before}{start}\n{text}{end}{after}", encoding="utf-8")
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process; getrusage would count its parent's before the exec, too."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024.0

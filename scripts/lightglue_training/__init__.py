@@ -6,4 +6,5 @@ blocks        stage 2: rendered blocks with parallax, occlusion and two suns
 batches       pairs cut to equal numbers of keypoints
 loss          of assignment and confidence
 validation    recall at a precision, reliability, beside the ratio test
+costs         seconds and memory, for scripts/bench_lightglue
 """

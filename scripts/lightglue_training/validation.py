@@ -88,12 +88,17 @@ def _cut(pair: Pair, keypoints: int) -> Pair:
     return Pair(pair.side0.take(rows0), pair.side1.take(rows1), pair.truth.take(rows0, rows1), pair.two_suns)
 
 
+def compared(network: LightGlue, pairs: Sequence[Pair]) -> tuple[Found, Found]:
+    """What the ratio test and the network find in the same pairs."""
+    ratio = judged((pair, *by_ratio(pair)) for pair in pairs)
+    return ratio, judged((pair, *by_network(network, pair)) for pair in pairs)
+
+
 def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[str, float]]:
     """Figures by set: the ratio test's recall and precision, and the network's recall there."""
     rows = {}
     for name, pairs in sets.items():
-        ratio = judged((pair, *by_ratio(pair)) for pair in pairs)
-        own = judged((pair, *by_network(network, pair)) for pair in pairs)
+        ratio, own = compared(network, pairs)
         rows[name] = {
             "pairs": len(pairs),
             "ratio_precision": ratio.precision,
