@@ -1,0 +1,157 @@
+"""What matching with LightGlue costs: the forward pass in every way, processes beside threads, and a block's pairs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from common import peak_mb
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import Features, PairGeometry
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.formats import read_features
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.lightglue_file import load_lightglue
+from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue as Matcher
+from aeromatch_cli.strategies.matchers.nearest import Nearest
+from lightglue_training.batches import as_side
+from lightglue_training.blocks import Pair
+
+OFFICIAL = Dimensions(input_dim=128, descriptor_dim=256, n_layers=9, num_heads=4, add_scale_ori=True)
+REPEATS = 20
+EVERYTHING = {"depth_confidence": -1.0, "width_confidence": -1.0}
+
+
+def median_seconds(work: Callable[[], object], device: str) -> float:
+    """Of REPEATS calls after one that does not count."""
+    taken = []
+    for _ in range(1 + REPEATS):
+        started = time.perf_counter()
+        work()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        taken.append(time.perf_counter() - started)
+    return float(np.median(taken[1:]))
+
+
+def forward_table(network: LightGlue, pair: Pair, device: str) -> str:
+    """Every way on the same pair, all of whose keypoints enter."""
+    ways = {
+        "kornia, official size, float32": _kornia(OFFICIAL, device, None),
+        "kornia, these weights, float32": _kornia(network.dimensions, device, network),
+        "own forward, float32": _own(network, device),
+        "own forward, bfloat16": _own(in_bfloat16(network), device),
+        "+ early exit": _own(in_bfloat16(network), device, depth_confidence=0.95),
+        "+ early exit and pruning": _own(in_bfloat16(network), device, depth_confidence=0.95, width_confidence=0.99),
+    }
+    lines = ["| forward | seconds a pair | x official (goal 0.25) |", "|---|---|---|"]
+    base = 0.0
+    for name, way in ways.items():
+        seconds = median_seconds(partial(way, pair), device)
+        base = base or seconds
+        lines.append(f"| {name} | {seconds:.3f} | {seconds / base:.2f} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def in_bfloat16(network: LightGlue) -> LightGlue:
+    """A copy."""
+    half = LightGlue(network.dimensions).to(next(network.parameters()).device).eval()
+    half.load_state_dict(network.state_dict())
+    return half.to(dtype=torch.bfloat16)
+
+
+def _kornia(dimensions: Dimensions, device: str, weights: LightGlue | None) -> Callable[[Pair], Any]:
+    from kornia.feature import LightGlue as Kornia
+
+    torch.manual_seed(0)
+    conf = dict(vars(dimensions)) | {"flash": False} | EVERYTHING
+    theirs = Kornia(features=None, **conf).eval().to(device)
+    if weights is not None:
+        theirs.load_state_dict(weights.state_dict(), strict=False)
+
+    def image(side: Any) -> dict[str, torch.Tensor]:
+        arrays = {"keypoints": side.points_px, "scales": side.sizes_px / 2, "oris": side.angles_rad}
+        arrays |= {"image_size": side.size_px, "descriptors": side.descriptors / 512.0}
+        return {k: torch.from_numpy(np.asarray(v, np.float32))[None].to(device) for k, v in arrays.items()}
+
+    def match(pair: Pair) -> Any:
+        with torch.inference_mode():
+            return theirs({"image0": image(pair.side0), "image1": image(pair.side1)})
+
+    return match
+
+
+def _own(network: LightGlue, device: str, **options: float) -> Callable[[Pair], Any]:
+    def match(pair: Pair) -> Any:
+        sides = [as_side([side]).to(device) for side in (pair.side0, pair.side1)]
+        return network.match(*sides, threshold=0.1, **(EVERYTHING | options))
+
+    return match
+
+
+def jobs_table(weights: Path, pair: Pair) -> str:
+    """Pairs a second, all keypoints entering, of one process with two threads and of two with one each; memory."""
+    lines = ["| processes x threads | pairs a second | additional memory of each, MB |", "|---|---|---|"]
+    for jobs, threads in ((1, 2), (2, 1)):
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+            results = list(pool.map(partial(_work, weights, pair), [threads] * jobs))
+        rate = sum(1.0 / seconds for seconds, _ in results)
+        lines.append(f"| {jobs} x {threads} | {rate:.2f} | {max(mb for _, mb in results):.0f} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def _work(weights: Path, pair: Pair, threads: int) -> tuple[float, float]:
+    """Seconds a pair and megabytes beyond the loaded network, in a fresh process."""
+    torch.set_num_threads(threads)
+    network = in_bfloat16(load_lightglue(weights))
+    before_mb = peak_mb()
+    seconds = median_seconds(partial(_own(network, "cpu"), pair), "cpu")
+    return seconds, peak_mb() - before_mb
+
+
+def block_table(folder: Path, weights: Path, keypoints: int) -> str:
+    """The matcher over all pairs of a rendered block, with what saves time switched on one after the other."""
+    never = keypoints + 1
+    steps: Mapping[str, dict[str, Any]] = {
+        "every keypoint": {"overlap": False, "ample": never, **EVERYTHING},
+        "+ only the predicted overlap": {"ample": never, **EVERYTHING},
+        "+ early exit": {"ample": never, "width_confidence": -1.0},
+        "+ pruning": {"ample": never},
+        "+ ratio test where ample (default)": {},
+    }
+    matchers = {name: Matcher(weights=str(weights), **settings) for name, settings in steps.items()}
+    block = _block_features(folder, keypoints)
+    lines = ["| matcher | seconds a pair, mean | matches |", "|---|---|---|"]
+    for name, matcher in {**matchers, "nearest": Nearest()}.items():
+        matcher(*block[0])
+        started = time.perf_counter()
+        found = sum(len(matcher(*pair).indices) for pair in block)
+        lines.append(f"| {name} | {(time.perf_counter() - started) / len(block):.3f} | {found} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def _block_features(folder: Path, keypoints: int) -> list[tuple[Features, Features, PairGeometry]]:
+    """Features of preset `baseline` and geometry of the block's pairs, poses noisy."""
+    with tempfile.TemporaryDirectory() as scratch:
+        block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
+        block["cameras"] = str(folder / "block.json")
+        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
+        settings = load("baseline", [f"extract.keypoints={keypoints}"], block, **top)
+        context, _ = pairs.prepare(settings, Executor("serial", 1))
+        extract.run(context)
+        features = {i.image_id: read_features(context.workspace.features(i.image_id)) for i in context.images()}
+        chosen = [pair for row in context.rows().values() for pair in row]
+        return [(features[p.image_id0], features[p.image_id1], context.geometry(p)) for p in chosen]
