@@ -198,6 +198,19 @@ def test_limits_hide_what_lies_outside(seed, count0, count1):
     assert np.allclose(ratios, np.sqrt(squared[rows, columns] / second))
 
 
+def test_places_that_are_unknown_lie_outside_every_limit():
+    d0, d1 = np.eye(2, 128, dtype=np.float32), np.eye(2, 128, dtype=np.float32)
+    anywhere = np.zeros((2, 2, 3))
+    for forms, places in (
+        (anywhere, [[np.nan, 0.0], [0.0, 0.0]]),
+        (np.where([[[True]], [[False]]], np.nan, anywhere), [[0.0, 0.0], [0.0, 0.0]]),
+    ):
+        rows, columns, _ = mutual_nearest(
+            d0, d1, np.arange(2), np.arange(2), ratio=0.9, limits=Limits(forms, np.array(places))
+        )
+        assert list(zip(rows, columns, strict=True)) == [(1, 1)]
+
+
 def test_views_of_like_direction_are_compared():
     down, tilted = [0.0, 0.0, -1.0], [np.sin(0.6), 0.0, -np.cos(0.6)]
     one = features(np.zeros((0, 128), np.uint8))

@@ -1,7 +1,8 @@
 """The score matrix of two sets of descriptors, block by block, exact to the bit on any machine.
 
 RootSIFT descriptors are bytes, so every dot product is an integer that 32 bits hold exactly: an 8-bit integer product
-(where the processor has one) and float32 BLAS (sums below 2^24) give the same numbers whatever the library does.
+(where the processor has one) and float32 BLAS (sums below 2^24) give the same numbers whatever the library does. Only a
+place within rounding of a window's border may count as inside on one machine and as outside on another.
 Source: Lowe, IJCV 2004, section 7.1 (ratio); Arandjelovic and Zisserman, CVPR 2012 (RootSIFT).
 """
 
@@ -110,7 +111,7 @@ def _scan(
 
 
 def _outside(limits: Limits) -> Callable[[int, int], BoolArray]:
-    """Which targets (rows, T) the queries of a block must not take."""
+    """Which targets (rows, T) the queries of a block must not take; a target or form that is not finite fits nowhere."""
     places = np.concatenate([limits.places.T, np.ones((1, len(limits.places)))]).astype(np.float32)
     forms = [np.ascontiguousarray(limits.forms[:, k], np.float32) for k in range(2)]
     shape = (min(_BLOCK_ROWS, len(limits.forms)), len(limits.places))
@@ -121,8 +122,9 @@ def _outside(limits: Limits) -> Callable[[int, int], BoolArray]:
         for form, answer in zip(forms, (mask, second), strict=True):
             np.matmul(form[start:stop], places, out=values)
             np.abs(values, out=values)
-            np.greater(values, 1.0, out=answer)
-        return np.logical_or(mask, second, out=mask)
+            np.less_equal(values, 1.0, out=answer)
+        np.logical_and(mask, second, out=mask)
+        return np.logical_not(mask, out=mask)
 
     return outside
 
