@@ -69,7 +69,7 @@ def mutual_nearest(
 def _ratios(best: NDArray[Any], second: NDArray[Any]) -> FloatArray:
     """d1/d2 (float64) of negated squared distances; 0 where there is no second, 1 where both are 0."""
     near, far = np.maximum(-best.astype(np.float64), 0.0), np.maximum(-second.astype(np.float64), 0.0)
-    ratio = np.sqrt(np.divide(near, far, out=np.ones_like(near), where=far > 0))
+    ratio = np.sqrt(np.divide(near, far, out=np.ones_like(near), where=(far > 0) & np.isfinite(near)))
     ratio[second == _lowest(second.dtype)] = 0.0
     return ratio
 
@@ -111,7 +111,7 @@ def _scan(
 
 
 def _outside(limits: Limits) -> Callable[[int, int], BoolArray]:
-    """Which targets (rows, T) the queries of a block must not take; a target or form that is not finite fits nowhere."""
+    """Which targets (rows, T) the queries of a block must not take; what is not finite fits nowhere."""
     places = np.concatenate([limits.places.T, np.ones((1, len(limits.places)))]).astype(np.float32)
     forms = [np.ascontiguousarray(limits.forms[:, k], np.float32) for k in range(2)]
     shape = (min(_BLOCK_ROWS, len(limits.forms)), len(limits.places))
