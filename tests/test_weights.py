@@ -12,15 +12,18 @@ from safetensors.torch import save_file
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.weights import (
+    SHIPPED_FOLDER,
     WeightsCheck,
     add_weights,
     list_weights,
     read_tensors,
     resolve_weights,
     sha256_of_file,
+    shipped_weights,
     verify_weights,
     weights_folder,
 )
+from aeromatch_cli.stages.weights import manage_weights
 
 DIMENSIONS = Dimensions(input_dim=8, descriptor_dim=16, n_layers=2, num_heads=2, add_scale_ori=True)
 
@@ -65,6 +68,17 @@ def test_added_weights_are_listed_found_and_verified(lightglue_file: Path) -> No
     assert resolve_weights("small") == resolve_weights("small.safetensors") == stored
     assert sorted(path.name for path in weights_folder().iterdir()) == ["index.json", "small.safetensors"]
     assert verify_weights() == (WeightsCheck("small.safetensors", "ok"),)
+
+
+def test_every_shipped_file_has_a_card_and_is_listed() -> None:
+    for entry in shipped_weights():
+        path = SHIPPED_FOLDER / entry.name
+        assert entry.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert path.with_suffix(".md").read_text(encoding="utf-8").startswith(f"# {entry.name}\n")
+        assert entry.size_bytes <= 10_000_000
+    assert "shadow" in {entry.architecture for entry in shipped_weights()}
+    listed = manage_weights("list", None).lines
+    assert all(entry.name in line for entry, line in zip(shipped_weights(), listed, strict=False))
 
 
 def test_verify_sees_changed_missing_and_foreign_files(lightglue_file: Path, tmp_path: Path) -> None:

@@ -21,8 +21,9 @@ from aeromatch_cli.errors import ConfigError, WorkspaceError
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Where scripts/train_lightglue.py's result belongs.
-SHIPPED_LIGHTGLUE = Path(__file__).parent / "trained" / "lightglue.safetensors"
+# Weights that come with the package, each beside its model card.
+SHIPPED_FOLDER = Path(__file__).parent / "trained"
+SHIPPED_LIGHTGLUE = SHIPPED_FOLDER / "lightglue.safetensors"
 SUFFIXES = (".safetensors", ".pth", ".pt")
 
 _INDEX_NAME = "index.json"
@@ -30,7 +31,10 @@ _INDEX_NAME = "index.json"
 
 @dataclass(frozen=True)
 class WeightsEntry:
-    """A file of the weights folder as it was when it was added. architecture: "lightglue"."""
+    """A file of the weights folder as it was when it was added, or one that ships.
+
+    architecture: "lightglue" or "shadow".
+    """
 
     name: str
     sha256: str
@@ -89,6 +93,12 @@ def list_weights() -> tuple[WeightsEntry, ...]:
         return tuple(WeightsEntry(name=name, **record) for name, record in sorted(records.items()))
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"{index} cannot be read ({error}); delete it and add the weights again") from error
+
+
+def shipped_weights() -> tuple[WeightsEntry, ...]:
+    """Every file that ships with the package, by name; its architecture is its name's."""
+    paths = sorted(SHIPPED_FOLDER.glob("*.safetensors"))
+    return tuple(WeightsEntry(path.name, sha256_of_file(path), path.stat().st_size, path.stem) for path in paths)
 
 
 def verify_weights() -> tuple[WeightsCheck, ...]:
