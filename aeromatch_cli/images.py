@@ -1,6 +1,6 @@
 """Rasters in and out: stored frame whatever the EXIF Orientation, RGB order, 8 and 16 bit, masks, views.
 
-The only file that knows OpenCV's BGR and rasterio's band order.
+The only file that knows OpenCV's BGR.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli import tiff
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose, View
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import distort, resized, world_rays
@@ -40,8 +41,8 @@ def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
     """
     import cv2
 
-    if path.suffix.lower() in (".tif", ".tiff"):
-        pixels = _read_tiff(path)
+    if path.suffix.lower() in tiff.SUFFIXES:
+        pixels = tiff.read_tiff(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
         straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
@@ -86,23 +87,6 @@ def _jpeg_fault(data: bytes) -> str:
         # A segment's length counts its own two bytes.
         place += int.from_bytes(data[place : place + 2], "big")
     return "cut off: its JPEG data ends early; copy it again or remove it"
-
-
-def _read_tiff(path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) in the stored dtype; the first three bands of four or more."""
-    import warnings
-
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                bands = source.read(list(range(1, 4)) if source.count >= 3 else [1])
-    except (RasterioError, OSError) as error:
-        raise ItemError(f"cannot decode image {path}: {error}") from None
-    return np.ascontiguousarray(np.moveaxis(bands, 0, 2)) if len(bands) == 3 else np.asarray(bands[0])
 
 
 def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
