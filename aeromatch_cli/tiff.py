@@ -23,9 +23,14 @@ def tiff_size(path: Path) -> tuple[int, int]:
 
 
 def read_tiff(path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) in the stored dtype; the first three bands of four or more. Raises ItemError."""
+    """(H, W) or (H, W, 3) of whole or floating numbers as stored; the first three bands of four or more.
+
+    Raises ItemError.
+    """
     with _opened(path) as source:
         bands = source.read(list(range(1, 4)) if source.count >= 3 else [1])
+    if bands.dtype.kind not in "iuf":
+        raise ItemError(f"image {path} holds {bands.dtype} numbers: write their magnitudes, as uint16 or float32")
     return np.ascontiguousarray(np.moveaxis(bands, 0, 2)) if len(bands) == 3 else np.asarray(bands[0])
 
 

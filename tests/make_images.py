@@ -86,7 +86,9 @@ def write_bands(
     count, height, width = bands.shape
     directory = ImageFileDirectory_v2(b"II+\0\x08\0\0\0\x10\0\0\0\0\0\0\0" if big else b"II*\0\x08\0\0\0")
     directory.update({256: width, 257: height, 258: (8 * bands.itemsize,) * count, 259: 1, 262: 1, 277: count})
-    directory.update({278: height, 279: bands.nbytes, 339: ({"u": 1, "i": 2, "f": 3}[bands.dtype.kind],) * count})
+    directory.update(
+        {278: height, 279: bands.nbytes, 339: ({"u": 1, "i": 2, "f": 3, "c": 6}[bands.dtype.kind],) * count}
+    )
     directory.update({273: 0} | (main or {}))  # where the pixels begin, behind the tables
     directory.tagtype[273] = directory.tagtype[279] = 16 if big else 4
     directory.update({pointer: table for pointer, table in ((_EXIF_IFD, exif), (_GPS_IFD, gps)) if table})
