@@ -42,19 +42,36 @@ def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
 
     Other depths come as `in_16_bits` makes them. Raises ItemError when the file cannot be decoded.
     """
+    return read_raster(path, colour=colour)[0]
+
+
+def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
+    """The same, and where it is valid (H, W) by what the file says (None = everywhere); what is not is 0.
+
+    Invalid are transparent pixels, those of the nodata value in all bands, and NaN. A file that calls every pixel
+    invalid is not believed: some writers leave alpha empty.
+    """
     import cv2
 
+    valid = None
     if path.suffix.lower() in tiff.SUFFIXES:
-        pixels = tiff.read_tiff(path)
+        pixels, valid = tiff.read_tiff(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
         straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
         flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
         pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
-        if pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-    pixels = in_16_bits(pixels)
-    return pixels if colour else to_gray8(pixels)
+        if pixels.ndim == 3 and pixels.shape[2] == 4:
+            valid = pixels[..., 3] > 0
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
+        elif pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+    if valid is not None and bool(valid.all()) == bool(valid.any()):
+        valid = None
+    pixels = in_16_bits(pixels, valid)
+    if valid is not None:
+        pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
+    return pixels if colour else to_gray8(pixels), valid
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
@@ -93,24 +110,31 @@ def _jpeg_fault(data: bytes) -> str:
     return "cut off: its JPEG data ends early; copy it again or remove it"
 
 
-def in_16_bits(pixels: NDArray[Any]) -> NDArray[Any]:
+def in_16_bits(pixels: NDArray[Any], valid: BoolArray | None = None) -> NDArray[Any]:
     """A picture of whole or floating numbers as uint16; uint8 and uint16 as they are. NaN and infinity become 0.
 
     Whole numbers that all lie within 0-65535 keep their values. Others are scaled, all bands alike so that hue stays:
     the 99.9th percentile becomes 65535, and 0 stays 0, so that values stay proportional to light; where the 0.1th
-    percentile is negative (temperatures, say), that becomes 0. Zeros do not count, for they may be a frame.
+    percentile is negative (temperatures, say), that becomes 0. Only what is valid (H, W; None = all) counts, and no
+    zeros, for they may be a frame.
     """
     if pixels.dtype in (np.uint8, np.uint16):
         return pixels
-    if pixels.dtype.kind in "iu" and pixels.min() >= 0 and pixels.max() <= _TOP_16_BIT:
-        return pixels.astype(np.uint16)
-    known = pixels.astype(np.result_type(pixels.dtype, np.float32))
-    known[~np.isfinite(known)] = 0.0
-    seen = known[known != 0]
-    low, high = (float(v) for v in np.percentile(seen, _RANGE_PERCENTILES)) if seen.size else (0.0, 0.0)
+    there = np.isfinite(pixels)
+    if valid is not None:
+        there &= valid if pixels.ndim == 2 else valid[..., None]
+    seen = pixels[there & (pixels != 0)]
+    if not seen.size:
+        return np.zeros(pixels.shape, np.uint16)
+    known = np.where(there, pixels, 0)
+    if pixels.dtype.kind in "iu" and seen.min() >= 0 and seen.max() <= _TOP_16_BIT:
+        return known.astype(np.uint16)
+    exact = np.result_type(pixels.dtype, np.float32)
+    low, high = (float(value) for value in np.percentile(seen.astype(exact), _RANGE_PERCENTILES))
     low = min(low, 0.0)
-    scaled = (known - low) * (_TOP_16_BIT / ((high - low) or 1.0))
-    return np.clip(np.rint(scaled), 0, _TOP_16_BIT).astype(np.uint16)
+    with np.errstate(over="ignore"):  # an outlier may be beyond float32 once it is scaled
+        scaled = np.rint((known.astype(exact) - low) * (_TOP_16_BIT / ((high - low) or 1.0)))
+    return np.where(there, np.clip(scaled, 0, _TOP_16_BIT), 0).astype(np.uint16)
 
 
 def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
