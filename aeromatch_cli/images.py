@@ -1,6 +1,6 @@
 """Rasters in and out: stored frame whatever the EXIF Orientation, RGB order, 8 and 16 bit, masks, views.
 
-The only file that knows OpenCV's BGR and rasterio's band order.
+The only file that knows OpenCV's BGR.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli import tiff
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose, View
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import distort, resized, world_rays
@@ -19,8 +20,11 @@ from aeromatch_cli.geometry.footprints import sees_horizon
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.warps import area_scale
 
-# 16-bit and float pictures are stretched between these percentiles: a cast would leave a 12-bit sensor black.
+# 16-bit pictures are stretched between these percentiles: a cast would leave a 12-bit sensor black.
 _STRETCH_PERCENTILES = (0.5, 99.5)
+# The range of float pictures, and of whole numbers that are no uint16: a few outliers are not to make the rest flat.
+_RANGE_PERCENTILES = (0.1, 99.9)
+_TOP_16_BIT = 65535
 _GRID_STEP_PX = 8
 _COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 _GRID_ERROR_PX = 0.015
@@ -34,22 +38,40 @@ _END_OF_IMAGE = 0xD9
 
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
-    """The stored raster: (H, W) uint8 gray, or with `colour` its own dtype and (H, W, 3) RGB where it has colour.
+    """The stored raster: (H, W) uint8 gray, or with `colour` uint8 or uint16 and (H, W, 3) RGB where it has colour.
 
-    Raises ItemError when the file cannot be decoded.
+    Other depths come as `in_16_bits` makes them. Raises ItemError when the file cannot be decoded.
+    """
+    return read_raster(path, colour=colour)[0]
+
+
+def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
+    """The same, and where it is valid (H, W) by what the file says (None = everywhere); what is not is 0.
+
+    Invalid are transparent pixels, those of the nodata value in all bands, and NaN. A file that calls every pixel
+    invalid is not believed: some writers leave alpha empty.
     """
     import cv2
 
-    if path.suffix.lower() in (".tif", ".tiff"):
-        pixels = _read_tiff(path)
+    valid = None
+    if path.suffix.lower() in tiff.SUFFIXES:
+        pixels, valid = tiff.read_tiff(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
         straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
         flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
         pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
-        if pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB if pixels.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-    return pixels if colour else to_gray8(pixels)
+        if pixels.ndim == 3 and pixels.shape[2] == 4:
+            valid = pixels[..., 3] > 0
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
+        elif pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+    if valid is not None and bool(valid.all()) == bool(valid.any()):
+        valid = None
+    pixels = in_16_bits(pixels, valid)
+    if valid is not None:
+        pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
+    return pixels if colour else to_gray8(pixels), valid
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
@@ -88,37 +110,45 @@ def _jpeg_fault(data: bytes) -> str:
     return "cut off: its JPEG data ends early; copy it again or remove it"
 
 
-def _read_tiff(path: Path) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) in the stored dtype; the first three bands of four or more."""
-    import warnings
+def in_16_bits(pixels: NDArray[Any], valid: BoolArray | None = None) -> NDArray[Any]:
+    """A picture of whole or floating numbers as uint16; uint8 and uint16 as they are. NaN and infinity become 0.
 
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                bands = source.read(list(range(1, 4)) if source.count >= 3 else [1])
-    except (RasterioError, OSError) as error:
-        raise ItemError(f"cannot decode image {path}: {error}") from None
-    return np.ascontiguousarray(np.moveaxis(bands, 0, 2)) if len(bands) == 3 else np.asarray(bands[0])
+    Whole numbers that all lie within 0-65535 keep their values. Others are scaled, all bands alike so that hue stays:
+    the 99.9th percentile becomes 65535, and 0 stays 0, so that values stay proportional to light; where the 0.1th
+    percentile is negative (temperatures, say), that becomes 0. Only what is valid (H, W; None = all) counts, and no
+    zeros, for they may be a frame.
+    """
+    if pixels.dtype in (np.uint8, np.uint16):
+        return pixels
+    there = np.isfinite(pixels)
+    if valid is not None:
+        there &= valid if pixels.ndim == 2 else valid[..., None]
+    seen = pixels[there & (pixels != 0)]
+    if not seen.size:
+        return np.zeros(pixels.shape, np.uint16)
+    known = np.where(there, pixels, 0)
+    if pixels.dtype.kind in "iu" and seen.min() >= 0 and seen.max() <= _TOP_16_BIT:
+        return known.astype(np.uint16)
+    exact = np.result_type(pixels.dtype, np.float32)
+    low, high = (float(value) for value in np.percentile(seen.astype(exact), _RANGE_PERCENTILES))
+    low = min(low, 0.0)
+    with np.errstate(over="ignore"):  # an outlier may be beyond float32 once it is scaled
+        scaled = np.rint((known.astype(exact) - low) * (_TOP_16_BIT / ((high - low) or 1.0)))
+    return np.where(there, np.clip(scaled, 0, _TOP_16_BIT), 0).astype(np.uint16)
 
 
 def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """(H, W) uint8 of any picture; other depths are stretched between percentiles of their own values."""
+    """(H, W) uint8 of a uint8 or uint16 picture; 16 bits are stretched between percentiles of their own values."""
     import cv2
 
-    if pixels.ndim == 3:
-        known = pixels.dtype in (np.uint8, np.uint16)  # those that OpenCV converts; exact in float32 for all others
-        pixels = cv2.cvtColor(pixels if known else pixels.astype(np.float32), cv2.COLOR_RGB2GRAY)
-    return np.asarray(pixels) if pixels.dtype == np.uint8 else _stretched(pixels, pixels)
+    gray = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else pixels
+    return np.asarray(gray) if gray.dtype == np.uint8 else _stretched(gray, gray)
 
 
 def sample_colours(pixels: NDArray[Any], points_px: FloatArray, sizes_px: FloatArray) -> NDArray[np.uint8]:
     """(N, 3) uint8 RGB around points (N, 2) of a picture, averaged over a square of half to all of each size (N,).
 
-    Gray pictures give it thrice; other depths are stretched as in `to_gray8`, all bands alike so that hue stays.
+    Gray pictures give it thrice; 16 bits are stretched as in `to_gray8`, all bands alike so that hue stays.
     """
     import cv2
 
@@ -143,20 +173,22 @@ def _stretched(values: NDArray[Any], pixels: NDArray[Any]) -> NDArray[np.uint8]:
     if pixels.dtype == np.uint8:
         return np.clip(np.rint(values), 0, 255).astype(np.uint8)
     known = pixels.astype(np.float32)
-    seen = known[np.isfinite(known) & (known != 0)]
+    seen = known[known != 0]
     low, high = np.percentile(seen, _STRETCH_PERCENTILES) if seen.size else (0.0, 1.0)
     stretched = (values.astype(np.float32) - low) * (255.0 / max(float(high - low), 1e-6))
-    return np.clip(np.nan_to_num(np.rint(stretched)), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
 
 
 def write_png(stream: Any, pixels: NDArray[Any]) -> None:
-    """PNG of (H, W) or (H, W, 3) RGB, 8 or 16 bit, into a binary stream."""
+    """PNG of (H, W) or (H, W, 3) RGB, uint8 or uint16, into a binary stream. Raises ValueError for other types."""
     import cv2
 
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"a PNG holds uint8 or uint16, not {pixels.dtype}")  # OpenCV would cast without a word
     ordered = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
     ok, data = cv2.imencode(".png", ordered)
     if not ok:
-        raise ValueError(f"cannot encode a picture of shape {pixels.shape} and type {pixels.dtype}")
+        raise ValueError(f"cannot encode a picture of shape {pixels.shape}")
     stream.write(data.tobytes())
 
 

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 
@@ -67,6 +69,34 @@ def write_image(
     else:
         extra = {"xmp": xmp.encode()} if xmp else {}
         Image.new("RGB", size_px, (90, 120, 60)).save(path, format="JPEG", exif=tags, **extra)
+    return path
+
+
+def write_bands(
+    path: Path,
+    bands: NDArray[Any],
+    *,
+    main: dict[int, Any] | None = None,
+    exif: dict[int, Any] | None = None,
+    gps: dict[int, Any] | None = None,
+    xmp: str = "",
+    big: bool = False,
+) -> Path:
+    """A TIFF of bands (B, H, W), min-is-black as GDAL writes them, with tags as in `write_image`; big: BigTIFF."""
+    count, height, width = bands.shape
+    directory = ImageFileDirectory_v2(b"II+\0\x08\0\0\0\x10\0\0\0\0\0\0\0" if big else b"II*\0\x08\0\0\0")
+    directory.update({256: width, 257: height, 258: (8 * bands.itemsize,) * count, 259: 1, 262: 1, 277: count})
+    directory.update(
+        {278: height, 279: bands.nbytes, 339: ({"u": 1, "i": 2, "f": 3, "c": 6}[bands.dtype.kind],) * count}
+    )
+    directory.update({273: 0} | (main or {}))  # where the pixels begin, behind the tables
+    directory.tagtype[273] = directory.tagtype[279] = 16 if big else 4
+    directory.update({pointer: table for pointer, table in ((_EXIF_IFD, exif), (_GPS_IFD, gps)) if table})
+    if xmp:
+        directory.tagtype[700], directory[700] = 1, xmp.encode()
+    with path.open("wb") as stream:
+        directory.save(stream)
+        stream.write(np.ascontiguousarray(np.moveaxis(bands, 0, 2)).tobytes())
     return path
 
 

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_image
+from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_bands, write_image
 from PIL.TiffImagePlugin import IFDRational
 
 from aeromatch_cli.blocks.exif import exif_or_reason, read_exif
@@ -59,6 +60,49 @@ def test_camera_namespace_is_nadir_also_in_16_bit_tiff(tmp_path: Path, name: str
 def test_orientation_never_turns_the_stored_size(tmp_path: Path, name: str) -> None:
     facts = read_exif(write_image(tmp_path / name, (40, 30), main={274: 6}))
     assert (facts.width_px, facts.height_px, facts.orientation) == (40, 30, 6)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "count"), [("uint16", 3), ("uint16", 4), ("uint16", 5), ("uint8", 5), ("float32", 3), ("int16", 3)]
+)
+def test_tiffs_of_several_bands_that_only_rasterio_knows(tmp_path: Path, dtype: str, count: int) -> None:
+    facts = read_exif(write_bands(tmp_path / "a.tif", np.ones((count, 6, 7), dtype)))
+    assert (facts.width_px, facts.height_px, facts.orientation, facts.notes) == (7, 6, 1, ())
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_their_tags_are_read(tmp_path: Path, big: bool) -> None:
+    xmp = PARROT_XMP.format(yaw="-13.305", pitch="5.18259", roll="2.73152")
+    path = write_bands(
+        tmp_path / "a.TIF",
+        np.ones((5, 6, 7), np.uint16),
+        main={271: "MicaSense", 272: "RedEdge", 274: 6, 306: "2016:11:22 16:32:34"},
+        exif={37386: 5.5},
+        gps=gps_tags(41.5, -81.25, 349.0),
+        xmp=xmp,
+        big=big,
+    )
+    facts = read_exif(path)
+    assert (facts.width_px, facts.height_px, facts.orientation) == (7, 6, 6)
+    assert (facts.make, facts.model, facts.focal_mm, facts.time) == ("MicaSense", "RedEdge", 5.5, "2016-11-22T16:32:34")
+    assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (41.5, -81.25, 349.0)
+    assert facts.angles is not None
+    assert (facts.angles.yaw_deg, facts.angles.convention) == (-13.305, "nadir")
+    assert facts.notes == ()
+
+
+def test_lost_tables_of_such_a_tiff_cost_no_more_than_their_tags(tmp_path: Path) -> None:
+    path = write_bands(tmp_path / "a.tif", np.ones((5, 6, 7), np.uint16), main={271: "Make", 0x8825: 10**9})
+    facts = read_exif(path)
+    assert (facts.width_px, facts.make, facts.latitude_deg) == (7, "Make", None)
+
+
+@pytest.mark.parametrize("kept", [0, 8, 60])
+def test_damaged_tiffs_are_refused_as_ever(tmp_path: Path, kept: int) -> None:
+    path = write_bands(tmp_path / "a.tif", np.ones((5, 6, 7), np.uint16))
+    path.write_bytes(path.read_bytes()[:kept] + b"?" * 40)
+    with pytest.raises(ItemError, match=r"a\.tif: not a readable image \(damaged header or another format\)"):
+        read_exif(path)
 
 
 def test_png_without_tags(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from conftest import HEIGHT, IMAGES, WIDTH
+from make_images import write_bands
 
 from aeromatch_cli.workspace import Workspace, read_json
 
@@ -64,6 +65,22 @@ def test_sizes_depths_and_formats_mixed(site):
     assert outcome.code == 0, outcome.stderr
     assert outcome.facts["stages"]["extract"]["items"] == IMAGES
     assert outcome.facts["stages"]["filter"]["facts"]["pairs"].get("verified", 0) >= PAIRS // 2
+
+
+def test_tiffs_of_five_bands_of_floats_and_of_signed_numbers(site):
+    """With an enhancement and colours, so that every stage sees them."""
+    renamed = {}
+    for index, (dtype, scale, count) in enumerate([("uint16", 200, 5), ("float32", 1 / 255, 3), ("int16", 100, 1)]):
+        path = site.image(index)
+        bands = np.moveaxis(cv2.imread(str(path))[..., ::-1], 2, 0).astype(float) * scale
+        bands = np.concatenate([bands, bands[:2]])[:count]
+        renamed[path.name] = write_bands(path.with_suffix(".tif"), bands.astype(dtype)).name
+        path.unlink()
+    site.rewrite_poses(lambda rows: [{**row, "image": renamed.get(row["image"], row["image"])} for row in rows])
+    outcome = site("run", "--set", "enhance=clahe", "--set", "extract.colours=true")
+    assert outcome.code == 0, outcome.stderr
+    assert outcome.facts["stages"]["extract"]["items"] == IMAGES
+    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
 
 
 def test_images_that_do_not_fit_their_camera(site):

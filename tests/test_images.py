@@ -26,7 +26,6 @@ from aeromatch_cli.images import (
     sees_sky,
     shrink,
     shrink_camera,
-    to_gray8,
     view_maps,
     write_png,
 )
@@ -119,24 +118,6 @@ def test_16_bits_are_stretched_not_cast(tmp_path: Path, suffix: str) -> None:
     assert (gray.min(), gray.max()) == (0, 255)
     assert read_pixels(path, colour=True).dtype == np.uint16
     np.testing.assert_array_equal(read_pixels(path, colour=True), ramp)
-
-
-def test_stretch_ignores_nodata_and_outliers() -> None:
-    values = np.full((100, 100), 1000.0, np.float32)
-    values[:, 50:] = 2000.0
-    values[0, :40] = 0.0
-    values[1, :3] = (np.nan, np.inf, 1e9)
-    gray = to_gray8(values)
-    assert (gray[50, 10], gray[50, 90]) == (0, 255)
-    assert gray[0, 0] == 0
-
-
-@pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.uint32, np.float32, np.float64])
-def test_every_depth_becomes_gray(dtype: type) -> None:
-    colours = pattern().astype(dtype) * 100
-    assert to_gray8(colours).dtype == np.uint8
-    assert to_gray8(np.full((4, 4), 7, dtype)).max() <= 255
-    assert to_gray8(np.zeros((4, 4), dtype)).max() == 0
 
 
 def test_bands_beyond_three_are_left_out(tmp_path: Path) -> None:
@@ -236,13 +217,13 @@ def test_masks_of_another_size_are_fitted(tmp_path: Path) -> None:
 
 
 def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:
-    from aeromatch_cli.stages.enhance import _without_nodata
+    from aeromatch_cli.stages.enhance import _without_frames
 
     pixels = np.full((60, 80), 100, np.uint8)
     pixels[20:30, 20:30] = 0
-    assert _without_nodata(pixels) is None
+    assert _without_frames(pixels) is None
     pixels[:, :10] = 0
-    valid = _without_nodata(pixels)
+    valid = _without_frames(pixels)
     assert valid is not None
     expected = np.ones((60, 80), bool)
     expected[:, :10] = False

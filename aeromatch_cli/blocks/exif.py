@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 import struct
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli import tiff
 from aeromatch_cli.errors import ItemError
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
@@ -68,29 +70,28 @@ class ExifFacts:
     notes: tuple[str, ...] = ()
 
 
-def read_exif(path: Path) -> ExifFacts:
-    """Header facts of a JPEG, PNG or TIFF (8 or 16 bit). Raises ItemError where the file is no readable image."""
-    from PIL import Image, UnidentifiedImageError
+@dataclass(frozen=True, eq=False)
+class _Header:
+    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: the packet, if any."""
 
-    # A mapping camera's frame is larger than Pillow's guard against hostile files; nothing is decoded here.
-    Image.MAX_IMAGE_PIXELS = None
+    size_px: tuple[int, int]
+    main: Mapping[int, Any]
+    exif: Mapping[int, Any]
+    gps: Mapping[int, Any]
+    xmp: Any
+
+
+def read_exif(path: Path) -> ExifFacts:
+    """Header facts of a JPEG, PNG or TIFF (any depth). Raises ItemError where the file is no readable image."""
     notes: list[str] = []
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's remarks on odd tags, one per image, are of no use to anybody
-            with Image.open(path) as image:
-                tags, exif, gps = _ifds(image, notes)
-                # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
-                stored = (int(tags[_WIDTH]), int(tags[_HEIGHT])) if image.format == "TIFF" else image.size
-                xmp = _xmp(image, tags, notes)
-    except UnidentifiedImageError as error:
-        raise ItemError(f"{path.name}: not a readable image (damaged header or another format)") from error
-    except _BROKEN as error:
-        raise ItemError(f"{path.name}: header cannot be read ({error}): copy the file again") from error
-    width_px, height_px = stored
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow's remarks on odd tags, one per image, are of no use to anybody
+        header = _header(path, notes)
+    width_px, height_px = header.size_px
     if width_px < 1 or height_px < 1:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
-    latitude_deg, longitude_deg, altitude_m = _position(gps, xmp, notes)
+    tags, exif, xmp = header.main, header.exif, _xmp(header.xmp, notes)
+    latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     orientation = _number(tags.get(_ORIENTATION)) or 1.0
     return ExifFacts(
@@ -121,31 +122,82 @@ def exif_or_reason(path: Path) -> ExifFacts | str:
         return str(error).removeprefix(f"{path.name}: ")  # recorded beside the name
 
 
-def _ifds(image: Any, notes: list[str]) -> tuple[Mapping[int, Any], Mapping[int, Any], Mapping[int, Any]]:
-    """Main, EXIF and GPS tags; a broken table is empty and noted, since the picture itself may be sound."""
+def _header(path: Path, notes: list[str]) -> _Header:
+    """Size and tags; a broken table of tags is empty and noted, since the picture itself may be sound."""
+    from PIL import Image, UnidentifiedImageError
+
+    # A mapping camera's frame is larger than Pillow's guard against hostile files; nothing is decoded here.
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        with Image.open(path) as image:
+            readers: tuple[Callable[[], Mapping[int, Any]], ...] = (
+                lambda: dict(image.getexif()),
+                lambda: dict(image.getexif().get_ifd(_EXIF_IFD)),
+                lambda: dict(image.getexif().get_ifd(_GPS_IFD)),
+            )
+            main, exif, gps = _tables(readers, notes)
+            # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
+            size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
+            packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or main.get(_XMP_PACKET)
+            return _Header(size_px, main, exif, gps, packet)
+    except UnidentifiedImageError as error:
+        if path.suffix.lower() not in tiff.SUFFIXES:
+            raise _unreadable(path) from error
+        return _header_of_other_tiff(path, notes)
+    except _BROKEN as error:
+        raise ItemError(f"{path.name}: header cannot be read ({error}): copy the file again") from error
+
+
+def _header_of_other_tiff(path: Path, notes: list[str]) -> _Header:
+    """The same of a TIFF that Pillow does not know (16 bit or float with several bands): by the reader of its pixels.
+
+    Pillow can read the tags all the same.
+    """
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    try:
+        size_px = tiff.tiff_size(path)
+    except ItemError as error:
+        raise _unreadable(path) from error
+    with path.open("rb") as stream:
+        magic = stream.read(16)
+        magic = magic if magic[2:3] == b"+" else magic[:8]  # BigTIFF is version 43, and its offsets have 8 bytes
+
+        def table(pointer: int | None) -> Mapping[int, Any]:
+            directory = ImageFileDirectory_v2(magic)
+            start = directory.next if pointer is None else table(None).get(pointer)
+            if start is not None:
+                stream.seek(int(start))
+                directory.load(stream)
+            return dict(directory)
+
+        main, exif, gps = _tables([partial(table, pointer) for pointer in (None, _EXIF_IFD, _GPS_IFD)], notes)
+    return _Header(size_px, main, exif, gps, main.get(_XMP_PACKET))
+
+
+def _unreadable(path: Path) -> ItemError:
+    return ItemError(f"{path.name}: not a readable image (damaged header or another format)")
+
+
+def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]) -> list[Mapping[int, Any]]:
+    """Main, EXIF and GPS tags, each by its reader."""
     tables: list[Mapping[int, Any]] = []
-    readers: tuple[tuple[str, Callable[[], Mapping[int, Any]]], ...] = (
-        ("EXIF", lambda: dict(image.getexif())),
-        ("EXIF", lambda: dict(image.getexif().get_ifd(_EXIF_IFD))),
-        ("GPS", lambda: dict(image.getexif().get_ifd(_GPS_IFD))),
-    )
-    for label, read in readers:
+    for label, read in zip(("EXIF", "EXIF", "GPS"), readers, strict=True):
         try:
             tables.append(read())
         except _BROKEN:
             tables.append({})
             notes.append(f"{label} tags are damaged")
-    return tables[0], tables[1], tables[2]
+    return tables
 
 
-def _xmp(image: Any, tags: Mapping[int, Any], notes: list[str]) -> dict[str, str]:
+def _xmp(packet: Any, notes: list[str]) -> dict[str, str]:
     """XMP properties as "prefix:Name" -> text, with DJI's and Pix4D's namespaces under their usual prefixes."""
     from xml.etree.ElementTree import ParseError
 
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
-    packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or tags.get(_XMP_PACKET)
     if isinstance(packet, str):
         packet = packet.encode()
     if not isinstance(packet, bytes) or not packet.strip(b"\0 \r\n\t"):

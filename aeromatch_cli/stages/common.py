@@ -22,7 +22,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_hash, write_json, write_text
 
 # Part of every fingerprint that pixels enter; raised when decoding, masking, warping or merging change results.
-PIPELINE_VERSION = 2
+PIPELINE_VERSION = 3
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger("aeromatch")

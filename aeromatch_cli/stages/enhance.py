@@ -15,7 +15,7 @@ from aeromatch_cli.images import (
     below_horizon,
     mask_path,
     read_mask,
-    read_pixels,
+    read_raster,
     sees_sky,
     shrink,
     shrink_camera,
@@ -90,8 +90,8 @@ def _is_spared(context: Context, image: Image) -> bool:
 
 
 def load_source(task: EnhanceTask, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
-    """Pixels at the working scale and where they are valid (mask, nodata, sky); None = everywhere."""
-    pixels = read_pixels(task.path, colour=colour)
+    """Pixels at the working scale and where they are valid (mask, nodata, frames, sky); None = everywhere."""
+    pixels, recorded = read_raster(task.path, colour=colour)
     height, width = pixels.shape[:2]
     if (width, height) != (task.camera.width_px, task.camera.height_px):
         # The header and the decoded raster disagree: geometry would be wrong everywhere.
@@ -100,7 +100,7 @@ def load_source(task: EnhanceTask, *, colour: bool) -> tuple[NDArray[Any], BoolA
             f"{task.camera.width_px}x{task.camera.height_px}; give the right --cameras"
         )
     valid = read_mask(task.mask, width, height) if task.mask else None
-    valid = _combine(valid, _without_nodata(pixels))
+    valid = _combine(_combine(valid, recorded), _without_frames(pixels))
     pixels = shrink(pixels, task.scale)
     if valid is not None:
         valid = shrink(valid.astype(np.uint8) * 255, task.scale) > 254
@@ -115,7 +115,7 @@ def _combine(first: BoolArray | None, second: BoolArray | None) -> BoolArray | N
     return first & second
 
 
-def _without_nodata(pixels: NDArray[Any]) -> BoolArray | None:
+def _without_frames(pixels: NDArray[Any]) -> BoolArray | None:
     """False in frames of exact zeros that touch the border, as orthorectified or rotated pictures have them.
 
     Black objects inside the picture stay valid; None when less than half of any border line is zero.

@@ -21,6 +21,7 @@ OUR_CODE = (
     "data.py",
     "formats.py",
     "images.py",
+    "tiff.py",
     "methods/ours.py",
 )
 LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")

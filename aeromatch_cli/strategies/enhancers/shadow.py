@@ -24,6 +24,7 @@ from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regi
 class ShadowEnhancement(Beside):
     """Shadows lifted to the light around them; a picture without shadow passes unchanged."""
 
+    version: ClassVar[int] = 2
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
     beside: bool = Field(True, description=Beside.model_fields["beside"].description)

@@ -64,13 +64,12 @@ def make_overview(pixels: NDArray[Any], valid: BoolArray | None, longest_px: int
     scale = min(1.0, longest_px / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
-    tone = tone_of(pixels, small)
+    seen = None if valid is None else cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0
+    tone = tone_of(pixels, small, seen)
     levels = np.minimum(small.astype(np.float32) / np.float32(tone.white), np.float32(1.0))
     if levels.ndim == 2 or levels.shape[2] != 3:
         levels = np.repeat(levels.reshape(*levels.shape[:2], -1).mean(axis=2, keepdims=True), 3, axis=2)
-    seen = np.ones(levels.shape[:2], dtype=bool)
-    if valid is not None:
-        seen = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0
+    seen = np.ones(levels.shape[:2], dtype=bool) if seen is None else seen
     return Overview(levels, seen, tone.light(levels).mean(axis=2), tone)
 
 

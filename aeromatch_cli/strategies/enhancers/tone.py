@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import BoolArray, FloatArray
 
 # IEC 61966-2-1 (sRGB): a straight toe, then ((v + offset) / (1 + offset)) ** power.
 _TOE, _SLOPE, _OFFSET, _POWER = 0.04045, 12.92, 0.055, 2.4
@@ -58,9 +58,15 @@ class Tone:
         return np.maximum(raised / safe, np.float32(1.0))
 
 
-def tone_of(pixels: NDArray[Any], overview: NDArray[Any]) -> Tone:
-    """The tone of a picture (H, W) or (H, W, C); overview: the same picture reduced, with its stored values."""
-    if pixels.dtype == np.uint8:
-        return Tone(255.0, linear=False)
-    white = float(np.percentile(overview, _WHITE_PERCENTILE))
-    return Tone(max(white, 1.0), linear=pixels.ndim == 2)
+def white_of(values: NDArray[Any], valid: BoolArray | None) -> float:
+    """The stored value that counts as white in values (H, W) or (H, W, C), of what is valid (H, W; None = all)."""
+    if values.dtype == np.uint8:
+        return 255.0
+    known = values if valid is None or not valid.any() else values[valid]
+    return max(1.0, float(np.percentile(known, _WHITE_PERCENTILE)))
+
+
+def tone_of(pixels: NDArray[Any], overview: NDArray[Any], valid: BoolArray | None) -> Tone:
+    """The tone of a picture (H, W) or (H, W, C); overview: the same picture reduced, with its stored values, and where
+    that is valid."""
+    return Tone(white_of(overview, valid), linear=pixels.dtype != np.uint8 and pixels.ndim == 2)

@@ -15,9 +15,9 @@ from aeromatch_cli.data import BoolArray
 from aeromatch_cli.strategies import Enhanced
 from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+from aeromatch_cli.strategies.enhancers.tone import white_of
 
 _STRIP_ROWS = 256
-_WHITE_PERCENTILE = 99.8  # of pictures deeper than 8 bits, whose white is not known
 
 
 class WallisEnhancement(Beside):
@@ -36,9 +36,8 @@ class WallisEnhancement(Beside):
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
         """pixels (H, W) or (H, W, C) uint8 or uint16; no mask. What is not valid counts in no neighbourhood."""
         source = brightness(pixels)
-        known = source if valid is None or not valid.any() else source[valid]
-        white = 255.0 if pixels.dtype == np.uint8 else max(1.0, float(np.percentile(known, _WHITE_PERCENTILE)))
-        return Enhanced(with_brightness(pixels, source, self._filtered(source, valid, white)))
+        filtered = self._filtered(source, valid, white_of(source, valid))
+        return Enhanced(with_brightness(pixels, source, filtered))
 
     def _filtered(self, source: NDArray[Any], valid: BoolArray | None, white: float) -> NDArray[Any]:
         """g = (f - m) c S / (c s + (1 - c) S) + b M + (1 - b) m, m and s the local mean and spread, M and S wanted."""

@@ -1,0 +1,96 @@
+"""TIFFs of any number of bands and any depth, as rasterio reads them. The only file that knows its band order."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray
+from aeromatch_cli.errors import ItemError
+
+SUFFIXES = frozenset({".tif", ".tiff"})
+
+
+def tiff_size(path: Path) -> tuple[int, int]:
+    """Width and height of the stored raster, from the header alone. Raises ItemError."""
+    with _opened(path) as source:
+        return int(source.width), int(source.height)
+
+
+def read_tiff(path: Path) -> tuple[NDArray[Any], BoolArray | None]:
+    """(H, W) or (H, W, 3) of whole or floating numbers as stored, and where the file has values (None = everywhere).
+
+    The first three bands of four or more, the first of two; a band of transparency is none of them. Raises ItemError.
+    """
+    with _opened(path) as source:
+        extra = _transparency(source)
+        shown = [index for index in source.indexes if index != extra]
+        shown = shown[:3] if len(shown) >= 3 else shown[:1]
+        # One call: in most files the bands of a pixel lie together, and a second call would decode them again.
+        bands = source.read([*shown, extra] if extra else shown)
+        planes, alpha = bands[: len(shown)], bands[len(shown) :]
+        if bands.dtype.kind not in "iuf":
+            raise ItemError(f"image {path} holds {bands.dtype} numbers: write their magnitudes, as uint16 or float32")
+        masks = [_has_values(planes, [source.nodatavals[index - 1] for index in shown])]
+        if extra:
+            named = source.colorinterp[extra - 1].name == "alpha"
+            masks.append(alpha[0] > 0 if named or _is_mask(alpha[0]) else None)
+        flags = {flag.name for flag in source.mask_flag_enums[0]}
+        if "per_dataset" in flags and "alpha" not in flags:
+            masks.append(source.read_masks(1) > 0)
+    known = [mask for mask in masks if mask is not None]
+    valid = np.logical_and.reduce(known) if known else None
+    return np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.asarray(planes[0]), valid
+
+
+def _transparency(source: Any) -> int:
+    """Number of the alpha band, or of the last of two or four bands that may be one without the name; 0 for none."""
+    kinds = [kind.name for kind in source.colorinterp]
+    if "alpha" in kinds[1:]:
+        return kinds.index("alpha", 1) + 1
+    return len(kinds) if len(kinds) in (2, 4) and kinds[-1] == "undefined" else 0
+
+
+def _is_mask(band: NDArray[Any]) -> bool:
+    """Whether a band holds nothing but 0 and its type's largest value: many writers leave alpha without its name."""
+    return band.dtype.kind == "u" and bool(((band == 0) | (band == np.iinfo(band.dtype).max)).all())
+
+
+def _has_values(planes: NDArray[Any], nodata: Sequence[float | None]) -> BoolArray | None:
+    """(H, W) False where all planes (B, H, W) are their nodata value, or any is no number; None where nothing says."""
+    known: BoolArray | None = np.isfinite(planes).all(axis=0) if planes.dtype.kind == "f" else None
+    values = [value for value in nodata if value is not None and _can_hold(planes.dtype, value)]
+    if len(values) == len(planes):
+        with np.errstate(over="ignore"):  # a double beyond float32 is its infinity there
+            stored = np.array(values).astype(planes.dtype)
+        there = (planes != stored[:, None, None]).any(axis=0)
+        known = there if known is None else known & there
+    return known
+
+
+def _can_hold(dtype: np.dtype[Any], value: float) -> bool:
+    if dtype.kind == "f":
+        return True
+    limits = np.iinfo(dtype)
+    return float(value).is_integer() and limits.min <= value <= limits.max
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """rasterio's dataset; what it raises within becomes an ItemError."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                yield source
+    except (RasterioError, OSError) as error:
+        raise ItemError(f"cannot decode image {path}: {error}") from None
