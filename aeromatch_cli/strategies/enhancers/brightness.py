@@ -1,4 +1,4 @@
-"""Brightness of gray and colour pictures, and putting a changed one back without a change of hue."""
+"""Brightness of gray and colour pictures, and putting a changed one back without a change of hue below white."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brigh
 
 
 class ClaheEnhancement(Beside):
-    """Local contrast everywhere, shadow or not; hue stays."""
+    """Local contrast everywhere, shadow or not; hue stays, except where a band reaches white."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["clahe"] = "clahe"

@@ -21,7 +21,7 @@ _STRIP_ROWS = 256
 
 
 class WallisEnhancement(Beside):
-    """Local mean and contrast made alike everywhere, shadow or not; hue stays."""
+    """Local mean and contrast made alike everywhere, shadow or not; hue stays, except where a band reaches white."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["wallis"] = "wallis"
