@@ -149,9 +149,11 @@ def for_views(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanc
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing.
 
-    What another strategy left goes: a mask of other settings would be taken for this one's.
+    What other settings left goes: a mask of theirs would be taken for this one's. A picture of these very settings
+    stays, whether it is asked for or not.
     """
-    kept = {".png": picture, ".mask.png": result.mask is not None, ".json": picture or bool(result.info)}
+    stays = picture or is_done(task)
+    kept = {".png": stays, ".mask.png": result.mask is not None, ".json": stays or bool(result.info)}
     for suffix, stays in kept.items():
         if not stays:
             task.workspace.enhanced(task.image_id, suffix).unlink(missing_ok=True)
@@ -160,9 +162,9 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     mask = result.mask
     if mask is not None:
         write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
-    if picture or result.info:
+    if kept[".json"]:
         facts = task.workspace.enhanced(task.image_id, ".json")
-        write_json(facts, {"fingerprint": task.fingerprint, "picture": picture, **result.info})
+        write_json(facts, {"fingerprint": task.fingerprint, "picture": stays, **result.info})
 
 
 def keep_for_views(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
