@@ -175,8 +175,7 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
             f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
             f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
         )
-        if stage.stage == "filter":
-            lines += _filter_lines(stage)
+        lines += _filter_lines(stage) if stage.stage == "filter" else _picture_lines(stage)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -210,6 +209,19 @@ def _standing_failures(command: str, context: Context, reports: list[StageReport
         if stage in before and context.owns(owner(item)):
             failures.add((stage, item, reason))
     return tuple(sorted(failures))
+
+
+def _picture_lines(stage: StageReport) -> list[str]:
+    """What the pictures of a stage cost, and which are not made."""
+    facts, words = stage.facts, []
+    if "views_per_image" in facts:
+        views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
+        words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
+    if facts.get(enhance.SPARED):
+        words.append(f"{facts[enhance.SPARED]} images not enhanced: one sun")
+    if "remark" in facts:
+        words.append(facts["remark"])
+    return [f"          {'; '.join(words)}"] if words else []
 
 
 def _filter_lines(stage: StageReport) -> list[str]:
