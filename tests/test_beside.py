@@ -8,6 +8,7 @@ import numpy as np
 from conftest import QUICK, Site, invoke
 from PIL import Image
 
+from aeromatch_cli.config_text import default_yaml
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.workspace import read_json
 
@@ -51,6 +52,16 @@ def test_images_of_one_sun_are_left_as_they_are(site: Site) -> None:
         spared, plain = read_features(path), read_features(alone / "features" / path.name)
         assert np.array_equal(spared.keypoints_px, plain.keypoints_px)
         assert np.array_equal(spared.descriptors, plain.descriptors)
+
+
+def test_without_beside_the_time_has_no_effect(site: Site) -> None:
+    take_at(site, lambda _: "12:00:00")
+    clahe = ("--set", "enhance=clahe", "--set", "enhance.one_sun_minutes=20")
+    outcome = site("enhance", *clahe)
+    assert outcome.counts("enhance") == (5, 0, 0)
+    assert "one sun" not in outcome.stdout
+    described = " ".join(default_yaml().replace("#", "").split())
+    assert "Without beside it has no effect: every image is enhanced." in described
 
 
 def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> None:

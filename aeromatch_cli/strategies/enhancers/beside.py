@@ -21,5 +21,6 @@ class Beside(Strategy):
         20.0,
         ge=0.0,
         description="With beside: an image whose partners were all taken within so many minutes of it is left as it "
-        "is (the sun moves by 5 degrees in 20 minutes, so their shadows are alike); 0, or an unknown time: never.",
+        "is (the sun moves by 5 degrees in 20 minutes, so their shadows are alike); 0, or an unknown time: never. "
+        "Without beside it has no effect: every image is enhanced.",
     )
