@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -247,7 +248,7 @@ def _listed(names: list[str], shown: int = 10) -> str:
 
 
 def _check(context: Context, first: StageReport) -> Result:
-    found = check.run(context)
+    found = check.run(context, time.perf_counter() - first.started)
     lines = (*first.facts["summary"], *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
