@@ -77,7 +77,7 @@ app.add_typer(weights_app, name="weights")
 STAGES = {
     "run": "Everything, over all overlapping pairs: pairs to report.",
     "pairs": "Read the block and choose the pairs.",
-    "enhance": "Write enhanced pictures.",
+    "enhance": "Write enhanced pictures; none of images that enhance.one_sun_minutes spares, none with enhance=none.",
     "simulate": "Write simulated views.",
     "extract": "Find features in every image.",
     "match": "Match every pair; features that are missing are made first.",

@@ -20,7 +20,8 @@ distrusted.json images whose attitude contradicts the pictures: fingerprint (of 
                 they overlap with: they and their neighbours are also matched as they were taken
 
 enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json: fingerprint, picture
-                             (whether the picture is kept), and the facts that the strategy states.
+                             (whether the picture is kept), and the facts that the strategy states. None of images
+                             that are used as they were taken.
 simulated/<id>/views.json    fingerprint, pictures (whether they are kept), scale (stored raster to the raster that
                              the views were made from), views:
                              name, width_px, height_px, is_source, angle_deg, enhanced, undistorted_from_view. Source

@@ -8,6 +8,7 @@ import numpy as np
 from conftest import QUICK, Site, invoke
 from PIL import Image
 
+from aeromatch_cli.config_text import default_yaml
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.workspace import read_json
 
@@ -53,6 +54,16 @@ def test_images_of_one_sun_are_left_as_they_are(site: Site) -> None:
         assert np.array_equal(spared.descriptors, plain.descriptors)
 
 
+def test_without_beside_the_time_has_no_effect(site: Site) -> None:
+    take_at(site, lambda _: "12:00:00")
+    clahe = ("--set", "enhance=clahe", "--set", "enhance.one_sun_minutes=20")
+    outcome = site("enhance", *clahe)
+    assert outcome.counts("enhance") == (5, 0, 0)
+    assert "one sun" not in outcome.stdout
+    described = " ".join(default_yaml().replace("#", "").split())
+    assert "Without beside it has no effect: every image is enhanced." in described
+
+
 def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> None:
     take_at(site, lambda number: "12:00:00" if number else "12:21:00")
     chained = (*BESIDE, "--set", "pairs=sequential", "--set", "pairs.window=1")
@@ -62,16 +73,32 @@ def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> 
     assert set(enhanced_views(site).values()) == {False}
 
 
-def test_what_enhance_made_of_a_spared_image_stays(site: Site) -> None:
-    take_at(site, lambda _: "12:00:00")
-    assert site("enhance", *BESIDE).code == 0
-    made = {path.name: path.stat().st_mtime_ns for path in (site.work / "enhanced").iterdir()}
-    assert len([name for name in made if name.endswith(".png")]) == len(site.names())
-    assert site("extract", *BESIDE).code == 0
-    assert {path.name: path.stat().st_mtime_ns for path in (site.work / "enhanced").iterdir()} == made
-    # Of other settings: nobody is to take it for this one's.
-    assert site("extract", *BESIDE, "--set", "enhance.clip_limit=3").code == 0
-    assert list((site.work / "enhanced").iterdir()) == []
+def test_spared_images_have_no_enhanced_picture_and_are_counted(site: Site) -> None:
+    take_at(site, lambda number: "12:00:00" if number else "12:21:00")
+    chained = (*BESIDE, "--set", "pairs=sequential", "--set", "pairs.window=1")
+    said = "3 images not enhanced: one sun"
+
+    def pictures() -> list[str]:
+        return sorted(path.stem for path in site.work.glob("enhanced/*.png"))
+
+    ids = [name.replace(".", "_") for name in site.names()]
+    outcome = site("enhance", *chained)
+    assert outcome.counts("enhance") == (2, 3, 0)
+    assert said in outcome.stdout
+    assert pictures() == ids[:2]
+    assert site("enhance", *chained).counts("enhance") == (0, 5, 0)
+    for _ in range(2):  # the second time it is up to date
+        outcome = site("run", *chained, "--keep-images")
+        assert said in outcome.stdout
+        assert pictures() == ids[:2]
+    facts = read_json(site.work / "reports" / "extract.json")["facts"]
+    assert facts["images_spared_by_one_sun"] == 3
+    assert "images spared by one sun 3" in (site.work / "report" / "index.html").read_text(encoding="utf-8")
+    # Enhanced once, spared now: nobody is to take the picture for one that is used.
+    assert site("enhance", *chained, "--set", "enhance.one_sun_minutes=0").counts("enhance") == (5, 0, 0)
+    assert pictures() == ids
+    assert site("enhance", *chained).counts("enhance") == (2, 3, 0)
+    assert pictures() == ids[:2]
 
 
 def test_preset_fusion_verifies_the_block(site: Site) -> None:

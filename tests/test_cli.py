@@ -60,7 +60,7 @@ def test_stage_by_stage_gives_what_run_gives(done_site):
         assert outcome.code == 0
         made[command] = outcome.counts(command)[0]
     assert made == {
-        "pairs": PAIRS, "enhance": IMAGES, "simulate": IMAGES, "extract": IMAGES, "match": PAIRS, "filter": PAIRS,
+        "pairs": PAIRS, "enhance": 0, "simulate": IMAGES, "extract": IMAGES, "match": PAIRS, "filter": PAIRS,
         "export": 1, "report": 1,
     }  # fmt: skip
     expected, found = contents(done_site.work), contents(work)
@@ -73,10 +73,31 @@ def test_stage_by_stage_gives_what_run_gives(done_site):
 
 @pytest.mark.parametrize("command", ["pairs", "enhance", "simulate", "extract", "match"])
 def test_commands_that_make_what_they_need(site, command):
-    outcome = site(command)
+    outcome = site(command, "--set", "enhance=clahe")
     assert outcome.code == 0
     assert outcome.facts["stages"][command]["done"] > 0
     assert (site.work / "failures.csv").read_text() == "stage,item,reason\n"
+
+
+def test_no_enhancement_writes_no_pictures(site):
+    outcome = site("enhance")
+    assert (outcome.code, outcome.counts("enhance")) == (0, (0, IMAGES, 0))
+    assert "enhance=none changes nothing" in outcome.stdout
+    assert site("extract", "--keep-images").code == 0
+    assert not list(site.work.glob("enhanced/*"))
+    assert len(list(site.work.glob("simulated/*/*.png"))) == IMAGES
+
+
+@pytest.mark.parametrize("command", ["simulate", "extract", "run"])
+def test_the_summary_tells_what_views_cost(site, command):
+    stage = "simulate" if command == "simulate" else "extract"
+    more = ("--set", "simulate.source=true")
+    for _ in range(2):  # the second time it is up to date
+        outcome = site(command, *more)
+        facts = outcome.facts["stages"][stage]["facts"]
+        assert facts["views_per_image"] == 2.0
+        line = f"views per image: 2, {facts['view_megapixels_per_image']:.3g} megapixels together"
+        assert outcome.stdout.count(line) == 1
 
 
 def test_commands_that_need_an_earlier_one_say_so(site):

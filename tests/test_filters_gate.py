@@ -1,15 +1,19 @@
 """What verifies a pair: more inliers than chance gives, with every filter that stands on one model."""
 
+import re
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from make_matches import GEOMETRY, POSE0, POSE1, chance, houses
 
-from aeromatch_cli.data import Candidates
+from aeromatch_cli.data import Candidates, Verdict
 from aeromatch_cli.geometry.epipolar import relative_pose, sampson_distance_px
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.geometry.two_view import chance_errors_px, log10_false_alarms
+from aeromatch_cli.strategies.filters import FILTERS, apply_chain
+from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
 from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
@@ -86,6 +90,18 @@ def test_epipolar_finds_the_rotation():
     assert angle_between_deg(verdict.relative_rotation, relative_pose(POSE0, POSE1)[0]) < 0.1
 
 
+@pytest.mark.parametrize("name", sorted(name for name, one in FILTERS.items() if one.verifies))
+def test_who_gives_no_rotation_says_so(name):
+    verdict = FILTERS[name]()(houses(500, wrong=0.3, noise_px=0.2, seed=10).candidates, GEOMETRY, 0)
+    assert verdict.state == "verified"
+    given = verdict.relative_rotation is not None
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    with_rotation, without = re.search(
+        r"ends in a relative pose, (.+?):(.+?) give\s+no rotation", readme, re.S
+    ).groups()
+    assert (f"`{name}`" in with_rotation, f"`{name}`" in without) == (given, not given)
+
+
 def test_magsac_is_the_same_whatever_ran_before_it():
     scene = houses(400, wrong=0.6, seed=11)
     first = Magsac()(scene.candidates, GEOMETRY, 0)
@@ -130,3 +146,30 @@ def test_copies_of_a_match_are_no_further_evidence():
     wrong = np.flatnonzero(~verdict.keep)
     copied = scene.candidates.take(np.concatenate([np.repeat(few, 4), wrong]))
     assert Poselib()(copied, GEOMETRY, 0).state == "rejected"
+
+
+class _KeepFew:
+    name = "few"
+
+    def __init__(self, count):
+        self.count = count
+
+    def __call__(self, candidates, geometry, seed):
+        keep = np.arange(len(candidates)) < self.count
+        return Verdict(keep=keep, state="not verifiable", reason="a limit")
+
+
+@pytest.mark.parametrize("judge", [Poselib(), ClusteredRansac(), Poselib(min_inliers=20)])
+@pytest.mark.parametrize("after", [[], [Poselib(min_inliers=40)]], ids=["last", "before another"])
+def test_a_pair_left_with_fewer_matches_than_verify_it_is_rejected(judge, after):
+    given = houses(60, wrong=0.0, seed=13).candidates
+    short = judge.min_inliers - 3
+    verdict = apply_chain([judge, _KeepFew(short), *after], given, GEOMETRY, 0)
+    assert verdict.state == "rejected"
+    assert verdict.reason == f"{short} inliers of 60 matches, {judge.min_inliers} needed"
+    assert not verdict.keep.any()
+    assert verdict.relative_rotation is None
+    assert sum(verdict.rejected.values()) == 60
+    enough = apply_chain([judge, _KeepFew(judge.min_inliers)], given, GEOMETRY, 0)
+    assert enough.state == "verified"
+    assert enough.keep.sum() == judge.min_inliers

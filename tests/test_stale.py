@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Site, invoke
+from conftest import IMAGES, Site, invoke
 
 from aeromatch_cli.formats import read_pairs
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
@@ -117,3 +117,22 @@ def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
     names = {path.stem for path in workspace.views(image_id).parent.glob("*.png")}
     assert names == {view["name"] for view in read_json(workspace.views(image_id))["views"]}
     assert not tilted <= {f"{name}.png" for name in names}
+
+
+@pytest.mark.parametrize("command", ["extract", "match", "run"])
+def test_pictures_of_the_same_settings_stay(site: Site, command: str) -> None:
+    shadow = ("--set", "enhance=shadow")
+    assert site("enhance", *shadow).code == site("simulate", *shadow).code == 0
+
+    def pictures() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in site.work.glob("*ed/**/*.png") if "mask" not in path.name}
+
+    made = pictures()
+    assert len(made) >= 2 * IMAGES
+    assert site(command, *shadow).counts("extract") == (IMAGES, 0, 0)
+    assert pictures() == made
+    for stage in ("enhance", "simulate"):
+        assert site(stage, *shadow).counts(stage) == (0, IMAGES, 0)
+    # Of other settings they go: the features come from other pixels.
+    assert site(command, *shadow, "--set", "enhance.max_gain=5").code == 0
+    assert pictures() == {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import report_map
+from aeromatch_cli.strategies.extractors.sift import Sift
 
 # --- log file -----------------------------------------------------------------------------------------------------
 
@@ -217,3 +220,32 @@ def test_memory_estimate_counts_the_largest_view(site):
 
     # The source is view 0 beside the ground view: more pixels than either alone.
     assert estimate("--set", "simulate.source=true") > estimate() >= estimate("--set", "simulate=none")
+
+
+def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
+    extract_s, calls = Sift.__call__, []
+
+    def slow_to_start(self, camera, views):
+        time.sleep(0.0 if calls else 3.0)  # as a network that is loaded
+        calls.append(len(views))
+        return extract_s(self, camera, views)
+
+    monkeypatch.setattr(Sift, "__call__", slow_to_start)
+    estimate = site("check").facts["estimate"]
+    assert estimate["seconds_to_start"] > 3.0
+    assert estimate["seconds_per_image"] < 1.5
+    work = len(site.names()) * estimate["seconds_per_image"] + estimate["pairs"] * estimate["seconds_per_pair"]
+    assert estimate["seconds"] == pytest.approx(estimate["seconds_to_start"] + work, abs=0.1)
+
+
+def test_the_estimate_times_pairs_where_a_run_matches_them(site, monkeypatch):
+    labels = []
+    run = Executor.run
+
+    def recorded(self, function, tasks, label):
+        labels.append((function.__name__, len(tasks)))
+        return run(self, function, tasks, label)
+
+    monkeypatch.setattr(Executor, "run", recorded)
+    assert site("check").code == 0
+    assert labels[-2:] == [("_try_image", len(site.names())), ("_try_pair", 3)]

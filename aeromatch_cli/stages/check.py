@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.data import Features, Image
+from aeromatch_cli.data import Features, Image, Pair
 from aeromatch_cli.images import shrink_camera
 from aeromatch_cli.stages import enhance, extract, simulate
 from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.filter import candidates, pair_seed
+from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.strategies import Matcher
+from aeromatch_cli.strategies.filters import apply_chain
+from aeromatch_cli.strategies.filters.chain import Filter
 
 # Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per pixel of the source or of its views
 # together, whichever are more: a view of a turned or tilted image is larger than the image.
@@ -20,6 +27,9 @@ _BYTES_PER_PIXEL = 12.0
 _TILE_MB = 700.0
 _BYTES_PER_DESCRIPTOR = 170.0
 _BYTES_PER_MATCH = 60.0
+# How many pairs are tried, and how much smaller the picture is with which a worker gets ready.
+_SAMPLED_PAIRS = 3
+_WARM_UP_SCALE = 0.25
 
 
 @dataclass(frozen=True)
@@ -39,39 +49,86 @@ class _Trial:
     sample: bool
 
 
-def _try_image(trial: _Trial) -> tuple[float, Features | None]:
+@dataclass(frozen=True, eq=False)
+class _PairTrial:
+    """A pair to match and to judge, in memory."""
+
+    features: tuple[Features, Features]
+    pair: PairTask
+    matcher: Matcher
+    chain: tuple[Filter, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """start_s: what a worker does once (imports, networks). seconds: what every further item takes.
+
+    features: of a sampled image. matches: of a sampled pair.
+    """
+
+    start_s: float
+    seconds: float
+    features: Features | None = None
+    matches: int = 0
+
+
+def _try_image(trial: _Trial) -> _Tried:
+    views = trial.task.views
     started = time.perf_counter()
     if not trial.sample:
-        enhance.load_source(trial.task.views.source, colour=False)
-        return time.perf_counter() - started, None
-    pictures, _ = simulate.render(trial.task.views)
-    source = trial.task.views.source
-    features = trial.task.extractor(shrink_camera(source.camera, source.scale), pictures)
-    return time.perf_counter() - started, features
+        enhance.load_source(views.source, colour=False)
+        return _Tried(0.0, time.perf_counter() - started)
+    _features(trial, replace(views, source=replace(views.source, scale=views.source.scale * _WARM_UP_SCALE)))
+    ready = time.perf_counter()
+    features = _features(trial, views)
+    return _Tried(ready - started, time.perf_counter() - ready, features)
 
 
-def run(context: Context) -> Check:
-    """Try every image, and the strategies on the first pair that can be tried."""
+def _features(trial: _Trial, views: simulate.SimulateTask) -> Features:
+    pictures, _ = simulate.render(views)
+    return trial.task.extractor(shrink_camera(views.source.camera, views.source.scale), pictures)
+
+
+def _try_pair(trial: _PairTrial) -> _Tried:
+    started = time.perf_counter()
+    _match(trial)
+    ready = time.perf_counter()
+    matches = _match(trial)
+    seconds = time.perf_counter() - ready
+    return _Tried(max(ready - started - seconds, 0.0), seconds, matches=matches)
+
+
+def _match(trial: _PairTrial) -> int:
+    """How many matches there are before they are judged."""
+    matches = trial.matcher(*trial.features, trial.pair.geometry)
+    sides = [(features.keypoints_px, features.colours) for features in trial.features]
+    apply_chain(trial.chain, candidates(matches, *sides), trial.pair.geometry, trial.pair.seed)
+    return len(matches.indices)
+
+
+def run(context: Context, reading_s: float) -> Check:
+    """Try every image, and the strategies on a few pairs. reading_s: what it took to read the block."""
     images = list(context.block.images)
     sampled = _sample(context)
-    trials = [_Trial(extract.make_task(context, image), image.image_id in sampled) for image in images]
+    ids = {image_id for pair in sampled for image_id in (pair.image_id0, pair.image_id1)}
+    trials = [_Trial(extract.make_task(context, image), image.image_id in ids) for image in images]
     largest_px = max(_pixels(image, trial) for image, trial in zip(images, trials, strict=True))
     outcomes = context.executor.run(_try_image, trials, "check")
     failures = tuple((i.name, o.error) for i, o in zip(images, outcomes, strict=True) if o.value is None)
     timed = {
         image.image_id: outcome.value
         for image, outcome in zip(images, outcomes, strict=True)
-        if outcome.value is not None and image.image_id in sampled
+        if outcome.value is not None and image.image_id in ids
     }
-    estimate = _estimate(context, len(images), largest_px, timed)
+    estimate = _estimate(context, largest_px, timed, _time_pairs(context, sampled, timed), reading_s)
     estimate["readable_images"] = len(images) - len(failures)
     return Check(_lines(context, estimate, len(images)), estimate, failures)
 
 
-def _sample(context: Context) -> set[str]:
-    """Both images of the pair in the middle of the list."""
-    pair = context.pairs[len(context.pairs) // 2]
-    return {pair.image_id0, pair.image_id1}
+def _sample(context: Context) -> list[Pair]:
+    """Pairs at even distances in the list: those of steep and of oblique images cost differently."""
+    count = min(_SAMPLED_PAIRS, len(context.pairs))
+    return [context.pairs[(2 * k + 1) * len(context.pairs) // (2 * count)] for k in range(count)]
 
 
 def _pixels(image: Image, trial: _Trial) -> int:
@@ -83,40 +140,57 @@ def _pixels(image: Image, trial: _Trial) -> int:
     return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
 
 
+def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _Tried]) -> list[_Tried]:
+    """The sampled pairs both images of which could be tried, matched and judged as a run does it: in the workers.
+
+    In this process, whose libraries use every core, the same takes up to ten times as long on a busy machine.
+    """
+    trials = []
+    for pair in sampled:
+        found = [timed[i].features for i in (pair.image_id0, pair.image_id1) if i in timed]
+        features0, features1 = found if len(found) == 2 else (None, None)
+        if features0 is not None and features1 is not None:
+            task = PairTask(context.geometry(pair), "", pair_seed(context, pair))
+            settings = context.settings
+            trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter))
+    return [o.value for o in context.executor.run(_try_pair, trials, "check") if o.value is not None]
+
+
 def _estimate(
-    context: Context, images: int, largest_px: int, timed: dict[str, tuple[float, Features | None]]
+    context: Context, largest_px: int, images: Mapping[str, _Tried], pairs: Sequence[_Tried], reading_s: float
 ) -> dict[str, Any]:
-    """images: how many. largest_px: of the image, or its views, that needs most memory."""
-    seconds_image = max((seconds for seconds, _ in timed.values()), default=float("nan"))
-    descriptors = max((len(f.descriptors) for _, f in timed.values() if f is not None), default=0)
-    seconds_pair, matches = _time_pair(context, timed)
-    jobs = context.executor.jobs
+    """largest_px: of the image, or its views, that needs most memory. images, pairs: the sampled ones."""
+    count, jobs = len(context.block.images), _jobs(context)
+    seconds_image = _mean([tried.seconds for tried in images.values()])
+    seconds_pair = _mean([tried.seconds for tried in pairs])
+    descriptors = max((len(tried.features.descriptors) for tried in images.values() if tried.features), default=0)
+    matches = _mean([tried.matches for tried in pairs])
     megapixels = largest_px / 1e6
     memory_mb = _BASE_MB + _BYTES_PER_PIXEL * megapixels + min(_TILE_MB, _TILE_MB * megapixels / 4.0)
-    disk = images * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
-    seconds = (images * seconds_image + len(context.pairs) * seconds_pair) / jobs
+    disk = count * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
+    # Workers start side by side; the pairs of one image are one task.
+    starts = sum(max((tried.start_s for tried in group), default=0.0) for group in (images.values(), pairs))
+    longest = max((len(row) for row in context.rows().values()), default=0)
+    turns = max(len(context.pairs) / jobs, longest)
+    seconds = reading_s + starts + math.ceil(count / jobs) * seconds_image + turns * seconds_pair
     return {
         "pairs": len(context.pairs),
-        "seconds_per_image": round(seconds_image, 3) if timed else None,
+        "seconds_to_start": round(reading_s + starts, 3),
+        "seconds_per_image": round(seconds_image, 3) if images else None,
         "seconds_per_pair": round(seconds_pair, 4),
-        "seconds": round(seconds, 1) if timed else None,
+        "seconds": round(seconds, 1) if images else None,
         "memory_mb": round(memory_mb * jobs),
         "disk_mb": round(disk / 1e6, 1),
         "disk_free_mb": round(shutil.disk_usage(_existing(context.workspace.root)).free / 1e6),
     }
 
 
-def _time_pair(context: Context, timed: dict[str, tuple[float, Features | None]]) -> tuple[float, int]:
-    """Seconds to match and judge the sampled pair, and its matches; zero where it could not be tried."""
-    pair = context.pairs[len(context.pairs) // 2]
-    features = [timed.get(i, (0.0, None))[1] for i in (pair.image_id0, pair.image_id1)]
-    if features[0] is None or features[1] is None:
-        return 0.0, 0
-    geometry = context.geometry(pair)
-    context.settings.match(features[0], features[1], geometry)  # the first call builds what is built once per process
-    started = time.perf_counter()
-    matches = context.settings.match(features[0], features[1], geometry)
-    return time.perf_counter() - started, len(matches.indices)
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else 0.0
+
+
+def _jobs(context: Context) -> int:
+    return 1 if context.executor.kind == "serial" else context.executor.jobs
 
 
 def _existing(path: Path) -> Path:
@@ -131,8 +205,8 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     return (
         f"images    {estimate['readable_images']} of {images} readable",
         f"pairs     {estimate['pairs']}",
-        f"time      {duration} with {context.executor.jobs} jobs",
-        f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
+        f"time      {duration} with {_jobs(context)} jobs",
+        f"memory    about {estimate['memory_mb']} MB with {_jobs(context)} jobs",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )
 

@@ -2,7 +2,8 @@
 
 A picture that an attitude turns the wrong way matches nothing, so that nothing contradicts the attitude. Images that no
 verified pair ties to the rest although poses promise overlap are therefore suspects: they and those paired with them
-are also compared as they were taken, wherever the poses say, and judged by what that finds.
+are also compared as they were taken, wherever the poses say, and judged by what that finds. Matches speak of attitudes
+where the filter that verified them gives a relative rotation: with a fundamental matrix or a homography none is judged.
 
 A judgement on an image holds as long as nothing changes that can be laid at its door: the image, its given pose and
 the settings. Images that come later do not revoke it by themselves; matches that vindicate the image do.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from aeromatch_cli.stages.common import PIPELINE_VERSION, Context, StageReport, 
 from aeromatch_cli.strategies import Enhanced, Enhancer
 from aeromatch_cli.workspace import Workspace, fingerprint, image_fingerprint, read_json, write_atomically, write_json
 
+# Among a stage's facts: how many images are not enhanced because they and their partners were taken under one sun.
+SPARED = "images_spared_by_one_sun"
+
 
 @dataclass(frozen=True, eq=False)
 class EnhanceTask:
@@ -46,6 +50,11 @@ class EnhanceTask:
     spared: bool
     workspace: Workspace
     fingerprint: str
+
+    @property
+    def as_taken(self) -> bool:
+        """Whether later stages take the image as it is, so that no picture of it is worth a file."""
+        return self.spared or not self.enhancer.changes
 
 
 def make_task(context: Context, image: Image) -> EnhanceTask:
@@ -147,30 +156,28 @@ def for_views(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanc
 
 
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
-    """Write mask and facts, and with `picture` the enhanced pixels; a strategy that did nothing leaves nothing.
+    """Write mask and facts, and with `picture` the enhanced pixels; an image that stays as it was taken leaves nothing.
 
-    What another strategy left goes: a mask of other settings would be taken for this one's.
+    What other settings left goes: a mask of theirs would be taken for this one's. A picture of these very settings
+    stays, whether it is asked for or not.
     """
-    kept = {".png": picture, ".mask.png": result.mask is not None, ".json": picture or bool(result.info)}
-    for suffix, stays in kept.items():
-        if not stays:
-            task.workspace.enhanced(task.image_id, suffix).unlink(missing_ok=True)
+    picture = picture and not task.as_taken
+    stays = picture or _has_picture(task)
+    kept = {".png": stays, ".mask.png": result.mask is not None, ".json": stays or bool(result.info)}
+    _remove(task, [suffix for suffix, wanted in kept.items() if not wanted])
     if picture:
         write_atomically(task.workspace.enhanced(task.image_id, ".png"), lambda s: write_png(s, result.pixels))
     mask = result.mask
     if mask is not None:
         write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
-    if picture or result.info:
+    if kept[".json"]:
         facts = task.workspace.enhanced(task.image_id, ".json")
-        write_json(facts, {"fingerprint": task.fingerprint, "picture": picture, **result.info})
+        write_json(facts, {"fingerprint": task.fingerprint, "picture": stays, **result.info})
 
 
-def keep_for_views(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
-    """The same for the stages after this one: of a spared image what this stage made for itself stays."""
-    if not task.spared:
-        keep(task, result, picture=picture)
-    elif _facts(task).get("fingerprint") != task.fingerprint:
-        keep(task, result, picture=False)
+def _remove(task: EnhanceTask, suffixes: Iterable[str]) -> None:
+    for suffix in suffixes:
+        task.workspace.enhanced(task.image_id, suffix).unlink(missing_ok=True)
 
 
 def _run_task(task: EnhanceTask) -> str:
@@ -180,24 +187,37 @@ def _run_task(task: EnhanceTask) -> str:
 
 
 def run(context: Context) -> StageReport:
-    """Write enhanced/<id>.png for every image of the shard that is not up to date."""
+    """Write enhanced/<id>.png for every image of the shard that is not up to date; none for images left as taken."""
     report = StageReport("enhance")
     tasks = [make_task(context, image) for image in context.images()]
-    todo = [task for task in tasks if context.overwrite or not is_done(task)]
+    todo = [task for task in tasks if not task.as_taken and (context.overwrite or not is_done(task))]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
+    for task in tasks:
+        if task.as_taken:
+            _remove(task, (".png", ".mask.png", ".json"))
     run_stage(context, report, _run_task, todo, [task.image_id for task in todo])
+    report.facts = sun_facts(tasks)
+    if not context.settings.enhance.changes:
+        report.facts["remark"] = f"enhance={context.settings.enhance.name} changes nothing: no pictures"
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
 
+def sun_facts(tasks: Iterable[EnhanceTask]) -> dict[str, Any]:
+    """How many of the images are spared; {} where the settings spare none."""
+    asked = [task.spared for task in tasks if task.enhancer.beside and task.enhancer.one_sun_minutes > 0.0]
+    return {SPARED: sum(asked)} if asked else {}
+
+
 def is_done(task: EnhanceTask) -> bool:
-    """Whether the picture on file is the one that the task would make."""
-    found = _facts(task)
-    picture = task.workspace.enhanced(task.image_id, ".png")
-    return picture.is_file() and found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))
+    """Whether the picture on file is the one that the task would make, if it makes any."""
+    return task.as_taken or _has_picture(task)
 
 
-def _facts(task: EnhanceTask) -> dict[str, Any]:
-    """What the image's JSON file says, {} without one."""
-    path = task.workspace.enhanced(task.image_id, ".json")
-    return read_json(path) if path.is_file() else {}
+def _has_picture(task: EnhanceTask) -> bool:
+    """Whether the picture on file is of these very settings and inputs."""
+    picture, facts = (task.workspace.enhanced(task.image_id, suffix) for suffix in (".png", ".json"))
+    if task.as_taken or not (picture.is_file() and facts.is_file()):
+        return False
+    found = read_json(facts)
+    return found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))

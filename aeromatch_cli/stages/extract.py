@@ -64,7 +64,7 @@ def run_task(task: ExtractTask) -> Extracted:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)
     features = _in_stored_frame(features, source.scale)
-    enhance.keep_for_views(source, enhancement, picture=task.keep_images)
+    enhance.keep(source, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
     return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
@@ -105,6 +105,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     if made:
         counts = [item.keypoints for item in made]
         facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
+        facts |= enhance.sun_facts(task.views.source for task in tasks)
         summed = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
         report.facts = summed | simulate.cost_facts([item.cost for item in made], report.facts)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
@@ -115,7 +116,7 @@ def _is_done(task: ExtractTask) -> bool:
     if features_fingerprint(task.path) != task.fingerprint:
         return False
     source = task.views.source
-    return not task.keep_images or ((source.spared or enhance.is_done(source)) and simulate.is_done(task.views))
+    return not task.keep_images or (enhance.is_done(source) and simulate.is_done(task.views))
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:

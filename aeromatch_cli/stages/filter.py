@@ -26,6 +26,7 @@ from aeromatch_cli.stages import distrust, extract, match, rows
 from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage, unexplained
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.filters import apply_chain
+from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
 
@@ -65,7 +66,7 @@ def pair_fingerprint(context: Context, pair: Pair) -> str:
     needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
     sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
     matches = match.pair_fingerprint(context, pair)
-    return fingerprint(chain, library_version("poselib"), matches, sides, pair_seed(context, pair))
+    return fingerprint(CHAIN_VERSION, chain, library_version("poselib"), matches, sides, pair_seed(context, pair))
 
 
 def make_tasks(context: Context) -> tuple[list[FilterTask], list[Pair]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -175,8 +176,7 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
             f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
             f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
         )
-        if stage.stage == "filter":
-            lines += _filter_lines(stage)
+        lines += _filter_lines(stage) if stage.stage == "filter" else _picture_lines(stage)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -212,6 +212,19 @@ def _standing_failures(command: str, context: Context, reports: list[StageReport
     return tuple(sorted(failures))
 
 
+def _picture_lines(stage: StageReport) -> list[str]:
+    """What the pictures of a stage cost, and which are not made."""
+    facts, words = stage.facts, []
+    if "views_per_image" in facts:
+        views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
+        words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
+    if facts.get(enhance.SPARED):
+        words.append(f"{facts[enhance.SPARED]} images not enhanced: one sun")
+    if "remark" in facts:
+        words.append(facts["remark"])
+    return [f"          {'; '.join(words)}"] if words else []
+
+
 def _filter_lines(stage: StageReport) -> list[str]:
     facts = stage.facts
     states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
@@ -235,7 +248,7 @@ def _listed(names: list[str], shown: int = 10) -> str:
 
 
 def _check(context: Context, first: StageReport) -> Result:
-    found = check.run(context)
+    found = check.run(context, time.perf_counter() - first.started)
     lines = (*first.facts["summary"], *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}

@@ -95,10 +95,11 @@ class ViewCost:
 
 
 def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: bool) -> None:
-    """Write views.json, and with `with_pictures` a PNG of every view."""
+    """Write views.json, and with `with_pictures` a PNG of every view; those of the very same views stay anyway."""
     workspace, image_id = task.source.workspace, task.source.image_id
+    stay = with_pictures or is_done(task)
     stale = set(workspace.views(image_id).parent.glob("*.png"))
-    if with_pictures:
+    if stay:
         stale -= {workspace.view(image_id, item.view.name) for item in pictures}
     for path in sorted(stale):
         path.unlink(missing_ok=True)  # of other settings: views.json would not list it
@@ -110,7 +111,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
         workspace.views(image_id),
         {
             "fingerprint": task.fingerprint,
-            "pictures": with_pictures,
+            "pictures": stay,
             "scale": task.source.scale,
             "views": [
                 {

@@ -14,6 +14,7 @@ class NoEnhancement(Strategy):
     """The picture as it was taken."""
 
     needs_colour: ClassVar[bool] = False
+    changes: ClassVar[bool] = False
     beside: ClassVar[bool] = False
     one_sun_minutes: ClassVar[float] = 0.0
     name: Literal["none"] = "none"

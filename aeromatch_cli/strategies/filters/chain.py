@@ -9,6 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Candidates, IntArray, PairGeometry, Verdict
+from aeromatch_cli.strategies.filters.gate import shortage
+
+# Part of the fingerprint of every verdict; raised when composing changes results.
+VERSION = 1
 
 
 class Filter(Protocol):
@@ -21,32 +25,42 @@ def apply_chain(filters: Sequence[Filter], candidates: Candidates, geometry: Pai
     """One verdict on the matches: each filter sees what those before it left.
 
     A refusal ends the chain and drops everything. Otherwise the last model wins, with its errors, and the pair is
-    verified as long as the filters after it leave matches; without a model it is not verifiable, and what the filters
-    left is kept. Reject counts are summed by filter name.
+    verified if the filters after it leave as many matches as the filter of that model asks for inliers; without a model
+    it is not verifiable, and what the filters left is kept. Reject counts are summed by filter name.
     """
     alive = np.arange(len(candidates))
     rejected: dict[str, int] = {}
     found, judged = Verdict(keep=_mask(len(alive), alive), state="not verifiable", reason="no filter was given"), alive
+    judge: Filter | None = None
     for one in filters:
         verdict, given = one(candidates.take(alive), geometry, seed), alive
         alive = given[verdict.keep]
         rejected[one.name] = rejected.get(one.name, 0) + len(given) - len(alive)
         if verdict.state == "rejected" or len(alive) == 0:
-            return _refusal(len(candidates), found, verdict, one.name, rejected)
+            if verdict.state == "not verifiable" and found.state == "verified":
+                reason = _shortage(judge, len(given), len(judged)) or f"{one.name} left no match"
+                verdict = replace(verdict, state="rejected", reason=reason)
+            return _refusal(len(candidates), verdict, rejected)
         if verdict.state == "verified" or found.state != "verified":
-            found, judged = verdict, given
+            found, judged, judge = verdict, given, one
+    if found.state == "verified" and judge is not None and (few := _shortage(judge, len(alive), len(judged))):
+        rejected[judge.name] += len(alive)
+        return _refusal(len(candidates), replace(found, state="rejected", reason=few), rejected)
     errors = np.full(len(candidates), np.nan, dtype=np.float32)
     if found.errors_px is not None:
         errors[judged] = found.errors_px
     return replace(found, keep=_mask(len(candidates), alive), errors_px=errors, rejected=rejected)
 
 
-def _refusal(count: int, found: Verdict, last: Verdict, name: str, rejected: dict[str, int]) -> Verdict:
-    """Nothing is kept: a filter refused the pair, or none of its matches is left."""
+def _shortage(judge: Filter | None, left: int, matches: int) -> str:
+    """Why what is left of its inliers is too few for the filter that verified the pair, "" if it is not."""
+    return shortage(left, matches, getattr(judge, "min_inliers", 0))
+
+
+def _refusal(count: int, verdict: Verdict, rejected: dict[str, int]) -> Verdict:
+    """Nothing is kept, no model told."""
     nothing = np.zeros(count, dtype=bool)
-    if last.state == "not verifiable" and found.state == "verified":
-        return Verdict(keep=nothing, state="rejected", reason=f"{name} left no match", rejected=rejected)
-    return Verdict(keep=nothing, state=last.state, reason=last.reason, rejected=rejected)
+    return Verdict(keep=nothing, state=verdict.state, reason=verdict.reason, rejected=rejected)
 
 
 def _mask(count: int, which: IntArray) -> BoolArray:

@@ -19,6 +19,11 @@ _SHARES = (1.0, 0.5, 0.25)
 Distance = Callable[[FloatArray, FloatArray], FloatArray]
 
 
+def shortage(inliers: int, matches: int, needed: int) -> str:
+    """Why so many inliers of so many matches do not verify a pair, "" if they are enough."""
+    return f"{inliers} inliers of {matches} matches, {needed} needed" if inliers < needed else ""
+
+
 class Gated(Strategy):
     """What filters that verify by one model have in common."""
 
@@ -45,8 +50,8 @@ class Gated(Strategy):
     ) -> str:
         """Why inliers (N,) of the matches (N, 2) do not verify the pair, "" if they do."""
         count = int(inliers.sum())
-        if count < self.min_inliers:
-            return f"{count} inliers of {len(inliers)} matches, {self.min_inliers} needed"
+        if few := shortage(count, len(inliers), self.min_inliers):
+            return few
         errors, wrong = distance_px(points0_px, points1_px), chance_errors_px(distance_px, points0_px, points1_px)
         expected = min(
             log10_false_alarms(points0_px, points1_px, inliers & (errors <= part), wrong, part, sample)

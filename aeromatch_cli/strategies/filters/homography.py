@@ -15,7 +15,10 @@ from aeromatch_cli.strategies.filters.gate import Gated
 
 
 class Homography(Gated):
-    """Keeps the matches that one plane explains, estimated by PoseLib's LO-RANSAC."""
+    """Keeps the matches that one plane explains, estimated by PoseLib's LO-RANSAC.
+
+    The plane's relative rotation is ambiguous and not given: behind this filter no attitude is judged by its matches.
+    """
 
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})

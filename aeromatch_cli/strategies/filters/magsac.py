@@ -16,7 +16,10 @@ from aeromatch_cli.strategies.filters.gate import Gated
 
 
 class Magsac(Gated):
-    """Keeps the inliers of a fundamental matrix that weighs matches over all noise levels up to the threshold."""
+    """Keeps the inliers of a fundamental matrix that weighs matches over all noise levels up to the threshold.
+
+    A fundamental matrix holds no relative rotation: behind this filter no attitude is judged by its matches.
+    """
 
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
