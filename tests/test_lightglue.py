@@ -13,11 +13,13 @@ import pytest
 import torch
 from make_lightglue import SIFT, features, seeded_tensors, write
 from pydantic import ValidationError
+from safetensors.torch import save_file
 from torch import Tensor
 
 from aeromatch_cli.data import Camera, Features, FloatArray, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, Side
+from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, read_calibration
 from aeromatch_cli.strategies.matchers import lightglue
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue, wrapped_rad
 
@@ -244,7 +246,7 @@ class Recorder:
 
 
 def given_to(recorder: Recorder, weights: str, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Side, Side]]:
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, "cpu", {}))
+    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, Calibration(), "cpu", {}))
     recipe(weights)(by_hand(), by_hand(), GEOMETRY)
     return recorder.given
 
@@ -301,3 +303,28 @@ def test_a_replaced_file_is_loaded_again(tmp_path: Path) -> None:
     write(path, {"conv1.weight": torch.zeros(3, 3)})
     with pytest.raises(ConfigError, match="not a LightGlue"):
         matcher(features(50), features(50), GEOMETRY)
+
+
+def test_scores_and_threshold_are_those_of_the_calibration(tmp_path: Path) -> None:
+    tensors = {name: value.contiguous() for name, value in seeded_tensors(SIFT).items()}
+    plain, stretched = tmp_path / "plain.safetensors", tmp_path / "stretched.safetensors"
+    save_file(tensors, plain)
+    save_file(tensors, stretched, {CALIBRATION_KEY: "2.0 1.0"})
+    sides = features(60), noisy(features(60), 2.0)
+    before = as_dict(recipe(str(plain), threshold=0.0)(*sides, GEOMETRY))
+    after = as_dict(recipe(str(stretched), threshold=0.5)(*sides, GEOMETRY))
+    # sigmoid(2 x + 1) >= 0.5 where x >= -0.5.
+    expected = {pair: 1 / (1 + np.exp(-2 * np.log(s / (1 - s)) - 1)) for pair, s in before.items()}
+    expected = {pair: score for pair, score in expected.items() if score >= 0.5}
+    assert 0 < len(expected) < len(before)
+    assert after.keys() == expected.keys()
+    for pair, score in after.items():
+        assert score == pytest.approx(expected[pair], abs=1e-5)
+
+
+@pytest.mark.parametrize("text", ["", "one two", "1", "0 1", "-1 0", "nan 0", "1 2 3"])
+def test_other_calibrations_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "weights.safetensors"
+    save_file({name: value.contiguous() for name, value in seeded_tensors(SIFT).items()}, path, {CALIBRATION_KEY: text})
+    with pytest.raises(ConfigError, match="calibration"):
+        read_calibration(path)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.weights import read_tensors
@@ -20,6 +24,51 @@ _LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
 _POSITION_KEY = "posenc.Wr.weight"
 _WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
 _MAX_NAMED = 3
+# Entry of a safetensors file's metadata: slope and offset, separated by a space.
+CALIBRATION_KEY = "calibration"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What makes a network's scores the share of matches that are right: log odds = slope * log odds + offset.
+
+    Source: Platt, Probabilistic outputs for support vector machines, 1999. Without one, scores stay as they are.
+    """
+
+    slope: float = 1.0
+    offset: float = 0.0
+
+    def calibrated(self, scores: FloatArray) -> FloatArray:
+        """Scores (N,) in 0-1 of the network as probabilities (N,)."""
+        if self == Calibration():
+            return np.asarray(scores, np.float64)
+        bounded = np.clip(np.asarray(scores, np.float64), 1e-9, 1.0 - 1e-9)
+        return np.asarray(1.0 / (1.0 + np.exp(-(self.slope * np.log(bounded / (1.0 - bounded)) + self.offset))))
+
+    def score_of(self, probability: float) -> float:
+        """The network's score that means this probability; 0 and 1 stay."""
+        if self == Calibration() or not 0.0 < probability < 1.0:
+            return probability
+        return 1.0 / (1.0 + math.exp((self.offset - math.log(probability / (1.0 - probability))) / self.slope))
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Of a weights file; the neutral one where it has none. Raises ConfigError where what it has is no calibration."""
+    from safetensors import SafetensorError, safe_open
+
+    if path.suffix != ".safetensors":
+        return Calibration()
+    try:
+        with safe_open(path, framework="np") as content:
+            text = (content.metadata() or {}).get(CALIBRATION_KEY)
+        if text is None:
+            return Calibration()
+        slope, offset = (float(part) for part in text.split())
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        raise ConfigError(f"weights file {path}: its calibration cannot be read ({error})") from error
+    if not (slope > 0.0 and math.isfinite(slope + offset)):
+        raise ConfigError(f"weights file {path}: calibration {text!r} is no positive slope and an offset")
+    return Calibration(slope, offset)
 
 
 def canonical_keys(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

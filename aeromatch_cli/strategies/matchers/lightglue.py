@@ -50,7 +50,9 @@ class LightGlue(Search):
         description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`).",
         json_schema_extra={"path": "or name"},
     )
-    threshold: float = Field(0.1, ge=0.0, le=1.0, description="Smallest probability of a match.")
+    threshold: float = Field(
+        0.1, ge=0.0, le=1.0, description="Smallest probability of a match, as far as the weights are calibrated."
+    )
     overlap: bool = Field(
         True, description="Only keypoints that the other image may show, as far as poses and ground tell, are compared."
     )
@@ -103,7 +105,7 @@ class LightGlue(Search):
             side0, side1 = self._view(features0, int(view0), seen0), self._view(features1, int(view1), seen1)
             if len(side0.rows) and len(side1.rows):
                 pairs, scores = matcher.match(side0, side1)
-                parts.append((side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores.astype(np.float64)))
+                parts.append((side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores))
         found = joined(parts)
         if where is not None:
             found = where.within(found, features0, features1)
@@ -165,13 +167,14 @@ class _Side:
 @dataclass(frozen=True, eq=False)
 class _Matcher:
     network: Any
+    calibration: Any
     device: str
     options: dict[str, float]
 
     def match(self, side0: _Side, side1: _Side) -> tuple[IntArray, FloatArray]:
-        """Row pairs (M, 2) and scores (M,)."""
+        """Row pairs (M, 2) and their probabilities (M,)."""
         pairs, scores = self.network.match(self._tensors(side0), self._tensors(side1), **self.options)
-        return pairs.cpu().numpy(), scores.cpu().numpy()
+        return pairs.cpu().numpy(), self.calibration.calibrated(scores.cpu().numpy())
 
     def _tensors(self, side: _Side) -> Any:
         import torch
@@ -202,15 +205,17 @@ def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _M
     """The network, built once per process; the stamp makes a replaced file load again."""
     import torch
 
-    from aeromatch_cli.nets.lightglue_file import load_lightglue
+    from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 
     device = "cuda" if recipe.device == "auto" and torch.cuda.is_available() else "cpu"
     network = load_lightglue(Path(path), device=device)
     native = torch.cuda.is_bf16_supported() if device == "cuda" else _has_bfloat16()
     if recipe.precision == "bfloat16" or (recipe.precision == "auto" and native):
         network = network.to(dtype=torch.bfloat16)
-    names = ("threshold", "depth_confidence", "width_confidence")
-    return _Matcher(network, device, {name: getattr(recipe, name) for name in names})
+    calibration = read_calibration(Path(path))
+    options = {name: getattr(recipe, name) for name in ("depth_confidence", "width_confidence")}
+    options["threshold"] = calibration.score_of(recipe.threshold)
+    return _Matcher(network, calibration, device, options)
 
 
 def _has_bfloat16() -> bool:
