@@ -226,7 +226,7 @@ def _line(label: str, rows: Sequence[Row], right: int, direct_error_px: float) -
         f"{wrong}",
         f"{100 * correct / max(correct + wrong, 1):.1f} %",
         f"{error:.2f}" if np.isfinite(error) else "-",
-        f"{error / direct_error_px:.2f}" if direct_error_px > 0 else "-",
+        f"{error / direct_error_px:.2f}" if np.isfinite(error) and direct_error_px > 0 else "-",
         f"{np.median([r['ms'] for r in rows]):.1f}",
     ]
     return "| " + " | ".join(cells) + " |"
