@@ -28,18 +28,17 @@ from lightglue_training.blocks import Pair, block_pairs
 from lightglue_training.costs import block_table, forward_table, jobs_table
 from lightglue_training.data import pictures as pictures_of
 from lightglue_training.data import read_block, read_groups, write_block, write_groups
-from lightglue_training.validation import Found, compared
+from lightglue_training.validation import Found, compared, together
 from training_blocks import render
 
 from aeromatch_cli.nets.lightglue import LightGlue
-from aeromatch_cli.nets.lightglue_file import load_lightglue
+from aeromatch_cli.nets.lightglue_file import Calibration, load_lightglue, read_calibration
 from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import write_text
 
 TIMED_KEYPOINTS = 2048
 FIRST_BLOCK = 1000  # numbers of the blocks, far from those trained on
-EDGES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 def pairs_of(args: argparse.Namespace) -> dict[str, list[Pair]]:
@@ -77,12 +76,7 @@ def accuracy_rows(network: LightGlue, sets: dict[str, list[Pair]]) -> tuple[list
             "pairs": name, "count": len(pairs), "possible": ratio.possible, "precision": ratio.precision,
             "ratio_recall": ratio.recall, "recall": recall, "ratio_wrong": int((~ratio.right).sum()), "wrong": wrong,
         })  # fmt: skip
-    together = Found(
-        np.concatenate([f.scores for f in everything]),
-        np.concatenate([f.right for f in everything]),
-        sum(f.possible for f in everything),
-    )
-    return rows, together
+    return rows, together(everything)
 
 
 def accuracy_table(rows: Sequence[dict[str, Any]]) -> str:
@@ -101,13 +95,10 @@ def accuracy_table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def reliability_table(found: Found) -> str:
+def reliability_table(found: Found, calibration: Calibration) -> str:
     lines = ["| score | matches | mean score | right |", "|---|---|---|---|"]
-    for low, high in zip((0.0, *EDGES), EDGES, strict=False):
-        which = (found.scores > low) & (found.scores <= high)
-        if which.any():
-            scores, right = found.scores[which], found.right[which]
-            lines.append(f"| {low:.1f}-{high:.1f} | {which.sum()} | {scores.mean():.3f} | {right.mean():.3f} |")
+    for low, high, matches, mean, right in found.reliability(calibration):
+        lines.append(f"| {low:.1f}-{high:.1f} | {matches} | {mean:.3f} | {right:.3f} |")
     return "\n".join(lines)
 
 
@@ -148,8 +139,9 @@ def main() -> None:
     sets = pairs_of(args)
     text, facts = [], {}
     if "accuracy" in args.parts:
-        facts["accuracy"], together = accuracy_rows(network, sets)
-        text += [accuracy_table(facts["accuracy"]), "Whether scores mean what they say:", reliability_table(together)]
+        facts["accuracy"], found = accuracy_rows(network, sets)
+        text += [accuracy_table(facts["accuracy"]), "Whether scores mean what they say:"]
+        text += [reliability_table(found, read_calibration(args.weights))]
         print("\n\n".join(text), flush=True)
     if "speed" in args.parts:
         where = f"{args.threads} threads" if device == "cpu" else torch.cuda.get_device_name()

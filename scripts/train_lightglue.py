@@ -11,7 +11,8 @@ left out, and the pairs of these two. Beside it stands the mutual ratio test (0.
 
 The same on the CPU and on a CUDA device, both in bfloat16; the batch of a CUDA device is larger, the number of pairs is
 the same. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it was. Writes
-OUT/lightglue.safetensors (float16), OUT/log.json and OUT/curves.png.
+OUT/lightglue.safetensors (float16, with the calibration of its scores on the validation pairs), OUT/log.json,
+OUT/curves.png and OUT/reliability.png.
 """
 
 from __future__ import annotations
@@ -31,12 +32,14 @@ from lightglue_training.batches import Batch, batch_of, piece
 from lightglue_training.blocks import LEAST_PARTNERS, Pair
 from lightglue_training.data import prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
-from lightglue_training.validation import report, thinned
+from lightglue_training.validation import Found, compared, fitted, report, thinned, together
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration
 
 DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
+ALL_KEYPOINTS = 4096
 REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
 
 
@@ -173,18 +176,18 @@ def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, floa
     return float(loss.total.detach()), loss.partner, loss.none
 
 
-def validation_sets(data: Path) -> dict[str, list[Pair]]:
-    """Unseen pairs by name, cut so that validation takes seconds."""
+def validation_sets(data: Path, keypoints: tuple[int, int] = (512, 1024)) -> dict[str, list[Pair]]:
+    """Unseen pairs by name, keypoints of homographies and of rendered pairs cut so that validation takes seconds."""
     first = [p for path in sorted((data / "unseen1").glob("*.npz")) for p in read_groups(path)]
     second = [p for path in sorted((data / "unseen2").glob("*.npz")) for p in read_block(path)]
     first, second = ([pair for pair in pairs if usable(pair)] for pairs in (first, second))
     turned = [pair for pair in first if pair.side0.angles_rad.any()]
     upright = [pair for pair in first if not pair.side0.angles_rad.any()]
     return {
-        "homography, turned": thinned(turned, 512, 40),
-        "homography, upright": thinned(upright, 512, 40),
-        "rendered, one sun": thinned([pair for pair in second if not pair.two_suns], 1024, 40),
-        "rendered, two suns": thinned([pair for pair in second if pair.two_suns], 1024, 40),
+        "homography, turned": thinned(turned, keypoints[0], 40),
+        "homography, upright": thinned(upright, keypoints[0], 40),
+        "rendered, one sun": thinned([pair for pair in second if not pair.two_suns], keypoints[1], 40),
+        "rendered, two suns": thinned([pair for pair in second if pair.two_suns], keypoints[1], 40),
     }
 
 
@@ -207,9 +210,38 @@ def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path)
 
 
-def main() -> None:
+def finish(run: Run, out: Path) -> None:
+    """Weights with their calibration, log and reliability plot."""
     from safetensors.torch import save_file
 
+    network = run.average.eval()
+    # With every keypoint, as in use: where partners were cut away fewer matches are right.
+    sets = validation_sets(out / "data", (ALL_KEYPOINTS, ALL_KEYPOINTS))
+    found = together([compared(network, pairs)[1] for pairs in sets.values()])
+    calibration = fitted(found)
+    weights = {name: value.half().cpu().contiguous() for name, value in network.state_dict().items()}
+    metadata = {CALIBRATION_KEY: f"{calibration.slope:.4f} {calibration.offset:.4f}"}
+    save_file(weights, out / "lightglue.safetensors", metadata)
+    (out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
+    draw_reliability({"raw": Calibration(), "calibrated": calibration}, found, out / "reliability.png")
+
+
+def draw_reliability(ways: dict[str, Calibration], found: Found, path: Path) -> None:
+    """Share of right matches by score."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.5, 4.5), dpi=110, layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=0.8)
+    for name, calibration in ways.items():
+        rows = found.reliability(calibration)
+        axes.plot([row[3] for row in rows], [row[4] for row in rows], marker="o", label=name)
+    axes.set(xlabel="score", ylabel="share of right matches", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    axes.legend(frameon=False)
+    figure.savefig(path)
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
@@ -233,9 +265,7 @@ def main() -> None:
     prepare(args.out / "data", args.data, args.trained_on.split(","), args.unseen.split(","), args)
     run = None if args.only_data else train(args, device)
     if run is not None:
-        weights = {name: value.half().cpu().contiguous() for name, value in run.average.state_dict().items()}
-        save_file(weights, args.out / "lightglue.safetensors")
-        (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
+        finish(run, args.out)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,10 @@ from lightglue_training.data import read_groups, write_groups
 from lightglue_training.homographies import SIZE_PX, make_group
 from lightglue_training.loss import loss_of
 from lightglue_training.sides import NONE, UNKNOWN, Partners, Seen, partners
-from lightglue_training.validation import Found, by_ratio, judged, thinned
+from lightglue_training.validation import Found, by_ratio, fitted, judged, thinned
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.lightglue_file import Calibration
 
 
 @pytest.fixture(scope="module")
@@ -145,3 +146,17 @@ def test_the_ratio_test_is_judged_by_truth() -> None:
     assert found.possible == 40
     assert (found.right.sum(), (~found.right).sum()) == (40, 10)  # unknown ones are not counted
     assert len(thinned([pair] * 5, 30, 2)) == 2
+
+
+def test_a_calibration_is_found_again():
+    rng = np.random.default_rng(3)
+    scores = rng.uniform(0.01, 0.99, 40_000)
+    truth = Calibration(1.4, 0.6)
+    found = Found(scores, rng.random(len(scores)) < truth.calibrated(scores), len(scores))
+    calibration = fitted(found)
+    assert calibration.slope == pytest.approx(1.4, abs=0.05)
+    assert calibration.offset == pytest.approx(0.6, abs=0.05)
+    for low, high, matches, mean, right in found.reliability(calibration):
+        assert low < mean <= high
+        assert right == pytest.approx(mean, abs=4.0 * np.sqrt(0.25 / matches))
+    assert max(abs(right - mean) for *_, mean, right in found.reliability(Calibration())) > 0.1

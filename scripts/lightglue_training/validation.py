@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from aeromatch_cli.nets.lightglue import LightGlue
+from aeromatch_cli.nets.lightglue_file import Calibration
 from aeromatch_cli.strategies.matchers.scan import mutual_nearest
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair
 from lightglue_training.sides import UNKNOWN, Array
 
 RATIO, LEAST_SCORE = 0.8, 0.01
+EDGES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,37 @@ class Found:
         right = np.cumsum(self.right[order])
         enough = np.flatnonzero(right >= recall * self.possible)
         return int(enough[0] + 1 - right[enough[0]]) if len(enough) else -1
+
+    def reliability(self, calibration: Calibration) -> list[tuple[float, float, int, float, float]]:
+        """Per bin of calibrated scores that is not empty: its edges, matches, mean score, share of right ones."""
+        scores = calibration.calibrated(self.scores)
+        rows = []
+        for low, high in pairwise(EDGES):
+            which = (scores > low) & (scores <= high)
+            if which.any():
+                rows.append((low, high, int(which.sum()), float(scores[which].mean()), float(self.right[which].mean())))
+        return rows
+
+
+def together(parts: Sequence[Found]) -> Found:
+    return Found(
+        np.concatenate([part.scores for part in parts]),
+        np.concatenate([part.right for part in parts]),
+        sum(part.possible for part in parts),
+    )
+
+
+def fitted(found: Found) -> Calibration:
+    """Slope and offset of largest likelihood (logistic regression on log odds, Newton's method)."""
+    bounded = np.clip(found.scores.astype(np.float64), 1e-9, 1.0 - 1e-9)
+    columns = np.stack([np.log(bounded / (1.0 - bounded)), np.ones(len(bounded))], axis=1)
+    weights = np.array([1.0, 0.0])
+    for _ in range(30):
+        odds = 1.0 / (1.0 + np.exp(-columns @ weights))
+        slope = columns.T @ (found.right - odds)
+        bend = (columns * (odds * (1.0 - odds))[:, None]).T @ columns
+        weights = weights + np.linalg.solve(bend + 1e-9 * np.eye(2), slope)
+    return Calibration(float(weights[0]), float(weights[1]))
 
 
 def judged(answers: Iterable[tuple[Pair, Array, Array]]) -> Found:
