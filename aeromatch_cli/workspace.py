@@ -212,7 +212,12 @@ def _alive(pid: int) -> bool:
         return False
     except PermissionError:
         return True
-    return True
+    try:
+        facts = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return True  # no Linux
+    # A zombie was killed and its parent has not asked for it yet: it writes nothing any more.
+    return facts.rpartition(")")[2].split()[0] != "Z"
 
 
 def fingerprint(*parts: Any) -> str:

@@ -99,7 +99,8 @@ def test_a_worker_that_dies_is_blamed_and_the_rest_is_done(tmp_path: Path) -> No
     assert [one.value for one in found] == [None if number in (3, 9) else number**2 for number in range(12)]
     for number in (3, 9):
         assert "worker process died" in found[number].error
-        assert len((tmp_path / str(number)).read_text()) == 2  # in flight with others, then alone
+        # In flight with another one, whoever it was, and then alone; or alone at once.
+        assert len((tmp_path / str(number)).read_text()) in (1, 2)
     assert [one.value for one in again] == [1, 4]
     assert progress.told.count("+") == 14
     assert progress.told[0] == "extract 12"

@@ -320,6 +320,7 @@ def test_a_run_killed_again_and_again_ends_like_an_uninterrupted_one(done_site):
             os.killpg(process.pid, signal.SIGKILL)
             killed += 1
         process.communicate()
+        assert nothing_lives(process.pid)
     assert killed >= 2
     outcome = done_site("run", "--workspace", work, "--jobs", "1")
     assert outcome.code == 0

@@ -93,11 +93,13 @@ def test_a_killed_writer_leaves_no_half_file(tmp_path: Path) -> None:
     remove_stale_temporaries(tmp_path)
     assert len(files_below(tmp_path)) == 2  # its process lives: the scratch file is not touched
     process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
+    # It is dead, though nobody has asked for it yet.
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     assert path.read_bytes() == b"old"
     Workspace(tmp_path).create()
     assert files_below(tmp_path) == ["row.npz"]
+    process.wait()
+    process.stdout.close()
 
 
 def test_stale_temporaries_of_other_machines_and_foreign_files_stay(
