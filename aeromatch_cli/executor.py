@@ -141,7 +141,7 @@ class Executor:
 
     def __init__(self, kind: str = "serial", jobs: int = 0, progress: Progress | None = None) -> None:
         self.kind = kind
-        self.jobs = jobs or available_cores()
+        self.jobs = 1 if kind == "serial" else jobs or available_cores()
         self.progress = progress or SilentProgress()
         self._pool: ProcessPoolExecutor | None = None
         self._client: Any = None
@@ -175,7 +175,7 @@ class Executor:
         try:
             if self.kind == "dask":
                 return self._run_dask(function, tasks)
-            if self.kind == "serial" or self.jobs == 1 or len(tasks) <= 1:
+            if self.jobs == 1 or len(tasks) <= 1:
                 return self._run_serial(function, tasks)
             return self._run_processes(function, tasks)
         finally:

@@ -105,7 +105,6 @@ _ARCHIVE_FAULTS = (
     ValueError,
     TypeError,
     EOFError,
-    NotImplementedError,
     RuntimeError,
     struct.error,
     zipfile.BadZipFile,

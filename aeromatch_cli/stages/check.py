@@ -160,7 +160,7 @@ def _estimate(
     context: Context, largest_px: int, images: Mapping[str, _Tried], pairs: Sequence[_Tried], reading_s: float
 ) -> dict[str, Any]:
     """largest_px: of the image, or its views, that needs most memory. images, pairs: the sampled ones."""
-    count, jobs = len(context.block.images), _jobs(context)
+    count, jobs = len(context.block.images), context.executor.jobs
     seconds_image = _mean([tried.seconds for tried in images.values()])
     seconds_pair = _mean([tried.seconds for tried in pairs])
     descriptors = max((len(tried.features.descriptors) for tried in images.values() if tried.features), default=0)
@@ -189,10 +189,6 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def _jobs(context: Context) -> int:
-    return 1 if context.executor.kind == "serial" else context.executor.jobs
-
-
 def _existing(path: Path) -> Path:
     while not path.exists():
         path = path.parent
@@ -205,8 +201,8 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
     return (
         f"images    {estimate['readable_images']} of {images} readable",
         f"pairs     {estimate['pairs']}",
-        f"time      {duration} with {_jobs(context)} jobs",
-        f"memory    about {estimate['memory_mb']} MB with {_jobs(context)} jobs",
+        f"time      {duration} with {context.executor.jobs} jobs",
+        f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -19,6 +19,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.stages.common import Context
 from aeromatch_cli.synthetic import load_truth
 from lightglue_training.sides import Partners, Seen, partners, seen
 
@@ -56,17 +57,21 @@ def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[s
 
 def _sides(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tuple[str, Seen]]:
     with tempfile.TemporaryDirectory() as scratch:
-        block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
-        block["cameras"] = str(folder / "block.json")
-        own = [f"extract.keypoints={keypoints}", "pairs=exhaustive", *recipe]
-        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        context, _ = pairs.prepare(load("baseline", own, block, **top), Executor("serial", 1))
+        context = prepared(folder, scratch, (f"extract.keypoints={keypoints}", "pairs=exhaustive", *recipe))
         for image in context.block.images:
             task = extract.task_of(context, image.image_id)
             extract.run_task(task)
             features = read_features(task.path)
             if len(features.descriptors):
                 yield image.name, seen(features)
+
+
+def prepared(folder: Path, workspace: str, changes: Sequence[str]) -> Context:
+    """A rendered block as preset `baseline` with these settings reads it, with noisy poses."""
+    block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
+    block["cameras"] = str(folder / "block.json")
+    top = {"workspace": workspace, "run": {"executor": "serial", "jobs": 1}}
+    return pairs.prepare(load("baseline", list(changes), block, **top), Executor("serial", 1))[0]
 
 
 def _suns(folder: Path) -> dict[str, int]:

@@ -15,17 +15,15 @@ import numpy as np
 import torch
 from common import peak_mb
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import Features, PairGeometry
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import load_lightglue
-from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.stages import extract
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue as Matcher
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 from lightglue_training.batches import as_side
-from lightglue_training.blocks import Pair
+from lightglue_training.blocks import Pair, prepared
 
 OFFICIAL = Dimensions(input_dim=128, descriptor_dim=256, n_layers=9, num_heads=4, add_scale_ori=True)
 REPEATS = 20
@@ -146,11 +144,7 @@ def block_table(folder: Path, weights: Path, keypoints: int) -> str:
 def _block_features(folder: Path, keypoints: int) -> list[tuple[Features, Features, PairGeometry]]:
     """Features of preset `baseline` and geometry of the block's pairs, poses noisy."""
     with tempfile.TemporaryDirectory() as scratch:
-        block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
-        block["cameras"] = str(folder / "block.json")
-        top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        settings = load("baseline", [f"extract.keypoints={keypoints}"], block, **top)
-        context, _ = pairs.prepare(settings, Executor("serial", 1))
+        context = prepared(folder, scratch, (f"extract.keypoints={keypoints}",))
         extract.run(context)
         features = {i.image_id: read_features(context.workspace.features(i.image_id)) for i in context.images()}
         chosen = [pair for row in context.rows().values() for pair in row]
