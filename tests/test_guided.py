@@ -9,7 +9,7 @@ from aeromatch_cli.data import Features, Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project, undistort
 from aeromatch_cli.geometry.epipolar import essential, relative_pose
 from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, search_windows, stereo_of
-from aeromatch_cli.strategies.matchers.guided import nearby
+from aeromatch_cli.strategies.matchers.guided import Found, nearby, search_again
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1000, 750, (900.0, 500.0, 375.0, -0.03))
@@ -264,3 +264,24 @@ def test_pairs_with_ample_matches_are_not_searched_again():
     assert len(plain.indices) >= 30
     settled = Nearest(ratio=0.6, ample=30, guided=True)(first, second, pair_of(POSE0, POSE1))
     np.testing.assert_array_equal(settled.indices, plain.indices)
+
+
+@pytest.mark.parametrize(("probability", "stays"), [(0.9, True), (0.005, False)])
+def test_matches_that_only_a_network_sees_stay_where_place_and_size_agree(probability, stays):
+    rng = np.random.default_rng(9)
+    seen = scene(rng, 400)
+    first, second = noisy_twins(np.arange(400), rng)
+    second[300:] = 160 - np.minimum(first[300:], 160)  # as different as things can look
+    sides = [described(s, d) for s, d in zip(seen, (first, second), strict=True)]
+    # A network found all of them, and takes half of these for each other.
+    columns = np.arange(400)
+    columns[350:] = np.roll(columns[350:], 1)
+    costs = np.where(np.arange(400) < 300, 0.05, 1.0 - probability)
+    asked = Found(np.arange(400), columns, costs), *sides, pair_of(POSE0, POSE1), np.ones((1, 1), bool)
+    plain, kept = (search_again(*asked, keep=keep) for keep in (False, True))
+    assert (plain.rows < 300).all()
+    added = kept.rows[len(plain.rows) :]
+    assert (added < 350).mean() >= 0.95 if stays else len(added) == 0
+    assert len(added) > 45 or not stays
+    assert np.array_equal(kept.rows[: len(plain.rows)], plain.rows)
+    assert len(np.unique(kept.rows)) == len(kept.rows) == len(np.unique(kept.columns))

@@ -29,8 +29,8 @@ OF_VIEWS = {"view_sizes_px", "view_angles_deg", "view_directions", "view_gsd_m",
 
 
 def recipe(weights: str, **settings: Any) -> LightGlue:
-    """In full precision, so that tests can compare to the last digits."""
-    return LightGlue(weights=weights, **{"precision": "float32", **settings})
+    """In full precision, so that tests can compare to the last digits; the network is always asked."""
+    return LightGlue(weights=weights, **{"precision": "float32", "ample": 10**6, "enough": 10**6, **settings})
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -265,6 +265,18 @@ def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch
     np.testing.assert_allclose(first.descriptors[0, 0, :3].numpy(), [0.6, 0.8, 0.0], atol=1e-6)
     np.testing.assert_allclose(torch.linalg.norm(first.descriptors, dim=2).numpy(), [[1.0, 1.0]], atol=1e-6)
     assert (first.places.dtype, first.descriptors.dtype) == (torch.float32, torch.float32)
+
+
+@pytest.mark.parametrize(("count", "asked"), [(400, False), (200, True)])
+def test_the_network_is_asked_where_the_ratio_test_leaves_few(
+    weights: str, monkeypatch: pytest.MonkeyPatch, count: int, asked: bool
+) -> None:
+    recorder = Recorder(SIFT)
+    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, Calibration(), "cpu", {}))
+    matches = LightGlue(weights=weights)(features(count), noisy(features(count), 2.0), GEOMETRY)
+    assert bool(recorder.given) == asked
+    # The ratio test's, or what the network says.
+    assert len(matches.indices) == (0 if asked else pytest.approx(count, rel=0.05))
 
 
 def test_networks_without_scale_and_orientation_get_none(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:

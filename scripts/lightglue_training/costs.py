@@ -121,13 +121,13 @@ def _work(weights: Path, pair: Pair, threads: int) -> tuple[float, float]:
 
 def block_table(folder: Path, weights: Path, keypoints: int) -> str:
     """The matcher over all pairs of a rendered block, with what saves time switched on one after the other."""
-    never = keypoints + 1
+    always = {"ample": keypoints + 1, "enough": keypoints + 1}
     steps: Mapping[str, dict[str, Any]] = {
-        "every keypoint": {"overlap": False, "ample": never, **EVERYTHING},
-        "+ only the predicted overlap": {"ample": never, **EVERYTHING},
-        "+ early exit": {"ample": never, "width_confidence": -1.0},
-        "+ pruning": {"ample": never},
-        "+ ratio test where ample (default)": {},
+        "every keypoint": {"overlap": False, **always, **EVERYTHING},
+        "+ only the predicted overlap": {**always, **EVERYTHING},
+        "+ early exit": {**always, "width_confidence": -1.0},
+        "+ pruning": always,
+        "+ only where the ratio test leaves few (default)": {},
     }
     matchers = {name: Matcher(weights=str(weights), **settings) for name, settings in steps.items()}
     block = _block_features(folder, keypoints)

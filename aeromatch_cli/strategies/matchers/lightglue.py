@@ -22,28 +22,29 @@ from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.geometry.prediction import Windows
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.guided import Found
+from aeromatch_cli.strategies.matchers.guided import Found, search_again
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 from aeromatch_cli.strategies.matchers.search import Search, Where, joined
 
+# Cost at least of matches that are there without the network's having found them, beside those of 1 - probability.
+_DOUBTFUL = 0.7
 # Around the keypoints that are left of a view, as in training.
 _FRAME_PX = 4.0
 
 
 class LightGlue(Search):
-    """LightGlue (Lindenberger et al., ICCV 2023) with weights from a file.
+    """LightGlue (Lindenberger et al., ICCV 2023) for the pairs that the mutual ratio test leaves poor.
 
-    Pairs that the mutual ratio test settles (`ample`) never reach the network, which takes a hundred times as long.
+    Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
 
-    version: ClassVar[int] = 2
-    quick_differs: ClassVar[bool] = True
+    version: ClassVar[int] = 3
     name: Literal["lightglue"] = "lightglue"
-    ample: int = Field(
-        500,
+    enough: int = Field(
+        250,
         ge=1,
-        description="Where the mutual ratio test finds so many matches, its matches are taken, and network, enhanced "
-        "pictures and guided search left out: they cost more than they add. Larger than `extract.keypoints`: never.",
+        description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
+        "asked: it takes five times as long. Larger than `extract.keypoints`: it is always asked.",
     )
     weights: str | None = Field(
         None,
@@ -59,7 +60,7 @@ class LightGlue(Search):
     depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
     width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
     max_keypoints: int = Field(
-        4096, ge=1, description="Strongest descriptors kept per view; time grows with its square."
+        2048, ge=1, description="Strongest descriptors kept per view; time grows with its square."
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="Of the network's layers; auto is bfloat16 where the processor has it."
@@ -83,16 +84,36 @@ class LightGlue(Search):
             )
         return (str(SHIPPED_LIGHTGLUE),)
 
-    def quick_scan(self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry) -> Found:
-        """The mutual ratio test; nothing where no number of its matches would do."""
-        if self.ample > min(len(features0.keypoints_px), len(features1.keypoints_px)):
-            return joined([])
-        return Nearest().scan(features0, features1, alike, geometry, None)
-
     def scan(
         self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
     ) -> Found:
-        """Matches of all view pairs that are alike, costs 1 - probability.
+        """The mutual ratio test."""
+        return Nearest().scan(features0, features1, alike, geometry, where)
+
+    def look_closer(
+        self,
+        found: Found,
+        features0: Features,
+        features1: Features,
+        geometry: PairGeometry,
+        alike: BoolArray,
+        where: Where | None,
+    ) -> Found:
+        """Where there are too few: the network's matches; guided, they and those found before lead the search anew."""
+        if len(found.rows) >= self.enough:
+            return found
+        closer = self.by_network(features0, features1, alike, geometry, where)
+        if not self.guided:
+            return closer
+        doubtful = found.rows, found.columns, np.maximum(found.costs, _DOUBTFUL)
+        closer = joined([(closer.rows, closer.columns, closer.costs), doubtful])
+        windows = where.windows if where else None
+        return search_again(closer, features0, features1, geometry, alike, windows, keep=True)
+
+    def by_network(
+        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
+    ) -> Found:
+        """Matches of all view pairs that are alike, each keypoint once, costs 1 - probability.
 
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.

@@ -48,8 +48,6 @@ class Search(Strategy):
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
-    # Whether a quick scan is another one than a scan without windows.
-    quick_differs: ClassVar[bool] = False
     max_direction_deg: float = Field(
         5.0, ge=0.0, le=180.0, description="Simulated views whose directions are farther apart are not compared."
     )
@@ -81,16 +79,12 @@ class Search(Strategy):
         pictures = [alike & which for which in appearances(features0, features1)]
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
-        found = self.quick_scan(features0, features1, pictures[0], geometry)
+        found = self.scan(features0, features1, pictures[0], geometry, None)
         if where is not None:
             found = where.within(found, features0, features1)
         if len(found.rows) < self.ample:
             found = self._search_harder(found, features0, features1, geometry, pictures, where)
         return _matches(found, features0, features1)
-
-    def quick_scan(self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry) -> Found:
-        """What may be ample already, as `scan`."""
-        return self.scan(features0, features1, alike, geometry, None)
 
     @abstractmethod
     def scan(
@@ -111,18 +105,29 @@ class Search(Strategy):
         where: Where | None,
     ) -> Found:
         """Matches where those of the pictures as taken, `first`, are few. pictures: view pairs of each kind."""
-        again = where is not None or self.quick_differs
         scans = [
-            self.scan(features0, features1, views, geometry, where) if index or again else first
+            self.scan(features0, features1, views, geometry, where) if index or where is not None else first
             for index, views in enumerate(pictures)
         ]
         # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
         chosen = max(range(len(scans)), key=lambda index: len(scans[index].rows))
-        if not self.guided:
-            return scans[chosen]
-        return search_again(
-            scans[chosen], features0, features1, geometry, pictures[chosen], where.windows if where else None
-        )
+        alike, found = pictures[chosen], scans[chosen]
+        if self.guided:
+            windows = where.windows if where else None
+            found = search_again(found, features0, features1, geometry, alike, windows)
+        return self.look_closer(found, features0, features1, geometry, alike, where)
+
+    def look_closer(
+        self,
+        found: Found,
+        features0: Features,
+        features1: Features,
+        geometry: PairGeometry,
+        alike: BoolArray,
+        where: Where | None,
+    ) -> Found:
+        """What a dearer search of the views that are alike makes of the matches found so far."""
+        return found
 
     def windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
         """Where every keypoint of image 0 may lie in image 1, None where that is unknown."""
