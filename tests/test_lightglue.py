@@ -21,16 +21,25 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, Side
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, read_calibration
 from aeromatch_cli.strategies.matchers import lightglue
+from aeromatch_cli.strategies.matchers.guided import Found
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue, wrapped_rad
+from aeromatch_cli.strategies.matchers.search import joined
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
 OF_VIEWS = {"view_sizes_px", "view_angles_deg", "view_directions", "view_gsd_m", "view_enhanced"}
 
 
+class NetworkAlone(LightGlue):
+    """Without the ratio test's matches."""
+
+    def scan(self, *_: object) -> Found:
+        return joined([])
+
+
 def recipe(weights: str, **settings: Any) -> LightGlue:
-    """In full precision, so that tests can compare to the last digits; the network is always asked."""
-    return LightGlue(weights=weights, **{"precision": "float32", "ample": 10**6, "enough": 10**6, **settings})
+    """The network alone in full precision, so that tests can compare to the last digits."""
+    return NetworkAlone(weights=weights, **{"precision": "float32", **settings})
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -275,8 +284,8 @@ def test_the_network_is_asked_where_the_ratio_test_leaves_few(
     monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, Calibration(), "cpu", {}))
     matches = LightGlue(weights=weights)(features(count), noisy(features(count), 2.0), GEOMETRY)
     assert bool(recorder.given) == asked
-    # The ratio test's, or what the network says.
-    assert len(matches.indices) == (0 if asked else pytest.approx(count, rel=0.05))
+    # The ratio test's stay where the network finds nothing.
+    assert len(matches.indices) == pytest.approx(count, rel=0.05)
 
 
 def test_networks_without_scale_and_orientation_get_none(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,14 +99,14 @@ class LightGlue(Search):
         alike: BoolArray,
         where: Where | None,
     ) -> Found:
-        """Where there are too few: the network's matches; guided, they and those found before lead the search anew."""
+        """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""
         if len(found.rows) >= self.enough:
             return found
         closer = self.by_network(features0, features1, alike, geometry, where)
-        if not self.guided:
-            return closer
         doubtful = found.rows, found.columns, np.maximum(found.costs, _DOUBTFUL)
         closer = joined([(closer.rows, closer.columns, closer.costs), doubtful])
+        if not self.guided:
+            return closer
         windows = where.windows if where else None
         return search_again(closer, features0, features1, geometry, alike, windows, keep=True)
 
