@@ -68,10 +68,13 @@ class Outcome(Generic[R]):
 
 
 def single_threaded() -> None:
-    """Make this process's libraries use one thread. Runs at the start of every worker."""
+    """Make this process's libraries use one thread. Runs at the start of every worker, and before serial work."""
     import cv2
+    import threadpoolctl
 
     cv2.setNumThreads(1)
+    # What is loaded already: a BLAS of two threads sums in another order. The variables are for what comes later.
+    threadpoolctl.threadpool_limits(1)
     for name in _THREAD_VARIABLES:
         os.environ[name] = "1"
 

@@ -28,3 +28,24 @@ def random_features(count: int, *, seed: int = 0, side_px: int = 5472) -> Featur
         view_gsd_m=np.full(1, np.nan, np.float32),
         view_enhanced=np.zeros(1, bool),
     )
+
+
+def described(points_px: np.ndarray, descriptors: np.ndarray, size_px: float = 8.0) -> Features:
+    """Features of one view of 1000 x 750 pixels, one descriptor per keypoint, all of a size."""
+    count = len(points_px)
+    return Features(
+        keypoints_px=points_px.astype(np.float32),
+        sizes_px=np.full(count, size_px, np.float32),
+        responses=np.ones(count, np.float32),
+        descriptors=descriptors,
+        descriptor_keypoint_idx=np.arange(count, dtype=np.int32),
+        view_idx=np.zeros(count, np.int32),
+        view_keypoints_px=points_px.astype(np.float32),
+        view_size_px=np.full(count, size_px, np.float32),
+        view_orientation_deg=np.zeros(count, np.float32),
+        view_sizes_px=np.array([[1000, 750]], np.int32),
+        view_angles_deg=np.zeros(1, np.float32),
+        view_directions=np.full((1, 3), np.nan, np.float32),
+        view_gsd_m=np.full(1, np.nan, np.float32),
+        view_enhanced=np.zeros(1, bool),
+    )

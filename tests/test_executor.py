@@ -44,10 +44,15 @@ def work(task: Task) -> int:
     return task.number**2
 
 
-def threads(_: int) -> tuple[int, str]:
+def threads(_: int) -> tuple[int, int, str]:
+    """Of OpenCV, of the BLAS that numpy loaded long ago, and for what is loaded later."""
     import cv2
+    import numpy as np
+    import threadpoolctl
 
-    return cv2.getNumThreads(), os.environ.get("OMP_NUM_THREADS", "")
+    np.ones((2, 2)) @ np.ones((2, 2))
+    loaded = max(library["num_threads"] for library in threadpoolctl.threadpool_info())
+    return cv2.getNumThreads(), loaded, os.environ.get("OMP_NUM_THREADS", "")
 
 
 @dataclass
@@ -123,8 +128,13 @@ def test_a_full_disk_stops_everything(tmp_path: Path, kind: str) -> None:
 
 def test_workers_use_one_thread(pool: Executor) -> None:
     before = dict(os.environ)
-    assert {one.value for one in pool.run(threads, range(4), "x")} == {(1, "1")}
+    assert {one.value for one in pool.run(threads, range(4), "x")} == {(1, 1, "1")}
     assert dict(os.environ) == before
+
+
+def test_serial_work_uses_one_thread() -> None:
+    with Executor("serial", 1) as executor:
+        assert executor.run(threads, range(1), "x")[0].value == (1, 1, "1")
 
 
 def test_no_tasks_are_no_work(pool: Executor) -> None:

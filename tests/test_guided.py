@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from make_features import described
 
-from aeromatch_cli.data import Features, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project, undistort
 from aeromatch_cli.geometry.epipolar import essential, relative_pose
 from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, search_windows, stereo_of
-from aeromatch_cli.strategies.matchers.guided import Found, nearby, search_again
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.evidence import most_evident
+from aeromatch_cli.strategies.matchers.guided import SecondSearch, nearby
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1000, 750, (900.0, 500.0, 375.0, -0.03))
@@ -41,27 +44,6 @@ def windows(points0, pose0, pose1, *, relief_m=20.0, sigmas=3.0, sigma_px=1.0):
 
 def pair_of(pose0, pose1, ground_z_m=0.0):
     return PairGeometry(Pair("a", "b", 0.8, 10.0, "overlap"), CAMERA, CAMERA, pose0, pose1, ground_z_m)
-
-
-def described(points_px, descriptors, size_px=8.0):
-    """Features of one view, one descriptor per keypoint."""
-    count = len(points_px)
-    return Features(
-        keypoints_px=points_px.astype(np.float32),
-        sizes_px=np.full(count, size_px, np.float32),
-        responses=np.ones(count, np.float32),
-        descriptors=descriptors,
-        descriptor_keypoint_idx=np.arange(count, dtype=np.int32),
-        view_idx=np.zeros(count, np.int32),
-        view_keypoints_px=points_px.astype(np.float32),
-        view_size_px=np.full(count, size_px, np.float32),
-        view_orientation_deg=np.zeros(count, np.float32),
-        view_sizes_px=np.array([[1000, 750]], np.int32),
-        view_angles_deg=np.zeros(1, np.float32),
-        view_directions=np.full((1, 3), np.nan, np.float32),
-        view_gsd_m=np.full(1, np.nan, np.float32),
-        view_enhanced=np.zeros(1, bool),
-    )
 
 
 def noisy_twins(kinds, rng, noise=12):
@@ -277,11 +259,37 @@ def test_matches_that_only_a_network_sees_stay_where_place_and_size_agree(probab
     columns = np.arange(400)
     columns[350:] = np.roll(columns[350:], 1)
     costs = np.where(np.arange(400) < 300, 0.05, 1.0 - probability)
-    asked = Found(np.arange(400), columns, costs), *sides, pair_of(POSE0, POSE1), np.ones((1, 1), bool)
-    plain, kept = (search_again(*asked, keep=keep) for keep in (False, True))
+    again = SecondSearch(Comparison(*sides, pair_of(POSE0, POSE1), np.ones((1, 1), bool)))
+    plain, kept = (again(Found(np.arange(400), columns, costs), keep=keep) for keep in (False, True))
     assert (plain.rows < 300).all()
     added = kept.rows[len(plain.rows) :]
     assert (added < 350).mean() >= 0.95 if stays else len(added) == 0
     assert len(added) > 45 or not stays
     assert np.array_equal(kept.rows[: len(plain.rows)], plain.rows)
     assert len(np.unique(kept.rows)) == len(kept.rows) == len(np.unique(kept.columns))
+
+
+@pytest.mark.parametrize(("more_right", "more_wrong", "taken"), [(60, 40, True), (2, 150, False)])
+def test_of_two_sets_of_matches_the_one_with_more_evidence_counts(more_right, more_wrong, taken):
+    rng = np.random.default_rng(4)
+    seen = scene(rng, 400)
+    columns = np.arange(400)
+    columns[100:] = rng.permutation(columns[100:])
+    columns[100 : 100 + more_right] = np.arange(100, 100 + more_right)
+    asked = Comparison(*(described(s, np.zeros((400, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
+                       np.ones((1, 1), bool))  # fmt: skip
+    few = Found(np.arange(70, 140), np.concatenate([np.arange(70, 100), rng.integers(200, 400, 40)]), np.full(70, 0.5))
+    rows = np.arange(70, 100 + more_right + more_wrong)
+    many = Found(rows, columns[rows], np.full(len(rows), 0.5))
+    best = most_evident(asked, [many, few])
+    assert len(best.rows) > 70 if taken else set(best.rows) <= set(few.rows)
+    assert len(np.unique(best.columns)) == len(best.columns)
+
+
+def test_without_any_evidence_the_first_set_stays():
+    rng = np.random.default_rng(5)
+    seen = [rng.uniform(0, [1000, 750], (100, 2)) for _ in "01"]
+    asked = Comparison(*(described(s, np.zeros((100, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
+                       np.ones((1, 1), bool))  # fmt: skip
+    first, second = (Found(np.arange(n), np.arange(n), np.full(n, 0.5)) for n in (100, 50))
+    assert most_evident(asked, [first, second]) is first

@@ -21,9 +21,8 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, Side
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, read_calibration
 from aeromatch_cli.strategies.matchers import lightglue
-from aeromatch_cli.strategies.matchers.guided import Found
+from aeromatch_cli.strategies.matchers.comparison import Found, joined
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue, wrapped_rad
-from aeromatch_cli.strategies.matchers.search import joined
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
-from aeromatch_cli.geometry.prediction import Windows, inverse_depths, places_of_heights, stereo_of
-from aeromatch_cli.geometry.two_view import Sampling, TwoView, chance_errors_px, estimate, log10_false_alarms
+from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, stereo_of
+from aeromatch_cli.geometry.two_view import TwoView
 from aeromatch_cli.strategies.matchers.assignment import is_first, one_to_one
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
+from aeromatch_cli.strategies.matchers.evidence import evidence_of
 
-# Fewer matches support no first model, whatever the odds that chance gives it.
-_MIN_INLIERS = 12
-_LOG10_FALSE_ALARMS = -3.0
-_MODEL_PX = 4.0
 # Matches around a point whose heights are tried.
 _NEIGHBOURS = 6
 # Predicting and searching: what is found predicts once more.
@@ -32,30 +30,12 @@ _LARGEST_COST = 9.49
 # So many times as far from place and line, none may look more alike: repeated things lie side by side.
 _RIVALS = 2.0
 # Matches that another matcher found may lie so many times as far from predicted place and size, and the squares less
-# the log odds sum up to so much: of what it adds to 14 pairs of each of 7 rendered scenes, 85 % is right.
+# the log odds sum up to so much: of what it adds to 14 pairs of each of 7 rendered scenes, nine tenths are right.
 _PLACE_SLACK, _SIZE_SLACK, _LARGEST_KEPT = 2.0, 2.5, 3.0
 # Share of random keypoint pairs that look at most as different as "wrong pairs have".
 _CHANCE = 0.02
 _DRAWS = 8192
-_TRIALS = 16
 _CHUNK = 4096
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Matches as descriptors (N,) of either image, with costs in 0-1, smaller is better."""
-
-    rows: IntArray
-    columns: IntArray
-    costs: FloatArray
-
-    def take(self, which: IntArray | BoolArray) -> Found:
-        """Those of the given positions or mask."""
-        return Found(self.rows[which], self.columns[which], self.costs[which])
-
-    def keypoints(self, features0: Features, features1: Features) -> tuple[IntArray, IntArray]:
-        """The same as keypoints (N,) of either image."""
-        return features0.descriptor_keypoint_idx[self.rows], features1.descriptor_keypoint_idx[self.columns]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,83 +52,94 @@ class Side:
     units_px: FloatArray
 
 
-def search_again(
-    found: Found,
-    features0: Features,
-    features1: Features,
-    geometry: PairGeometry,
-    alike: BoolArray,
-    windows: Windows | None = None,
-    *,
-    keep: bool = False,
-) -> Found:
-    """Matches around the places that a verified model and the heights of its matches predict, instead of those found.
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What verified matches say about all keypoints of image 0.
+
+    places_px: (K0, Q, 2) in image 1, undistorted, as high as each of the Q nearest matches of other keypoints; not
+    finite where unknown. octaves: (K0,) that things grow by around there.
+    """
+
+    model: TwoView
+    places_px: FloatArray
+    octaves: FloatArray
+
+
+class SecondSearch:
+    """Matches around the places that a verified model and the heights of its matches predict.
 
     A match needs that its epipolar line, a place predicted by other matches, its size and its looks agree together.
-    Unchanged where `found` supports no model beyond chance. alike: (V0, V1) views that are compared. windows:
-    where each keypoint of image 0 was searched, None for everywhere. keep: costs of `found` are 1 - probability of a
-    matcher that sees more than looks; what line, place, size and it agree on stays, too, where the search found
-    nothing for either keypoint.
     """
-    side0, side1 = side_of(features0, geometry.camera0), side_of(features1, geometry.camera1)
-    wrong = distance_of_wrong_pairs(side0, side1, alike)
-    # One that occurred twice would confirm itself.
-    first = found = found.take(one_to_one(*found.keypoints(features0, features1), found.costs))
-    kept: BoolArray = np.zeros(len(first.rows), dtype=bool)
-    for _ in range(_ROUNDS):
-        idx0, idx1 = found.keypoints(features0, features1)
-        model = verified(side0.places_px[idx0], side1.places_px[idx1], geometry, windows and windows.take(idx0))
-        if model is None or wrong == 0.0:
-            break
-        places_px, octaves = predicted(side0, side1, idx0[model.inliers], idx1[model.inliers], model, geometry)
-        again = around(side0, side1, places_px, octaves, model, alike, wrong)
-        if len(again.rows) < _LEAST_KEPT * model.inliers.sum():
-            break  # heights around a match say nothing here: what was known is better
-        found = again
-        if keep:
-            kept = believed(first, side0, side1, places_px, octaves, model)
-    return added(found, first.take(kept), features0, features1)
+
+    def __init__(self, asked: Comparison) -> None:
+        self.asked = asked
+        geometry = asked.geometry
+        self._side0, self._side1 = (
+            side_of(asked.features0, geometry.camera0),
+            side_of(asked.features1, geometry.camera1),
+        )
+        self._wrong = distance_of_wrong_pairs(self._side0, self._side1, asked.alike)
+
+    def __call__(self, found: Found, *, keep: bool = False) -> Found:
+        """The new matches instead of those found, which stay where they support no model beyond chance.
+
+        keep: costs of `found` are 1 - probability of a matcher that sees more than looks; what line, place, size and it
+        agree on stays, too, where the search found nothing for either keypoint.
+        """
+        # One that occurred twice would confirm itself.
+        first = found = found.take(one_to_one(*self.asked.keypoints(found), found.costs))
+        if self._wrong == 0.0:
+            return found
+        last: Prediction | None = None
+        for _ in range(_ROUNDS):
+            prediction = self._predicted(found)
+            if prediction is None:
+                break
+            again = around(self._side0, self._side1, prediction, self.asked.alike, self._wrong)
+            if len(again.rows) < _LEAST_KEPT * prediction.model.inliers.sum():
+                break  # heights around a match say nothing here: what was known is better
+            found, last = again, prediction
+        if not keep or last is None:
+            return found
+        return self._added(found, first.take(believed(first, self._side0, self._side1, last)))
+
+    def _predicted(self, found: Found) -> Prediction | None:
+        evidence = evidence_of(self.asked, found, self._side0.places_px, self._side1.places_px)
+        if evidence is None or not evidence.beyond_chance:
+            return None
+        idx0, idx1 = self.asked.keypoints(found.take(evidence.model.inliers))
+        return predicted(self._side0, self._side1, idx0, idx1, evidence.model, self.asked.geometry)
+
+    def _added(self, first: Found, second: Found) -> Found:
+        """All of the first, and of the second what shares no keypoint with it."""
+        (used0, used1), (idx0, idx1) = self.asked.keypoints(first), self.asked.keypoints(second)
+        return joined([first, second.take(~np.isin(idx0, used0) & ~np.isin(idx1, used1))])
 
 
-def believed(
-    found: Found, side0: Side, side1: Side, places_px: FloatArray, octaves: FloatArray, model: TwoView
-) -> BoolArray:
+def believed(found: Found, side0: Side, side1: Side, prediction: Prediction) -> BoolArray:
     """Whether each match (N,) of costs 1 - probability agrees enough with its line, the places and the size predicted.
 
     The odds stand where `around` has the looks.
     """
-    idx0, idx1 = found.keypoints(side0.features, side1.features)
-    line, place, size = disagreements(side0, side1, idx0, idx1, places_px, octaves, model)
+    idx0 = side0.features.descriptor_keypoint_idx[found.rows]
+    idx1 = side1.features.descriptor_keypoint_idx[found.columns]
+    line, place, size = disagreements(side0, side1, idx0, idx1, prediction)
     probability = np.clip(1.0 - found.costs, 1e-6, 1.0 - 1e-6)
     odds = np.log(probability / (1.0 - probability))
     return np.asarray(line**2 + (place / _PLACE_SLACK) ** 2 + (size / _SIZE_SLACK) ** 2 - odds <= _LARGEST_KEPT)
 
 
 def disagreements(
-    side0: Side,
-    side1: Side,
-    idx0: IntArray,
-    idx1: IntArray,
-    places_px: FloatArray,
-    octaves: FloatArray,
-    model: TwoView,
+    side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, prediction: Prediction
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Of keypoint pairs (N,) with epipolar line, nearest predicted place, predicted size: standard deviations (N,)."""
-    errors_px = sampson_distance_px(model.pixel_model, side0.places_px[idx0], side1.places_px[idx1])
-    apart_px = np.linalg.norm(places_px[idx0] - side1.places_px[idx1][:, None], axis=2)
+    errors_px = sampson_distance_px(prediction.model.pixel_model, side0.places_px[idx0], side1.places_px[idx1])
+    apart_px = np.linalg.norm(prediction.places_px[idx0] - side1.places_px[idx1][:, None], axis=2)
     apart_px = np.where(np.isfinite(apart_px), apart_px, np.inf).min(axis=1)
     line_px = _LINE_PX * np.sqrt((side0.units_px[idx0] ** 2 + side1.units_px[idx1] ** 2) / 2.0)
     place_px = _PLACE_PX * side1.units_px[idx1]
-    steps = _octaves(side0, side1, idx0, idx1) - octaves[idx0]
+    steps = _octaves(side0, side1, idx0, idx1) - prediction.octaves[idx0]
     return errors_px / line_px, apart_px / place_px, steps / _SIZE_OCTAVES
-
-
-def added(first: Found, second: Found, features0: Features, features1: Features) -> Found:
-    """All of the first, and of the second what shares no keypoint with it."""
-    used0, used1 = first.keypoints(features0, features1)
-    idx0, idx1 = second.keypoints(features0, features1)
-    second = second.take(~np.isin(idx0, used0) & ~np.isin(idx1, used1))
-    return Found(*(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True)))
 
 
 def side_of(features: Features, camera: Camera) -> Side:
@@ -161,41 +152,10 @@ def side_of(features: Features, camera: Camera) -> Side:
     return Side(features, undistort(camera, features.keypoints_px), first, count, np.maximum(units_px, 1.0))
 
 
-def verified(
-    points0_px: FloatArray, points1_px: FloatArray, geometry: PairGeometry, windows: Windows | None
-) -> TwoView | None:
-    """A relative pose beyond chance of matches (N, 2), undistorted pixels, searched in windows (N) or everywhere."""
-    usable: BoolArray = np.asarray(np.isfinite(points0_px + points1_px).all(axis=1))
-    if usable.sum() < _MIN_INLIERS:
-        return None
-    points0, points1 = points0_px[usable], points1_px[usable]
-    found = estimate(points0, points1, geometry, "relative_pose", Sampling(_MODEL_PX), 0)
-    if found.inliers.sum() < _MIN_INLIERS:
-        return None
-
-    def distance(a: FloatArray, b: FloatArray) -> FloatArray:
-        return sampson_distance_px(found.pixel_model, a, b)
-
-    if windows is None:
-        errors = chance_errors_px(distance, points0, points1)
-    else:
-        # A wrong match lies anywhere in its window.
-        wrong0, wrong1 = np.tile(points0_px, (_TRIALS, 1)), windows.sample(_TRIALS, np.random.default_rng(0))
-        seen = np.isfinite(wrong0 + wrong1).all(axis=1)
-        errors = distance(wrong0[seen], wrong1[seen])
-    if log10_false_alarms(points0, points1, found.inliers, errors, _MODEL_PX, found.sample) > _LOG10_FALSE_ALARMS:
-        return None
-    inliers: BoolArray = np.zeros(len(usable), dtype=np.bool_)
-    inliers[usable] = found.inliers
-    return replace(found, inliers=inliers)
-
-
 def predicted(
     side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, model: TwoView, geometry: PairGeometry
-) -> tuple[FloatArray, FloatArray]:
-    """From matches idx0, idx1 (M,): places (K0, Q, 2) in image 1 of all keypoints of image 0, as high as each of the Q
-    nearest matches of other keypoints, and octaves (K0,) that things grow by around there.
-    """
+) -> Prediction:
+    """What matches idx0, idx1 (M,) of a model predict."""
     from scipy.spatial import cKDTree
 
     usable = np.flatnonzero(np.isfinite(side0.places_px).all(axis=1))
@@ -212,7 +172,7 @@ def predicted(
     inverse = inverse_depths(stereo, known0, known1)
     places_px = places_of_heights(stereo, side0.places_px, known0[nearest], inverse[nearest])
     steps = _octaves(side0, side1, idx0, idx1)
-    return places_px, np.median(steps[nearest], axis=1)
+    return Prediction(model, places_px, np.median(steps[nearest], axis=1))
 
 
 def _octaves(side0: Side, side1: Side, idx0: IntArray, idx1: IntArray) -> FloatArray:
@@ -220,22 +180,14 @@ def _octaves(side0: Side, side1: Side, idx0: IntArray, idx1: IntArray) -> FloatA
     return np.asarray(np.log2(side1.features.sizes_px[idx1].astype(np.float64) / side0.features.sizes_px[idx0]))
 
 
-def around(
-    side0: Side,
-    side1: Side,
-    places_px: FloatArray,
-    octaves: FloatArray,
-    model: TwoView,
-    alike: BoolArray,
-    wrong: float,
-) -> Found:
-    """Mutually best matches near the predicted places (K0, Q, 2) and sizes (K0,), by the sum of what disagrees.
+def around(side0: Side, side1: Side, prediction: Prediction, alike: BoolArray, wrong: float) -> Found:
+    """Mutually best matches near the predicted places and sizes, by the sum of what disagrees.
 
     Both keypoints must be each other's nearest in looks, too, among all that lie about there.
     """
     farthest_px = _RIVALS * _PLACE_PX * np.sqrt(_LARGEST_COST) * float(side1.units_px.max(initial=1.0))
-    idx0, idx1 = nearby(places_px, side1.places_px, farthest_px)
-    line, place, size = disagreements(side0, side1, idx0, idx1, places_px, octaves, model)
+    idx0, idx1 = nearby(prediction.places_px, side1.places_px, farthest_px)
+    line, place, size = disagreements(side0, side1, idx0, idx1, prediction)
     about = line <= _RIVALS * np.sqrt(_LARGEST_COST)
     idx0, idx1, costs = idx0[about], idx1[about], (line**2 + place**2 + size**2)[about]
     distances, rows, columns = closest(side0, side1, idx0, idx1, alike)

@@ -7,7 +7,7 @@ orientation in radians in (-pi, pi], RootSIFT of unit length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -16,18 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
+from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.geometry.prediction import Windows
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.guided import Found, search_again
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
+from aeromatch_cli.strategies.matchers.evidence import most_evident
+from aeromatch_cli.strategies.matchers.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.nearest import Nearest
-from aeromatch_cli.strategies.matchers.search import Search, Where, joined
+from aeromatch_cli.strategies.matchers.overlap import in_overlap
+from aeromatch_cli.strategies.matchers.search import Search
 
 # Cost at least of matches that are there without the network's having found them, beside those of 1 - probability.
 _DOUBTFUL = 0.7
+# Where the network sees more than there is, its surest matches alone, or none, support a model better: probabilities.
+_SURER = (0.3, 0.5, 0.8)
 # Around the keypoints that are left of a view, as in training.
 _FRAME_PX = 4.0
 
@@ -38,7 +41,7 @@ class LightGlue(Search):
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["lightglue"] = "lightglue"
     enough: int = Field(
         250,
@@ -84,66 +87,41 @@ class LightGlue(Search):
             )
         return (str(SHIPPED_LIGHTGLUE),)
 
-    def scan(
-        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
-    ) -> Found:
+    def scan(self, asked: Comparison) -> Found:
         """The mutual ratio test."""
-        return Nearest().scan(features0, features1, alike, geometry, where)
+        return Nearest().scan(asked)
 
-    def look_closer(
-        self,
-        found: Found,
-        features0: Features,
-        features1: Features,
-        geometry: PairGeometry,
-        alike: BoolArray,
-        where: Where | None,
-    ) -> Found:
+    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Found:
         """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""
         if len(found.rows) >= self.enough:
             return found
-        closer = self.by_network(features0, features1, alike, geometry, where)
-        doubtful = found.rows, found.columns, np.maximum(found.costs, _DOUBTFUL)
-        closer = joined([(closer.rows, closer.columns, closer.costs), doubtful])
-        if not self.guided:
-            return closer
-        windows = where.windows if where else None
-        return search_again(closer, features0, features1, geometry, alike, windows, keep=True)
+        shown = in_overlap(asked, found, self.windows) if self.overlap else None
+        closer = self.by_network(asked, shown)
+        doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
+        surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in (0.0, *_SURER)]
+        closer = most_evident(asked, [*surer, doubtful])
+        return again(closer, keep=True) if again else closer
 
-    def by_network(
-        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
-    ) -> Found:
+    def by_network(self, asked: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Found:
         """Matches of all view pairs that are alike, each keypoint once, costs 1 - probability.
 
+        shown: (K0,), (K1,) the keypoints that the other image may show.
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.
         """
         (path,) = self.fingerprint_files()
         matcher = _matcher(path, _content_stamp(path), self)
-        seen0, seen1 = self._in_overlap(features0, features1, geometry)
+        everything = [np.ones(len(f.keypoints_px), dtype=bool) for f in (asked.features0, asked.features1)]
+        shown0, shown1 = shown or everything
         parts = []
-        for view0, view1 in np.argwhere(alike):
-            side0, side1 = self._view(features0, int(view0), seen0), self._view(features1, int(view1), seen1)
+        for view0, view1 in np.argwhere(asked.alike):
+            side0 = self._view(asked.features0, int(view0), shown0)
+            side1 = self._view(asked.features1, int(view1), shown1)
             if len(side0.rows) and len(side1.rows):
                 pairs, scores = matcher.match(side0, side1)
-                parts.append((side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores))
-        found = joined(parts)
-        if where is not None:
-            found = where.within(found, features0, features1)
-        return found.take(one_to_one(*found.keypoints(features0, features1), found.costs))
-
-    def _in_overlap(
-        self, features0: Features, features1: Features, geometry: PairGeometry
-    ) -> tuple[BoolArray, BoolArray]:
-        """Which keypoints (K0,), (K1,) the other image may show."""
-        everything = [np.ones(len(features.keypoints_px), dtype=bool) for features in (features0, features1)]
-        forward = self.windows(features0, geometry) if self.overlap else None
-        backward = self.windows(features1, geometry.turned()) if self.overlap else None
-        if forward is None or backward is None:
-            return everything[0], everything[1]
-        return _meets(forward, undistort(geometry.camera1, features1.keypoints_px)), _meets(
-            backward, undistort(geometry.camera0, features0.keypoints_px)
-        )
+                parts.append(Found(side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores))
+        found = asked.within(joined(parts))
+        return found.take(one_to_one(*asked.keypoints(found), found.costs))
 
     def _view(self, features: Features, view: int, seen: BoolArray) -> _Side:
         rows = np.flatnonzero(features.view_idx == view)
@@ -244,18 +222,6 @@ def _has_bfloat16() -> bool:
     import torch
 
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
-
-
-def _meets(windows: Windows, points_px: FloatArray) -> BoolArray:
-    """Whether each window's box reaches into the box of the points (N, 2); a window of nothing does not."""
-    usable = points_px[np.isfinite(points_px).all(axis=1)]
-    if not len(usable):
-        return np.zeros(len(windows.centers_px), dtype=bool)
-    reach = np.einsum("nij,ni->nj", np.abs(windows.axes), windows.halves_px)
-    with np.errstate(invalid="ignore"):
-        low, high = windows.centers_px - reach, windows.centers_px + reach
-        inside = (high >= usable.min(axis=0)) & (low <= usable.max(axis=0))
-    return np.asarray(inside.all(axis=1))
 
 
 def wrapped_rad(angles_deg: FloatArray) -> FloatArray:

@@ -7,10 +7,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Features, PairGeometry
-from aeromatch_cli.strategies.matchers.guided import Found
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
 from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
-from aeromatch_cli.strategies.matchers.search import Search, Where, joined
+from aeromatch_cli.strategies.matchers.search import Search
 
 
 class Nearest(Search):
@@ -23,13 +22,12 @@ class Nearest(Search):
     )
     ratio_both: bool = Field(False, description="The ratio must hold from image 1's side as well, over all of image 0.")
 
-    def scan(
-        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
-    ) -> Found:
+    def scan(self, asked: Comparison) -> Found:
         """Matches of all view pairs that are alike, costs d1/d2."""
+        features0, features1, where = asked.features0, asked.features1, asked.where
         limits = None if where is None else Limits(where.windows.forms(), where.places_px)
         parts = []
-        for view0, view1 in np.argwhere(alike):
+        for view0, view1 in np.argwhere(asked.alike):
             of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
             keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
             rows, columns, ratios = mutual_nearest(
@@ -41,5 +39,5 @@ class Nearest(Search):
                 ratio_both=self.ratio_both,
                 limits=None if limits is None else Limits(limits.forms[keypoints0], limits.places[keypoints1]),
             )
-            parts.append((of0[rows], of1[columns], ratios))
+            parts.append(Found(of0[rows], of1[columns], ratios))
         return joined(parts)

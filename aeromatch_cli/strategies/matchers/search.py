@@ -3,39 +3,23 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, Matches, PairGeometry
+from aeromatch_cli.data import BoolArray, Features, FloatArray, Matches, PairGeometry
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.prediction import Windows, search_windows
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
-from aeromatch_cli.strategies.matchers.guided import Found, search_again
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, Where
+from aeromatch_cli.strategies.matchers.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.views import appearances, like_views
 
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Where:
-    """Windows in image 1 for the keypoints of image 0, and image 1's keypoints as they see them.
-
-    places_px: (K1, 2) undistorted.
-    """
-
-    windows: Windows
-    places_px: FloatArray
-
-    def within(self, found: Found, features0: Features, features1: Features) -> Found:
-        """Those of the matches that lie in their windows."""
-        idx0, idx1 = found.keypoints(features0, features1)
-        return found.take(self.windows.take(idx0).contain(self.places_px[idx1]))
 
 
 class Search(Strategy):
@@ -76,57 +60,39 @@ class Search(Strategy):
         Scores are the matcher's own, or 1 - cost where a model guided the search.
         """
         alike = like_views(features0, features1, self.max_direction_deg)
-        pictures = [alike & which for which in appearances(features0, features1)]
+        taken, *enhanced = (alike & which for which in appearances(features0, features1))
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
-        found = self.scan(features0, features1, pictures[0], geometry, None)
-        if where is not None:
-            found = where.within(found, features0, features1)
+        asked = Comparison(features0, features1, geometry, taken)
+        found = self.scan(asked)
+        asked = replace(asked, where=where)
+        found = asked.within(found)
         if len(found.rows) < self.ample:
-            found = self._search_harder(found, features0, features1, geometry, pictures, where)
-        return _matches(found, features0, features1)
+            asked, found = self._searched_harder(asked, found, enhanced)
+        return _matches(asked, found)
 
     @abstractmethod
-    def scan(
-        self, features0: Features, features1: Features, alike: BoolArray, geometry: PairGeometry, where: Where | None
-    ) -> Found:
-        """Matches of all view pairs (V0, V1) that are alike; with `where` only such as lie in its windows.
+    def scan(self, asked: Comparison) -> Found:
+        """Matches of all view pairs that are alike, only such as lie where they may.
 
         A keypoint may occur several times. Costs lie in 0-1; the score of a match is 1 - cost.
         """
 
-    def _search_harder(
-        self,
-        first: Found,
-        features0: Features,
-        features1: Features,
-        geometry: PairGeometry,
-        pictures: list[BoolArray],
-        where: Where | None,
-    ) -> Found:
-        """Matches where those of the pictures as taken, `first`, are few. pictures: view pairs of each kind."""
-        scans = [
-            self.scan(features0, features1, views, geometry, where) if index or where is not None else first
-            for index, views in enumerate(pictures)
-        ]
-        # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
-        chosen = max(range(len(scans)), key=lambda index: len(scans[index].rows))
-        alike, found = pictures[chosen], scans[chosen]
-        if self.guided:
-            windows = where.windows if where else None
-            found = search_again(found, features0, features1, geometry, alike, windows)
-        return self.look_closer(found, features0, features1, geometry, alike, where)
+    def _searched_harder(self, asked: Comparison, found: Found, enhanced: list[BoolArray]) -> tuple[Comparison, Found]:
+        """The pictures that say most and their matches, where those of the pictures as taken are few.
 
-    def look_closer(
-        self,
-        found: Found,
-        features0: Features,
-        features1: Features,
-        geometry: PairGeometry,
-        alike: BoolArray,
-        where: Where | None,
-    ) -> Found:
-        """What a dearer search of the views that are alike makes of the matches found so far."""
+        enhanced: view pairs (V0, V1) of the enhanced pictures, where there are any.
+        """
+        first = found if asked.where is None else self.scan(asked)
+        others = [replace(asked, alike=alike) for alike in enhanced]
+        scans = [(asked, first), *((other, self.scan(other)) for other in others)]
+        # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
+        asked, found = max(scans, key=lambda scan: len(scan[1].rows))
+        again = SecondSearch(asked) if self.guided else None
+        return asked, self.look_closer(asked, again(found) if again else found, again)
+
+    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Found:
+        """What a dearer search makes of the matches found so far. again: the second search, where it is wanted."""
         return found
 
     def windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
@@ -150,15 +116,10 @@ class Search(Strategy):
         )
 
 
-def joined(parts: Sequence[tuple[IntArray, IntArray, FloatArray]]) -> Found:
-    """Descriptor rows, columns and costs of several view pairs together."""
-    nothing = np.zeros(0, np.int64)
-    return Found(*(np.concatenate(column) for column in zip((nothing, nothing, np.zeros(0)), *parts, strict=True)))
-
-
-def _matches(found: Found, features0: Features, features1: Features) -> Matches:
+def _matches(asked: Comparison, found: Found) -> Matches:
     """The cheapest matches in which each keypoint occurs once, and no two lie together in both images."""
-    idx0, idx1 = found.keypoints(features0, features1)
+    features0, features1 = asked.features0, asked.features1
+    idx0, idx1 = asked.keypoints(found)
     kept = one_to_one(idx0, idx1, found.costs)
     places: FloatArray = np.concatenate(
         [features0.keypoints_px[idx0[kept]], features1.keypoints_px[idx1[kept]]], axis=1, dtype=np.float64
