@@ -68,15 +68,27 @@ class Outcome(Generic[R]):
 
 
 def single_threaded() -> None:
-    """Make this process's libraries use one thread. Runs at the start of every worker, and before serial work."""
+    """Make this process's libraries use one thread. Runs at the start of every worker."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    for name in _THREAD_VARIABLES:
+        os.environ[name] = "1"
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """The same for as long as serial work takes. A BLAS of two threads, loaded long ago, sums in another order."""
     import cv2
     import threadpoolctl
 
-    cv2.setNumThreads(1)
-    # What is loaded already: a BLAS of two threads sums in another order. The variables are for what comes later.
-    threadpoolctl.threadpool_limits(1)
-    for name in _THREAD_VARIABLES:
-        os.environ[name] = "1"
+    before = cv2.getNumThreads()
+    single_threaded()
+    try:
+        with threadpoolctl.threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def _worker_start() -> None:
@@ -185,11 +197,11 @@ class Executor:
             self.progress.stop()
 
     def _run_serial(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
-        single_threaded()
         outcomes = []
-        for task in tasks:
-            outcomes.append(guarded(function, task))
-            self.progress.advance()
+        with _one_thread():
+            for task in tasks:
+                outcomes.append(guarded(function, task))
+                self.progress.advance()
         return outcomes
 
     def _run_processes(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:

@@ -228,8 +228,12 @@ def fingerprint(*parts: Any) -> str:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Strategy):
-        files = {path: file_digest(Path(path)) for path in value.fingerprint_files()}
-        return {"class": type(value).__name__, "version": value.version, "files": files, **value.model_dump()}
+        # Contents, not places: another folder, or another machine's, makes no other recipe.
+        files = [file_digest(Path(path)) for path in value.fingerprint_files()]
+        extras = {name: field.json_schema_extra for name, field in type(value).model_fields.items()}
+        places = {name for name, extra in extras.items() if isinstance(extra, dict) and "path" in extra}
+        recipe = value.model_dump(exclude=places)
+        return {"class": type(value).__name__, "version": value.version, "files": files, **recipe}
     if hasattr(value, "tolist"):
         return value.tolist()
     if hasattr(value, "__dataclass_fields__"):

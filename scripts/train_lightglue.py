@@ -9,8 +9,9 @@ two steps see the same. The learning rate falls along a cosine; what is kept is 
 Validation knows neither the pictures nor the scenes: homography pairs of --unseen and of two rendered blocks that are
 left out, and the pairs of these two. Beside it stands the mutual ratio test (0.8) on the same keypoints.
 
-The same on the CPU and on a CUDA device, both in bfloat16; the batch of a CUDA device is larger, the number of pairs is
-the same. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it was. Writes
+On the CPU and on a CUDA device in bfloat16; a CUDA device takes larger batches, so that as many pairs are fewer steps:
+what ships was trained on a CPU. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on
+where it was; OUT/recipe.json makes sure that it is the same run. Writes
 OUT/lightglue.safetensors (float16, with the calibration of its scores on the validation pairs), OUT/log.json,
 OUT/curves.png and OUT/reliability.png.
 """
@@ -30,16 +31,19 @@ import numpy as np
 import torch
 from lightglue_training.batches import Batch, batch_of, piece
 from lightglue_training.blocks import LEAST_PARTNERS, Pair
-from lightglue_training.data import prepare, read_block, read_groups
+from lightglue_training.data import SHARD, prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import Found, compared, fitted, report, thinned, together
+from training_blocks import LEFT_OUT
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
-from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration
+from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
 
 DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads=2, add_scale_ori=True)
 DECAY, CLIP = 0.999, 1.0
 ALL_KEYPOINTS = 4096
+# Arguments of which another value makes other data, and another run.
+OF_DATA, OF_RUN = ("trained_on", "unseen", "groups", "blocks"), ("start", "scale", "batch", "rate")
 REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
 
 
@@ -54,9 +58,11 @@ class Phase:
     confidence: bool = False
 
 
-def phases(scale: float) -> tuple[Phase, ...]:
+def phases(scale: float, *, anew: bool) -> tuple[Phase, ...]:
+    """anew: not from weights, which have learnt from homographies before."""
+    first = (Phase("homographies", round(240_000 * scale), 256, 0.0),) if anew else ()
     return (
-        Phase("homographies", round(240_000 * scale), 256, 0.0),
+        *first,
         Phase("blocks", round(160_000 * scale), 384, 0.6),
         Phase("many", round(32_000 * scale), 768, 0.6, confidence=True),
     )
@@ -97,12 +103,14 @@ class Run:
         partly.replace(path)
 
     @classmethod
-    def begin(cls, path: Path, device: str, rate: float) -> Run:
+    def begin(cls, path: Path, device: str, rate: float, start: Path | None = None) -> Run:
+        """Where the state file `path` left it, else from the weights `start`, else from nothing."""
         torch.manual_seed(0)
-        network = LightGlue(DIMENSIONS).to(device)
+        network = load_lightglue(start) if start else LightGlue(DIMENSIONS)
+        network = network.to(device).requires_grad_(True)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
         if path.is_file():
-            run.seen, run.log, *states = torch.load(path, map_location=device, weights_only=False)
+            run.seen, run.log, *states = torch.load(path, map_location=device, weights_only=True)
             for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
                 part.load_state_dict(state)
         return run
@@ -110,14 +118,14 @@ class Run:
 
 def train(args: argparse.Namespace, device: str) -> Run | None:
     """The finished run, or None where --minutes ended it before."""
-    plan = phases(args.scale)
+    plan = phases(args.scale, anew=args.start is None)
     total = sum(phase.pairs for phase in plan)
     stage1 = [p for path in sorted((args.out / "data" / "stage1").glob("*.npz")) for p in read_groups(path)]
     stage2 = [p for path in sorted((args.out / "data" / "stage2").glob("*.npz")) for p in read_block(path)]
     stage1, stage2 = ([pair for pair in pairs if usable(pair)] for pairs in (stage1, stage2))
     sets = validation_sets(args.out / "data")
     state, started = args.out / "state.pt", time.monotonic()
-    run = Run.begin(state, device, args.rate)
+    run = Run.begin(state, device, args.rate, args.start)
     print(f"{len(stage1)} homography pairs, {len(stage2)} rendered pairs, {run.seen} of {total} pairs seen", flush=True)
     losses: list[tuple[float, float, float]] = []
     while run.seen < total:
@@ -157,8 +165,8 @@ def _phase(plan: tuple[Phase, ...], seen: int) -> Phase:
 
 
 def _rate(seen: int, total: int) -> float:
-    """Of the learning rate: a short rise, then a cosine to nothing."""
-    return min(1.0, (seen + 1) / 8_000) * (0.5 + 0.5 * math.cos(math.pi * seen / total)) + 0.005
+    """Of the learning rate: a short rise, then a cosine to next to nothing."""
+    return min(1.0, (seen + 1) / min(8_000, 0.1 * total)) * (0.5 + 0.5 * math.cos(math.pi * seen / total)) + 0.005
 
 
 def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, float, float]:
@@ -169,7 +177,8 @@ def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, floa
     loss.total.backward()
     torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
     run.optimiser.step()
-    keep = min(DECAY, (run.seen + 1) / (run.seen + 1000))
+    steps = run.seen // len(batch.partners0)
+    keep = min(DECAY, (steps + 1) / (steps + 10))
     with torch.no_grad():
         for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
             old.lerp_(new, 1.0 - keep)
@@ -244,6 +253,30 @@ def draw_reliability(ways: dict[str, Calibration], found: Found, path: Path) -> 
     figure.savefig(path)
 
 
+def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuses what cannot be trained on, and to go on with another run's data or state."""
+    if args.blocks <= max(LEFT_OUT):
+        parser.error(
+            f"--blocks {args.blocks}: block {max(LEFT_OUT)} is for validation; give at least {max(LEFT_OUT) + 1}"
+        )
+    if args.groups < 4 * SHARD or args.groups % SHARD:
+        parser.error(f"--groups {args.groups}: give a multiple of {SHARD}, at least {4 * SHARD}")
+    for name in (*args.trained_on.split(","), *args.unseen.split(",")):
+        if not (args.data / name / "images").is_dir():
+            parser.error(f"{args.data / name} has no folder images; see --data, --trained-on and --unseen")
+    names = OF_DATA if args.only_data else (*OF_DATA, *OF_RUN)
+    asked = {name: str(getattr(args, name)) for name in names}
+    path = args.out / "recipe.json"
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    other = [name for name in asked if known.get(name, asked[name]) != asked[name]]
+    if other:
+        parser.error(
+            f"{args.out} holds another run ({', '.join(f'{n} {known[n]}' for n in other)}); give another --out"
+        )
+    args.out.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(known | asked, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -253,6 +286,7 @@ def main() -> None:
     add("--groups", type=int, default=2400, help="groups of four homography views")
     add("--blocks", type=int, default=60, help="rendered blocks, at least 19")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
+    add("--start", type=Path, help="weights to go on from; the first phase, of homographies alone, is left out then")
     add("--scale", type=float, default=1.0, help="of the number of pairs of every phase")
     add("--batch", type=int, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
     add("--rate", type=float, default=6e-4, help="largest learning rate")
@@ -265,6 +299,7 @@ def main() -> None:
     args.batch = args.batch or (96 if device == "cuda" else 16)
     args.rendered = args.rendered or args.out / "blocks"
     torch.set_num_threads(args.jobs)
+    check(parser, args)
     prepare(args.out / "data", args.data, args.trained_on.split(","), args.unseen.split(","), args)
     run = None if args.only_data else train(args, device)
     if run is not None:

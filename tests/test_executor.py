@@ -133,8 +133,12 @@ def test_workers_use_one_thread(pool: Executor) -> None:
 
 
 def test_serial_work_uses_one_thread() -> None:
+    import cv2
+
+    cv2.setNumThreads(2)
     with Executor("serial", 1) as executor:
         assert executor.run(threads, range(1), "x")[0].value == (1, 1, "1")
+    assert cv2.getNumThreads() == 2
 
 
 def test_no_tasks_are_no_work(pool: Executor) -> None:

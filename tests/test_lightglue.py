@@ -308,6 +308,21 @@ def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.Monk
         LightGlue(weights=str(tmp_path / "absent.pth"))(features(3), features(3), GEOMETRY)
 
 
+def test_weights_of_a_user_are_found_wanting_before_anything_is_matched(weights: str, tmp_path: Path) -> None:
+    recipe(weights).check_files(128)
+    LightGlue().check_files(128)
+    with pytest.raises(ConfigError, match="length 128, the extractor makes 64"):
+        recipe(weights).check_files(64)
+    (tmp_path / "other.safetensors").write_bytes(b"not a network")
+    with pytest.raises(ConfigError, match=r"other\.safetensors is damaged"):
+        recipe(str(tmp_path / "other.safetensors")).check_files(128)
+
+
+def test_surer_matches_are_only_those_above_the_threshold(weights: str) -> None:
+    assert recipe(weights, threshold=0.1)._least_probabilities() == [0.1, 0.3, 0.5, 0.8]
+    assert recipe(weights, threshold=0.8)._least_probabilities() == [0.8]
+
+
 def test_fingerprint_files_and_schema(weights: str) -> None:
     matcher = recipe(weights)
     assert matcher.fingerprint_files() == (weights,)

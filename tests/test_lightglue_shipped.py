@@ -24,10 +24,10 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Found, Found]:
 
 def test_the_network_recalls_more_at_the_ratio_tests_precision(answers: tuple[Found, Found]) -> None:
     ratio, network = answers
-    assert ratio.recall == pytest.approx(0.32, abs=0.03)  # a set as hard as it was
-    # 0.547 when these weights were made.
-    assert network.recall_at(ratio.precision) >= 0.53
-    assert network.wrong_at(ratio.recall) <= 0.5 * (~ratio.right).sum()
+    assert ratio.recall == pytest.approx(0.335, abs=0.03)  # a set as hard as it was
+    # 0.606 when these weights were made; those before them reach 0.526.
+    assert network.recall_at(ratio.precision) >= 0.58
+    assert network.wrong_at(ratio.recall) <= 0.4 * (~ratio.right).sum()
 
 
 def test_scores_mean_what_they_say(answers: tuple[Found, Found]) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+import train_lightglue
 from lightglue_training.batches import batch_of, piece
 from lightglue_training.blocks import Pair
 from lightglue_training.data import read_groups, write_groups
@@ -45,11 +47,25 @@ def test_partners_are_mutual_and_near_and_the_rest_is_none_or_unknown() -> None:
     places1 = np.array([[11.0, 10.0], [54.0, 10.0], [300.0, 10.0], [131.0, 10.0], [132.5, 10.0]])
     there0, there1 = places0.copy(), places1.copy()  # the identity
     there0[4] = np.nan  # hidden in the other picture
-    found = partners(places0, places1, there0, there1)
+    found = partners(side(places0), side(places1), there0, there1)
     #                              near  4 px off  no one   nearer of two  hidden
     assert found.of0.tolist() == [0, UNKNOWN, NONE, 3, NONE]
     #                              near  4 px off  no one  nearer  farther of two
     assert found.of1.tolist() == [0, UNKNOWN, NONE, 3, UNKNOWN]
+
+
+def test_of_places_described_twice_those_that_look_most_alike_are_partners() -> None:
+    first = side(np.array([[10.0, 10.0], [10.0, 10.0], [50.0, 10.0], [90.0, 10.0], [90.0, 10.0]]))
+    second = side(np.array([[11.0, 10.0], [11.0, 10.0], [50.0, 11.0], [50.0, 11.0], [200.0, 10.0]]), 1)
+    second.descriptors[[1, 0, 3]] = first.descriptors[[0, 1, 2]]
+    found = partners(first, second, first.places_px, second.places_px)
+    assert found.of0.tolist() == [1, 0, 3, NONE, NONE]
+    assert found.of1.tolist() == [1, 0, UNKNOWN, 2, NONE]
+    # Either description of the right place is right.
+    pair = Pair(first, second, found, False)
+    indices = np.array([[0, 1], [1, 0], [2, 4], [3, 4]])
+    assert judged([(pair, indices, np.ones(4))]).right.tolist() == [True, True, False, False]
+    assert judged([(pair, np.array([[0, 0]]), np.ones(1))]).right.tolist() == [True]
 
 
 def test_homography_truth_joins_places_of_the_same_point(picture: Path) -> None:
@@ -160,3 +176,26 @@ def test_a_calibration_is_found_again():
         assert low < mean <= high
         assert right == pytest.approx(mean, abs=4.0 * np.sqrt(0.25 / matches))
     assert max(abs(right - mean) for *_, mean, right in found.reliability(Calibration())) > 0.1
+
+
+def test_a_run_is_not_mixed_with_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        (tmp_path / "data" / name / "images").mkdir(parents=True)
+    parser = argparse.ArgumentParser()
+    plain = {"trained_on": "a", "unseen": "b", "groups": 200, "blocks": 19, "start": None, "scale": 1.0, "batch": 16}
+    args = argparse.Namespace(data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, **plain)
+    train_lightglue.check(parser, args)
+    args.only_data = False
+    train_lightglue.check(parser, args)
+    train_lightglue.check(parser, args)
+    for name, value, said in (
+        ("scale", 0.5, "holds another run (scale 1.0)"),
+        ("groups", 250, "holds another run (groups 200)"),
+        ("groups", 130, "multiple of 50"),
+        ("blocks", 4, "give at least 19"),
+        ("unseen", "c", "c has no folder images"),
+    ):
+        with pytest.raises(SystemExit) as refused:
+            train_lightglue.check(parser, argparse.Namespace(**(vars(args) | {name: value})))
+        assert refused.value.code == 2
+        assert said in capsys.readouterr().err

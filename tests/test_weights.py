@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets import weights
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.weights import (
     SHIPPED_FOLDER,
@@ -20,6 +22,7 @@ from aeromatch_cli.nets.weights import (
     resolve_weights,
     sha256_of_file,
     shipped_weights,
+    verify_shipped,
     verify_weights,
     weights_folder,
 )
@@ -161,13 +164,13 @@ def test_a_training_checkpoint_is_taken_by_its_network(tmp_path: Path, container
 @pytest.mark.parametrize("name", ["damaged.pth", "damaged.safetensors"])
 def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"not a weights file")
-    with pytest.raises(ConfigError, match=f"{name} cannot be read as"):
+    with pytest.raises(ConfigError, match=f"{name} is damaged or not"):
         read_tensors(tmp_path / name)
 
 
 def test_a_truncated_file_is_named(lightglue_file: Path) -> None:
     lightglue_file.write_bytes(lightglue_file.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match=r"small\.safetensors cannot be read as"):
+    with pytest.raises(ConfigError, match=r"small\.safetensors is damaged or not a safetensors file"):
         read_tensors(lightglue_file)
 
 
@@ -179,7 +182,7 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
             return Path.touch, (str(marker),)
 
     torch.save({"a": Bomb()}, tmp_path / "bomb.pth")
-    with pytest.raises(ConfigError, match="cannot be read"):
+    with pytest.raises(ConfigError, match="is damaged or not what"):
         read_tensors(tmp_path / "bomb.pth")
     assert not marker.exists()
 
@@ -199,3 +202,32 @@ def test_other_contents_are_refused(tmp_path: Path) -> None:
         read_tensors(tmp_path / "weights.onnx")
     with pytest.raises(ConfigError, match=r"absent\.pth does not exist"):
         read_tensors(tmp_path / "absent.pth")
+
+
+def test_what_ships_is_what_its_sums_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {entry.name for entry in shipped_weights()}
+    assert {check.name for check in verify_shipped()} == names
+    assert {check.state for check in verify_shipped()} == {"ok"}
+    copy = tmp_path / "trained"
+    shutil.copytree(weights.SHIPPED_FOLDER, copy)
+    monkeypatch.setattr(weights, "SHIPPED_FOLDER", copy)
+    (copy / "shadow.safetensors").unlink()
+    with (copy / "lightglue.safetensors").open("r+b") as stream:
+        stream.truncate(1_000_000)
+    assert [(c.name, c.state) for c in verify_shipped()] == [
+        ("lightglue.safetensors", "changed"),
+        ("shadow.safetensors", "missing"),
+    ]
+
+
+@pytest.mark.parametrize("shape", [(), (0, 4)])
+def test_matrices_that_are_none_are_refused(lightglue_file: Path, tmp_path: Path, shape: tuple[int, ...]) -> None:
+    tensors = read_tensors(lightglue_file)
+    for name in ("posenc.Wr.weight", "input_proj.weight"):
+        broken = tmp_path / "broken.safetensors"
+        save_file({**tensors, name: torch.zeros(shape)}, broken)
+        with pytest.raises(ConfigError, match=f"{name} of shape .* is no matrix"):
+            add_weights(broken)
+    save_file({name: value.to(torch.int8) for name, value in tensors.items()}, tmp_path / "whole.safetensors")
+    with pytest.raises(ConfigError, match=r"torch\.int8; export floating point"):
+        add_weights(tmp_path / "whole.safetensors")

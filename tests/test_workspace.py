@@ -44,7 +44,7 @@ class Recipe(Strategy):
     count: int = 3
     share: float = Field(0.5)
     words: tuple[str, ...] = ("a", "b")
-    weights: str = ""
+    weights: str = Field("", json_schema_extra={"path": True})
 
     def fingerprint_files(self) -> tuple[str, ...]:
         return (self.weights,) if self.weights else ()
@@ -275,7 +275,7 @@ def test_fingerprint_feels_every_field_of_every_strategy(name: str, tmp_path: Pa
     family, _, key = name.partition(".")
     default = FAMILIES[family][key]()
     if "weights" in type(default).model_fields:
-        (tmp_path / "own.pt").write_bytes(b"")
+        (tmp_path / "own.pt").write_bytes(b"")  # "other" does not exist
         default = default.model_copy(update={"weights": str(tmp_path / "own.pt")})
     prints = {fingerprint(default)}
     fields = [f for f in type(default).model_fields if f != "name"]
@@ -308,6 +308,8 @@ def test_fingerprint_feels_the_contents_of_weights(tmp_path: Path) -> None:
     weights.write_bytes(b"one")
     first = fingerprint(Recipe(weights=str(weights)))
     assert fingerprint(Recipe(weights=str(weights))) == first
+    (tmp_path / "moved.pt").write_bytes(b"one")
+    assert fingerprint(Recipe(weights=str(tmp_path / "moved.pt"))) == first
     weights.write_bytes(b"two")
     os.utime(weights, ns=(5, 5))
     assert fingerprint(Recipe(weights=str(weights))) != first

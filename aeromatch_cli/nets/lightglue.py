@@ -69,8 +69,9 @@ class FourierEncoding(nn.Module):
         nn.init.normal_(self.Wr.weight.data, mean=0.0, std=1.0)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Cosines and sines (B, 1, N, head_dim) of places (B, N, P), in float32."""
-        angles = functional.linear(places, self.Wr.weight.float()).unsqueeze(1)
+        """Cosines and sines (B, 1, N, head_dim) of places (B, N, P), in float32: angles of several turns need it."""
+        with torch.autocast(places.device.type, enabled=False):
+            angles = functional.linear(places.float(), self.Wr.weight.float()).unsqueeze(1)
         return angles.cos().repeat_interleave(2, dim=-1), angles.sin().repeat_interleave(2, dim=-1)
 
 
@@ -181,7 +182,9 @@ class Confidence(nn.Module):
 
 
 class LightGlue(nn.Module):
-    """The whole network. Its parameters' type decides in which precision layers compute; places stay float32."""
+    """The whole network. The type of the layers' parameters decides in which precision they compute (`with_layers_in`);
+    places and their code stay float32.
+    """
 
     def __init__(self, dimensions: Dimensions) -> None:
         super().__init__()
@@ -206,9 +209,16 @@ class LightGlue(nn.Module):
         """The head after layer `index`; the last layer has none."""
         return cast(Confidence, self.token_confidence[index])
 
+    def with_layers_in(self, kind: torch.dtype) -> LightGlue:
+        """This network, everything but the position code in another precision."""
+        for name, part in self.named_children():
+            if name != "posenc":
+                part.to(dtype=kind)
+        return self
+
     def begin(self, side: Side) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """States (B, N, dim) and position code of one side."""
-        kind = self.posenc.Wr.weight.dtype
+        kind = self.layers[0].self_attn.Wqkv.weight.dtype
         cosines, sines = self.posenc(side.places)
         return self.input_proj(side.descriptors.to(kind)), (cosines.to(kind), sines.to(kind))
 

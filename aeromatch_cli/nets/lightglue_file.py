@@ -23,6 +23,7 @@ _OLD_LAYER_KEY = re.compile(r"^(self|cross)_attn\.(\d+)\.")
 _LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
 _POSITION_KEY = "posenc.Wr.weight"
 _WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
+_PROJECTION_KEY = "input_proj.weight"
 _MAX_NAMED = 3
 # Entry of a safetensors file's metadata: slope and offset, separated by a space.
 CALIBRATION_KEY = "calibration"
@@ -63,9 +64,12 @@ def read_calibration(path: Path) -> Calibration:
             text = (content.metadata() or {}).get(CALIBRATION_KEY)
         if text is None:
             return Calibration()
-        slope, offset = (float(part) for part in text.split())
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError) as error:
         raise ConfigError(f"weights file {path}: its calibration cannot be read ({error})") from error
+    try:
+        slope, offset = (float(part) for part in text.split())
+    except ValueError:
+        slope = offset = math.nan
     if not (slope > 0.0 and math.isfinite(slope + offset)):
         raise ConfigError(f"weights file {path}: calibration {text!r} is no positive slope and an offset")
     return Calibration(slope, offset)
@@ -88,9 +92,12 @@ def canonical_keys(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def infer_dimensions(tensors: dict[str, Tensor]) -> Dimensions:
     """Dimensions from the shapes of canonical tensors. Raises ValueError where they are not a LightGlue's."""
-    missing = [key for key in (_POSITION_KEY, _WIDTH_KEY) if key not in tensors or tensors[key].ndim != 2]
+    missing = [key for key in (_POSITION_KEY, _WIDTH_KEY) if key not in tensors]
     if missing:
         raise ValueError(f"it has no {' and no '.join(missing)}")
+    for key in (_POSITION_KEY, _WIDTH_KEY, _PROJECTION_KEY):
+        if key in tensors and (tensors[key].ndim != 2 or not tensors[key].numel()):
+            raise ValueError(f"{key} of shape {tuple(tensors[key].shape)} is no matrix")
     descriptor_dim = int(tensors[_WIDTH_KEY].shape[0])
     half_head_dim, position_dim = (int(size) for size in tensors[_POSITION_KEY].shape)
     if position_dim not in (2, 4):
@@ -98,7 +105,7 @@ def infer_dimensions(tensors: dict[str, Tensor]) -> Dimensions:
     num_heads, rest = divmod(descriptor_dim, 2 * half_head_dim)
     if rest or num_heads == 0:
         raise ValueError(f"{_POSITION_KEY} and {_WIDTH_KEY} disagree")
-    projection = tensors.get("input_proj.weight")
+    projection = tensors.get(_PROJECTION_KEY)
     layers = {int(match.group(1)) for key in tensors if (match := _LAYER_KEY.match(key))}
     return Dimensions(
         input_dim=descriptor_dim if projection is None else int(projection.shape[-1]),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 # Weights that come with the package, each beside its model card.
 SHIPPED_FOLDER = Path(__file__).parent / "trained"
 SHIPPED_LIGHTGLUE = SHIPPED_FOLDER / "lightglue.safetensors"
+_SUMS = "SHA256SUMS"  # of what ships, as sha256sum writes and checks them
 SUFFIXES = (".safetensors", ".pth", ".pt")
 
 _INDEX_NAME = "index.json"
@@ -99,6 +100,19 @@ def shipped_weights() -> tuple[WeightsEntry, ...]:
     """Every file that ships with the package, by name; its architecture is its name's."""
     paths = sorted(SHIPPED_FOLDER.glob("*.safetensors"))
     return tuple(WeightsEntry(path.name, sha256_of_file(path), path.stat().st_size, path.stem) for path in paths)
+
+
+def verify_shipped() -> tuple[WeightsCheck, ...]:
+    """Compare every file that ships with the package with the sum that ships beside it."""
+    sums = (SHIPPED_FOLDER / _SUMS).read_text(encoding="ascii").split("\n")
+    checks = []
+    for expected, name in (line.split() for line in sums if line):
+        path = SHIPPED_FOLDER / name
+        if not path.is_file():
+            checks.append(WeightsCheck(name, "missing"))
+        else:
+            checks.append(WeightsCheck(name, "ok" if sha256_of_file(path) == expected else "changed"))
+    return tuple(checks)
 
 
 def verify_weights() -> tuple[WeightsCheck, ...]:
@@ -190,8 +204,10 @@ def _read(path: Path) -> Any:
             return load_file(path, device="cpu")
         return torch.load(path, map_location="cpu", weights_only=True)
     except (SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
-        reason = str(error).split("\n", maxsplit=1)[0]
-        raise ConfigError(f"weights file {path} cannot be read as {path.suffix}: {reason}") from error
+        holds = "a safetensors file" if path.suffix == ".safetensors" else "what torch.save writes, tensors only"
+        raise ConfigError(
+            f"weights file {path} is damaged or not {holds}; copy it again, or export the network's state dict"
+        ) from error
 
 
 def _checked_tensors(path: Path, content: Any) -> dict[str, Tensor]:
@@ -202,6 +218,8 @@ def _checked_tensors(path: Path, content: Any) -> dict[str, Tensor]:
     for name, value in content.items():
         if not isinstance(name, str) or not isinstance(value, torch.Tensor):
             raise ConfigError(f"weights file {path}: entry {name!r} is not a tensor; export the network's state dict")
-        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+        if not value.is_floating_point():
+            raise ConfigError(f"weights file {path}: tensor {name} is of type {value.dtype}; export floating point")
+        if not bool(torch.isfinite(value).all()):
             raise ConfigError(f"weights file {path}: tensor {name} holds NaN or infinity; the file is damaged")
     return dict(content)

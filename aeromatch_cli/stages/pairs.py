@@ -102,10 +102,10 @@ def _context(
 
 
 def _check_files(settings: Settings) -> None:
-    """Files that strategies need (weights, pair lists) are missed now and not after hours of extraction."""
+    """Files that strategies need (weights, pair lists) are found wanting now and not after hours of extraction."""
     chosen = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
     for strategy in (*chosen, *settings.filter, *settings.export):
-        strategy.fingerprint_files()
+        strategy.check_files(settings.extract.descriptor_length)
 
 
 def _turned(context: Context) -> set[str]:

@@ -44,8 +44,14 @@ class Strategy(BaseModel):
         return self.needs
 
     def fingerprint_files(self) -> tuple[str, ...]:
-        """Paths of files (weights) whose contents are part of the recipe."""
+        """Paths of files (weights) whose contents are part of the recipe; fields that name one carry "path" in their
+        json_schema_extra. Raises ConfigError where one is missing.
+        """
         return ()
+
+    def check_files(self, descriptor_length: int) -> None:
+        """Raises ConfigError where a file is missing, or is not what it is named for with this extractor."""
+        self.fingerprint_files()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +103,13 @@ class Simulator(Protocol):
 
 
 class Extractor(Protocol):
-    """colours: whether the stage adds the colour around every keypoint to the features.
+    """descriptor_length: of every descriptor.
+    colours: whether the stage adds the colour around every keypoint to the features.
     follows_north: whether what it makes of a view that has north up is only comparable with such views.
     with_room_for: the same for images that get further views only because other images have no attitude.
     """
+
+    descriptor_length: ClassVar[int]
 
     @property
     def colours(self) -> bool: ...

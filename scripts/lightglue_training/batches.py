@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from aeromatch_cli.nets.lightglue import Side, normalised
+from aeromatch_cli.strategies.matchers.lightglue import FRAME_PX
 from lightglue_training.sides import UNKNOWN, Array, Partners, Seen
 
 
@@ -60,7 +61,7 @@ def _framed(side: Seen, framed: bool, turn: float, scale: float) -> Seen:
     matrix = np.array([[cosine, -sine], [sine, cosine]], np.float32) * np.float32(scale)
     points = (side.points_px - side.size_px / 2.0) @ matrix.T
     if framed:
-        low, high = points.min(axis=0) - 4.0, points.max(axis=0) + 4.0
+        low, high = points.min(axis=0) - FRAME_PX, points.max(axis=0) + FRAME_PX
     else:
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side.size_px / 2.0 @ matrix.T
         low, high = corners.min(axis=0), corners.max(axis=0)

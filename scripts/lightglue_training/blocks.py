@@ -49,7 +49,7 @@ def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[s
             there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
             there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
             there0[hidden0], there1[hidden1] = np.nan, np.nan
-            found_partners = partners(side0.places_px, side1.places_px, there0, there1)
+            found_partners = partners(side0, side1, there0, there1)
             if found_partners.count >= LEAST_PARTNERS:
                 found.append(Pair(side0, side1, found_partners, suns[name0] != suns[name1]))
     return found

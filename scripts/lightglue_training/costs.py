@@ -66,7 +66,7 @@ def in_bfloat16(network: LightGlue) -> LightGlue:
     """A copy."""
     half = LightGlue(network.dimensions).to(next(network.parameters()).device).eval()
     half.load_state_dict(network.state_dict())
-    return half.to(dtype=torch.bfloat16)
+    return half.with_layers_in(torch.bfloat16)
 
 
 def _kornia(dimensions: Dimensions, device: str, weights: LightGlue | None) -> Callable[[Pair], Any]:

@@ -100,8 +100,9 @@ def write_block(path: Path, pairs: Callable[[], list[Pair]]) -> None:
 
 
 def _save(path: Path, arrays: dict[str, Any]) -> None:
-    partly = path.with_suffix(".partly.npz")
-    np.savez(partly, **arrays)
+    partly = path.with_suffix(".partly")  # no .npz: a killed run's is never read
+    with partly.open("wb") as stream:
+        np.savez(stream, **arrays)
     partly.replace(path)
 
 

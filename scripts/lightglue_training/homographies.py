@@ -34,7 +34,7 @@ class Group:
         forward = self.matrices[second] @ np.linalg.inv(self.matrices[first])
         sides = self.views[first], self.views[second]
         there = _moved(forward, sides[0].places_px), _moved(np.linalg.inv(forward), sides[1].places_px)
-        return partners(sides[0].places_px, sides[1].places_px, *there)
+        return partners(*sides, *there)
 
 
 def _moved(matrix: Array, points_px: Array) -> Array:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Features
@@ -76,12 +77,35 @@ def _renumbered(partners: Array, rows: Array) -> Array:
     return out
 
 
-def partners(places0_px: Array, places1_px: Array, there0_px: Array, there1_px: Array) -> Partners:
-    """From keypoints (M, 2), (N, 2) and where they truly are in the other picture (not finite: nowhere).
+def partners(side0: Seen, side1: Seen, there0_px: Array, there1_px: Array) -> Partners:
+    """From two sides and where their places truly are in the other picture, (M, 2), (N, 2), not finite: nowhere.
 
-    Partners are each other's nearest, within CORRECT_PX in both directions. A keypoint is without partner where no
-    other lies within WRONG_PX in either direction; in between nothing is known.
+    Places are partners that are each other's nearest, within CORRECT_PX in both directions. A place is without partner
+    where no other lies within WRONG_PX in either direction; in between nothing is known. SIFT describes a third of the
+    places twice or more, along several gradients: of such, those that look most alike are partners, one to one, and of
+    the others nothing is known.
     """
+    (places0, rows0, of_place0), (places1, rows1, of_place1) = (
+        np.unique(side.places_px, axis=0, return_index=True, return_inverse=True) for side in (side0, side1)
+    )
+    by_place = _of_places(places0, places1, there0_px[rows0], there1_px[rows1])
+    of0, of1 = (
+        np.where(mates[places] == NONE, NONE, UNKNOWN).astype(np.int32)
+        for mates, places in ((by_place.of0, of_place0), (by_place.of1, of_place1))
+    )
+    groups0, groups1 = (
+        np.split(np.argsort(p, kind="stable"), np.cumsum(np.bincount(p))[:-1]) for p in (of_place0, of_place1)
+    )
+    for place in np.flatnonzero(by_place.of0 >= 0):
+        first, second = groups0[place], groups1[by_place.of0[place]]
+        apart = side0.descriptors[first][:, None].astype(np.float32) - side1.descriptors[second]
+        chosen = linear_sum_assignment((apart**2).sum(axis=2))
+        of0[first[chosen[0]]], of1[second[chosen[1]]] = second[chosen[1]], first[chosen[0]]
+    return Partners(of0, of1)
+
+
+def _of_places(places0_px: Array, places1_px: Array, there0_px: Array, there1_px: Array) -> Partners:
+    """Partners of places, each of which occurs once."""
     forward, backward = _nearest(there0_px, places1_px), _nearest(there1_px, places0_px)
     of0, of1 = (np.where(near[0] > WRONG_PX, NONE, UNKNOWN) for near in (forward, backward))
     candidates = np.flatnonzero(forward[0] <= CORRECT_PX)

@@ -82,13 +82,17 @@ def fitted(found: Found) -> Calibration:
 
 
 def judged(answers: Iterable[tuple[Pair, Array, Array]]) -> Found:
-    """answers: pair, matches (M, 2) as rows of its sides, scores (M,). What truth does not know is left out."""
+    """answers: pair, matches (M, 2) as rows of its sides, scores (M,). What truth does not know is left out.
+
+    A match is right where it leads to the place of the keypoint's partner, which may be described there twice.
+    """
     scores, right, possible = [np.zeros(0)], [np.zeros(0, bool)], 0
     for pair, indices, values in answers:
         partner = pair.truth.of0[indices[:, 0]]
         known = (partner != UNKNOWN) & (pair.truth.of1[indices[:, 1]] != UNKNOWN)
         scores.append(values[known])
-        right.append((partner == indices[:, 1])[known])
+        places = pair.side1.places_px
+        right.append(((partner >= 0) & (places[partner] == places[indices[:, 1]]).all(axis=1))[known])
         possible += int((pair.truth.of0 >= 0).sum())
     return Found(np.concatenate(scores), np.concatenate(right), possible)
 

@@ -30,6 +30,7 @@ class Sift(Strategy):
 
     version: ClassVar[int] = 3
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
+    descriptor_length: ClassVar[int] = 128
     name: Literal["sift"] = "sift"
     keypoints: int = Field(
         4000,

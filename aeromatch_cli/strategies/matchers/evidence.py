@@ -15,8 +15,8 @@ from aeromatch_cli.strategies.matchers.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
 
 # Fewer matches support no model, whatever the odds that chance gives it.
-_MIN_INLIERS = 12
-_LOG10_FALSE_ALARMS = -3.0
+MIN_INLIERS = 12
+LOG10_FALSE_ALARMS = -3.0
 _MODEL_PX = 4.0
 _TRIALS = 16
 
@@ -30,18 +30,18 @@ class Evidence:
 
     @property
     def beyond_chance(self) -> bool:
-        return self.log10_false_alarms <= _LOG10_FALSE_ALARMS
+        return self.log10_false_alarms <= LOG10_FALSE_ALARMS
 
 
 def evidence_of(asked: Comparison, found: Found, places0_px: FloatArray, places1_px: FloatArray) -> Evidence | None:
     """Of matches in which no keypoint occurs twice; None where too few agree. places: (K0, 2), (K1, 2) undistorted."""
     idx0, idx1 = asked.keypoints(found)
     usable: BoolArray = np.asarray(np.isfinite(places0_px[idx0] + places1_px[idx1]).all(axis=1))
-    if usable.sum() < _MIN_INLIERS:
+    if usable.sum() < MIN_INLIERS:
         return None
     points0, points1 = places0_px[idx0[usable]], places1_px[idx1[usable]]
     model = estimate(points0, points1, asked.geometry, "relative_pose", Sampling(_MODEL_PX), 0)
-    if model.inliers.sum() < _MIN_INLIERS:
+    if model.inliers.sum() < MIN_INLIERS:
         return None
 
     def distance(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -62,13 +62,13 @@ def evidence_of(asked: Comparison, found: Found, places0_px: FloatArray, places1
 
 
 def most_evident(asked: Comparison, sets: Sequence[Found]) -> Found:
-    """The set, each keypoint once, whose matches support a model farthest beyond chance; the first where none does."""
+    """The set whose matches, each keypoint once, support a model farthest beyond chance; the first where none does."""
     geometry = asked.geometry
     places0 = undistort(geometry.camera0, asked.features0.keypoints_px)
     places1 = undistort(geometry.camera1, asked.features1.keypoints_px)
-    best, most = sets[0], 0.0
-    for found in sets:
-        single = found.take(one_to_one(*asked.keypoints(found), found.costs))
+    singles = [found.take(one_to_one(*asked.keypoints(found), found.costs)) for found in sets]
+    best, most = singles[0], 0.0
+    for single in singles:
         evidence = evidence_of(asked, single, places0, places1)
         if evidence is not None and evidence.log10_false_alarms < most:
             best, most = single, evidence.log10_false_alarms

@@ -31,8 +31,8 @@ from aeromatch_cli.strategies.matchers.search import Search
 _DOUBTFUL = 0.7
 # Where the network sees more than there is, its surest matches alone, or none, support a model better: probabilities.
 _SURER = (0.3, 0.5, 0.8)
-# Around the keypoints that are left of a view, as in training.
-_FRAME_PX = 4.0
+# Around the keypoints that are left of a view; training takes it from here.
+FRAME_PX = 4.0
 
 
 class LightGlue(Search):
@@ -41,13 +41,13 @@ class LightGlue(Search):
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["lightglue"] = "lightglue"
     enough: int = Field(
         250,
         ge=1,
         description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
-        "asked: it takes five times as long. Larger than `extract.keypoints`: it is always asked.",
+        "asked: it takes five times as long. For its matches everywhere, set `ample` as high as this.",
     )
     weights: str | None = Field(
         None,
@@ -55,10 +55,16 @@ class LightGlue(Search):
         json_schema_extra={"path": "or name"},
     )
     threshold: float = Field(
-        0.1, ge=0.0, le=1.0, description="Smallest probability of a match, as far as the weights are calibrated."
+        0.1,
+        ge=0.0,
+        le=1.0,
+        description="Smallest probability of a match of the network's, as far as the weights are calibrated. "
+        "Matches of the other searches join whatever it is.",
     )
     overlap: bool = Field(
-        True, description="Only keypoints that the other image may show, as far as poses and ground tell, are compared."
+        True,
+        description="Only keypoints that the other image may show are compared, as far as the plane of the matches "
+        "found before, or else poses and ground, tell.",
     )
     depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
     width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
@@ -66,13 +72,15 @@ class LightGlue(Search):
         2048, ge=1, description="Strongest descriptors kept per view; time grows with its square."
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
-        "auto", description="Of the network's layers; auto is bfloat16 where the processor has it."
+        "auto",
+        description="Of the network's layers; auto is bfloat16 where the processor has it. One in a thousand matches "
+        "depends on it: name one for shards on different processors.",
     )
     device: Literal["cpu", "auto"] = Field("cpu", description="`auto` takes CUDA where there is one.")
 
     def reads(self) -> frozenset[str]:
-        """Nothing of the geometry, unless guided or limited to the overlap."""
-        return self.needs if self.guided or self.overlap else frozenset()
+        """The cameras, in which a pair's matches are judged; more where guided or limited to the overlap."""
+        return self.needs if self.guided or self.overlap else frozenset({"camera"})
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
@@ -87,6 +95,16 @@ class LightGlue(Search):
             )
         return (str(SHIPPED_LIGHTGLUE),)
 
+    def check_files(self, descriptor_length: int) -> None:
+        """Weights that a user names are loaded once; those that ship are `aeromatch weights verify`'s."""
+        (path,) = self.fingerprint_files()
+        if self.weights is not None:
+            from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
+
+            network = load_lightglue(Path(path))
+            _check_length(network.dimensions.input_dim, descriptor_length)
+            read_calibration(Path(path))
+
     def scan(self, asked: Comparison) -> Found:
         """The mutual ratio test."""
         return Nearest().scan(asked)
@@ -98,9 +116,12 @@ class LightGlue(Search):
         shown = in_overlap(asked, found, self.windows) if self.overlap else None
         closer = self.by_network(asked, shown)
         doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
-        surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in (0.0, *_SURER)]
+        surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in self._least_probabilities()]
         closer = most_evident(asked, [*surer, doubtful])
         return again(closer, keep=True) if again else closer
+
+    def _least_probabilities(self) -> list[float]:
+        return [self.threshold, *(least for least in _SURER if least > self.threshold)]
 
     def by_network(self, asked: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Found:
         """Matches of all view pairs that are alike, each keypoint once, costs 1 - probability.
@@ -111,8 +132,9 @@ class LightGlue(Search):
         """
         (path,) = self.fingerprint_files()
         matcher = _matcher(path, _content_stamp(path), self)
-        everything = [np.ones(len(f.keypoints_px), dtype=bool) for f in (asked.features0, asked.features1)]
-        shown0, shown1 = shown or everything
+        if shown is None:
+            shown = np.ones(len(asked.features0.keypoints_px), bool), np.ones(len(asked.features1.keypoints_px), bool)
+        shown0, shown1 = shown
         parts = []
         for view0, view1 in np.argwhere(asked.alike):
             side0 = self._view(asked.features0, int(view0), shown0)
@@ -123,10 +145,10 @@ class LightGlue(Search):
         found = asked.within(joined(parts))
         return found.take(one_to_one(*asked.keypoints(found), found.costs))
 
-    def _view(self, features: Features, view: int, seen: BoolArray) -> _Side:
+    def _view(self, features: Features, view: int, shown: BoolArray) -> _Side:
         rows = np.flatnonzero(features.view_idx == view)
         total = len(rows)
-        rows = rows[seen[features.descriptor_keypoint_idx[rows]]]
+        rows = rows[shown[features.descriptor_keypoint_idx[rows]]]
         culled = len(rows) < total
         if len(rows) > self.max_keypoints:
             strength = features.responses[features.descriptor_keypoint_idx[rows]]
@@ -135,8 +157,8 @@ class LightGlue(Search):
         # Sub-pixel refinement can push a point over the border.
         points = np.clip(features.view_keypoints_px[rows].astype(np.float32) + np.float32(COLMAP_OFFSET_PX), 0, size_px)
         if culled and len(rows):
-            low = points.min(axis=0) - np.float32(_FRAME_PX)
-            size_px = points.max(axis=0) + np.float32(_FRAME_PX) - low
+            low = points.min(axis=0) - np.float32(FRAME_PX)
+            size_px = points.max(axis=0) + np.float32(FRAME_PX) - low
             points = points - low
         return _Side(
             rows=rows,
@@ -180,18 +202,22 @@ class _Matcher:
 
         from aeromatch_cli.nets.lightglue import Side, normalised
 
-        length, dimensions = side.descriptors.shape[1], self.network.dimensions
-        if length != dimensions.input_dim:
-            raise ConfigError(
-                f"these LightGlue weights expect descriptors of length {dimensions.input_dim}, the extractor "
-                f"makes {length}; use weights trained for it"
-            )
+        dimensions = self.network.dimensions
+        _check_length(dimensions.input_dim, side.descriptors.shape[1])
         places = normalised(torch.from_numpy(side.points_px), torch.from_numpy(side.size_px))
         if dimensions.add_scale_ori:
             more = np.stack([side.scales_px, side.orientations_rad], axis=1)
             places = torch.cat([places, torch.from_numpy(more)], dim=1)
         descriptors = torch.from_numpy(np.ascontiguousarray(side.descriptors))
         return Side(places[None].to(self.device), descriptors[None].to(self.device))
+
+
+def _check_length(expected: int, given: int) -> None:
+    if given != expected:
+        raise ConfigError(
+            f"these LightGlue weights expect descriptors of length {expected}, the extractor makes {given}; use "
+            "weights trained for it"
+        )
 
 
 def _content_stamp(path: str) -> tuple[int, int]:
@@ -210,7 +236,7 @@ def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _M
     network = load_lightglue(Path(path), device=device)
     native = torch.cuda.is_bf16_supported() if device == "cuda" else _has_bfloat16()
     if recipe.precision == "bfloat16" or (recipe.precision == "auto" and native):
-        network = network.to(dtype=torch.bfloat16)
+        network = network.with_layers_in(torch.bfloat16)
     calibration = read_calibration(Path(path))
     options = {name: getattr(recipe, name) for name in ("depth_confidence", "width_confidence")}
     options["threshold"] = calibration.score_of(recipe.threshold)

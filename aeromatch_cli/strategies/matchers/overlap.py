@@ -13,12 +13,11 @@ from aeromatch_cli.geometry.planes import plane_distances_px
 from aeromatch_cli.geometry.prediction import Windows
 from aeromatch_cli.geometry.two_view import H_SAMPLE, Sampling, chance_errors_px, log10_false_alarms
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.evidence import LOG10_FALSE_ALARMS, MIN_INLIERS
 
 # One plane stands for the ground with all that rises over it: so far beside it, in longer sides of the box of what
 # is matched, matches lie, and so far beyond the other picture's keypoints one may seem to lie.
 _PLANE_SHARE, _MARGIN_SHARE = 0.02, 0.15
-_MIN_INLIERS = 12
-_LOG10_FALSE_ALARMS = -3.0
 
 
 def in_overlap(
@@ -49,14 +48,14 @@ def _plane(points0_px: FloatArray, points1_px: FloatArray) -> FloatArray | None:
     import poselib
 
     usable = np.asarray(np.isfinite(points0_px + points1_px).all(axis=1))
-    if usable.sum() < _MIN_INLIERS:
+    if usable.sum() < MIN_INLIERS:
         return None
     points0, points1 = points0_px[usable], points1_px[usable]
     threshold_px = _PLANE_SHARE * _longer_side(points1)
     options = Sampling(threshold_px).options(0, "max_reproj_error")
     matrix, info = poselib.estimate_homography(points0, points1, options, {})
     inliers = np.asarray(info["inliers"], dtype=bool)
-    if inliers.sum() < _MIN_INLIERS:
+    if inliers.sum() < MIN_INLIERS:
         return None
     plane = _positive(np.asarray(matrix), points0[inliers])
 
@@ -65,7 +64,7 @@ def _plane(points0_px: FloatArray, points1_px: FloatArray) -> FloatArray | None:
 
     errors = chance_errors_px(distance, points0, points1)
     odds = log10_false_alarms(points0, points1, inliers, errors, threshold_px, H_SAMPLE)
-    return plane if odds <= _LOG10_FALSE_ALARMS else None
+    return plane if odds <= LOG10_FALSE_ALARMS else None
 
 
 def _positive(plane: FloatArray, points_px: FloatArray) -> FloatArray:
