@@ -47,7 +47,7 @@ class LightGlue(Search):
         250,
         ge=1,
         description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
-        "asked: it takes five times as long. For its matches everywhere, set `ample` as high as this.",
+        "asked: it takes five times as long. For it everywhere, raise this and `ample` above `extract.keypoints`.",
     )
     weights: str | None = Field(
         None,
@@ -73,8 +73,8 @@ class LightGlue(Search):
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto",
-        description="Of the network's layers; auto is bfloat16 where the processor has it. One in a thousand matches "
-        "depends on it: name one for shards on different processors.",
+        description="Of the network's layers; auto is bfloat16 where the processor has it. Matches "
+        "depend on it: name one for shards on different processors.",
     )
     device: Literal["cpu", "auto"] = Field("cpu", description="`auto` takes CUDA where there is one.")
 
