@@ -133,6 +133,16 @@ class Settings(_Section):
         return value
 
     @model_validator(mode="after")
+    def _descriptors_for_matchers(self) -> Settings:
+        if not self.extract.descriptor_length and not self.match.reads_pixels:
+            readers = [name for name, strategy in MATCHERS.items() if strategy.reads_pixels]
+            raise ValueError(
+                f"extract {self.extract.name} describes nothing that match {self.match.name} could compare; "
+                f"use match {' or '.join(readers)}, or another extract"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _colours_for_filters(self) -> Settings:
         readers = [getattr(one, "name", "") for one in self.filter if "colour" in one.needs]
         if readers and not self.extract.colours:

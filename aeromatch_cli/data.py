@@ -75,6 +75,32 @@ class Ground(Protocol):
         ...
 
 
+class Raster(Protocol):
+    """A stored picture, read only as far as it is needed: gray, float32, proportional to light as far as it is known.
+
+    Every read gives values (H, W) on one scale and where they are valid, (H, W) or None = everywhere.
+    """
+
+    @property
+    def width_px(self) -> int: ...
+
+    @property
+    def height_px(self) -> int: ...
+
+    @property
+    def finest(self) -> float:
+        """The largest scale that anything may be read at, 1 for stored pixels."""
+        ...
+
+    def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
+        """The whole picture, its area averaged to `scale` <= 1: stored pixel x lies at (x + 0.5) scale - 0.5."""
+        ...
+
+    def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
+        """Stored pixels from (left, top), which must lie inside."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """What was flown.
@@ -195,6 +221,7 @@ class Matches:
     indices: (M, 2) int32 into both images' keypoints, -1 for a point measured without a detector.
     scores: (M,) float32 in 0-1, larger is better. view_pairs: (M, 2) int16, the views that found each.
     points0_px, points1_px: (M, 2) float64 measured places in source pixels, or None where indices say it all.
+    remark: why a matcher that judges the pair as a whole found nothing, else "".
     """
 
     indices: IntArray
@@ -202,6 +229,7 @@ class Matches:
     view_pairs: IntArray
     points0_px: FloatArray | None = None
     points1_px: FloatArray | None = None
+    remark: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,6 +43,7 @@ matches/<id0>.npz            one row: all pairs of id0, concatenated; pair p own
   indices (M,2) int32 into both keypoint lists, -1 for a point measured without a detector
   scores (M,) float32 in 0-1; view_pairs (M,2) int16; strategy (P,) str
   points0_px, points1_px (M,2) float64, present only where some index is -1
+  remark (P,) str: why a matcher that judges pairs as a whole found nothing; present only where one did
 
 verified/<id0>.npz           the same row layout, only kept matches
   image_id1, fingerprint, offsets, indices, scores, [points0_px, points1_px] as above
@@ -285,12 +286,12 @@ class VerifiedEntry:
 
 
 def write_match_row(stream: BinaryIO, entries: Sequence[MatchEntry]) -> None:
-    np.savez(
-        stream,
-        **_row_arrays(entries),  # type: ignore[arg-type]
-        strategy=_strings([e.strategy for e in entries]),
-        view_pairs=_joined([e.matches.view_pairs for e in entries], (0, 2), np.int16),
-    )
+    arrays = _row_arrays(entries)
+    arrays["strategy"] = _strings([e.strategy for e in entries])
+    arrays["view_pairs"] = _joined([e.matches.view_pairs for e in entries], (0, 2), np.int16)
+    if any(e.matches.remark for e in entries):
+        arrays["remark"] = _strings([e.matches.remark for e in entries])
+    np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def read_match_row(path: Path) -> dict[str, MatchEntry]:
@@ -390,6 +391,7 @@ class _Row:
             np.zeros((len(indices), 2), np.int16) if view_pairs is None else view_pairs[span],
             self["points0_px"][span] if measured else None,
             self["points1_px"][span] if measured else None,
+            str(self["remark"][p]) if "remark" in self._arrays else "",
         )
 
 

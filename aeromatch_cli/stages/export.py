@@ -15,6 +15,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import MatchEntry, read_keypoints, read_match_row
 from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
 from aeromatch_cli.stages.filter import outdated_pairs, pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents
 from aeromatch_cli.workspace import fingerprint, read_json, translated_os_errors
@@ -101,10 +102,31 @@ def _contents(context: Context) -> ExportContents:
         # An image whose extraction failed is exported without keypoints, so that ids stay complete.
         return read_keypoints(path)[0] if path.exists() else np.zeros((0, 2), np.float32)
 
-    return ExportContents(context.block, keypoints_px, _pairs(context), context.guessed_cameras)
+    if not context.settings.match.reads_pixels:
+        return ExportContents(context.block, keypoints_px, _pairs(context), context.guessed_cameras)
+    tracks = tracks_of(
+        list(_matched(context)), keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id])
+    )
+
+    def with_measured_px(image_id: str) -> FloatArray:
+        return tracks.keypoints_px[image_id] if image_id in tracks.keypoints_px else keypoints_px(image_id)
+
+    return ExportContents(context.block, with_measured_px, _joined(context, tracks), context.guessed_cameras)
+
+
+def _joined(context: Context, tracks: Tracks) -> Iterator[PairContents]:
+    for item in _matched(context):
+        key, verdict = (item.pair.image_id0, item.pair.image_id1), item.verified.verdict
+        yield PairContents(item.pair, tracks.raw[key], tracks.verified[key], verdict.model_kind, verdict.model)
 
 
 def _pairs(context: Context) -> Iterator[PairContents]:
+    for item in _matched(context):
+        verdict, kept = item.verified.verdict, item.verified.matches.indices
+        yield PairContents(item.pair, item.raw.indices, kept, verdict.model_kind, verdict.model)
+
+
+def _matched(context: Context) -> Iterator[MatchedPair]:
     row_id, row = "", dict[str, MatchEntry]()
     for pair, entry in verified_pairs(context):
         if pair.image_id0 != row_id:
@@ -112,5 +134,4 @@ def _pairs(context: Context) -> Iterator[PairContents]:
         found = row.get(pair.image_id1)
         if found is None:  # the row was rewritten under another configuration while this one ran
             raise BrokenFileError(str(context.workspace.matches(pair.image_id0)), f"no entry {pair.image_id1}")
-        raw = found.matches
-        yield PairContents(pair, raw.indices, entry.matches.indices, entry.verdict.model_kind, entry.verdict.model)
+        yield MatchedPair(pair, found.matches, entry)

@@ -107,6 +107,8 @@ def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry
     kept = select(entry.matches, verdict.keep)
     errors = None if verdict.errors_px is None else verdict.errors_px[verdict.keep]
     verdict = replace(verdict, keep=np.ones(len(kept.indices), dtype=bool), errors_px=errors)
+    if entry.matches.remark:
+        verdict = replace(verdict, reason=entry.matches.remark)
     return VerifiedEntry(entry.image_id1, pair.fingerprint, len(entry.matches.indices), kept, verdict)
 
 

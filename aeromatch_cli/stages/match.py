@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,7 +11,9 @@ from aeromatch_cli.data import Features, Pair
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage
+from aeromatch_cli.stages.enhance import EnhanceTask
 from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.stages.sources import StoredRaster
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
@@ -24,6 +27,8 @@ class MatchTask:
     matcher: Matcher
     workspace: Workspace
     overwrite: bool
+    # By image_id, for a matcher that reads pixels.
+    sources: Mapping[str, EnhanceTask] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,10 @@ def make_tasks(context: Context) -> list[MatchTask]:
         usable = [p for p in pairs if p.image_id0 in features and p.image_id1 in features]
         row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p), seed=0) for p in usable)
         if row:
-            tasks.append(MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite))
+            ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
+            sources = {image_id: extract.task_of(context, image_id).views.source for image_id in ids}
+            task = MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite, sources)
+            tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
 
@@ -75,7 +83,12 @@ def run_task(task: MatchTask) -> RowResult:
 
 def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
     path1 = task.workspace.features(pair.image_id1)
-    matches = task.matcher(features0, _features(path1, _stamp(path1)), pair.geometry)
+    ids = (task.image_id0, pair.image_id1)
+    asked = features0, _features(path1, _stamp(path1)), pair.geometry
+    if task.matcher.reads_pixels:
+        matches = task.matcher(*asked, (StoredRaster(task.sources[ids[0]]), StoredRaster(task.sources[ids[1]])))
+    else:
+        matches = task.matcher(*asked)
     return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
 
 

@@ -7,7 +7,7 @@ Calls, by family (table in the family's __init__):
   enhancers   strategy(pixels, valid) -> Enhanced                    one image, before any view is made
   simulators  strategy(camera, pose, ground_z_m, gsd_m, neighbours) -> tuple[View, ...]
   extractors  strategy(camera, views) -> Features                    views: ViewPixels of one image
-  matchers    strategy(features0, features1, geometry) -> Matches
+  matchers    strategy(features0, features1, geometry) -> Matches      those with reads_pixels: also rasters, of both
   filters     strategy(candidates, geometry, seed) -> Verdict            points in stored pixels
   exporters   strategy(contents, folder) -> ExportSummary            the only family that writes: a foreign format
 """
@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Protocol
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from aeromatch_cli.data import BoolArray, Camera, Features, Matches, Neighbour, PairGeometry, Pose, View
+from aeromatch_cli.data import BoolArray, Camera, Features, Matches, Neighbour, PairGeometry, Pose, Raster, View
 
 
 class Strategy(BaseModel):
@@ -31,12 +31,14 @@ class Strategy(BaseModel):
     needs: what the call reads of an image's geometry, of "camera", "pose" (centre and attitude), "sigma", "ground" and
     "neighbours" (cameras, poses and ground of the images it is paired with); only that enters the fingerprint, so that
     a change re-does exactly the stages that depend on it. A filter that reads "colour" needs extract.colours.
+    reads_pixels: True for a matcher that is also given both images' rasters.
     verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
+    reads_pixels: ClassVar[bool] = False
     verifies: ClassVar[bool] = True
 
     def reads(self) -> frozenset[str]:
@@ -124,5 +126,8 @@ class Extractor(Protocol):
 
 class Matcher(Protocol):
     name: str
+    reads_pixels: ClassVar[bool]
 
-    def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches: ...
+    def __call__(
+        self, features0: Features, features1: Features, geometry: PairGeometry, *rasters: tuple[Raster, Raster]
+    ) -> Matches: ...

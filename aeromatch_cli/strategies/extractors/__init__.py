@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.extractors.lattice import Lattice
 from aeromatch_cli.strategies.extractors.sift import Sift
 
-EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift}
+EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift, "lattice": Lattice}

@@ -1,4 +1,4 @@
-"""Matchers: strategy(features0, features1, geometry) -> Matches, once per pair."""
+"""Matchers: strategy(features0, features1, geometry[, rasters]) -> Matches, once per pair."""
 
 from __future__ import annotations
 
@@ -7,5 +7,6 @@ from collections.abc import Mapping
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.polar import Polar
 
-MATCHERS: Mapping[str, type[Strategy]] = {"nearest": Nearest, "lightglue": LightGlue}
+MATCHERS: Mapping[str, type[Strategy]] = {"nearest": Nearest, "lightglue": LightGlue, "polar": Polar}

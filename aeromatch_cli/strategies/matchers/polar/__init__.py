@@ -1,0 +1,91 @@
+"""Polar: registration of two pictures by least squares in dynamic polar coordinates, and tie points on its ground.
+
+For grass, sand and ploughed fields, where few features are found twice: every pixel of the overlap takes part. The
+similarity between both pictures is searched for from coarse to fine, with the poses as a start where they are known
+and without them where they are not; where it is right, the lattice of image 0 is measured in image 1.
+
+Source: dynamic polar parameterisation of least-squares registration for nadir images, J. Geo-inf. Sci. 2019(10),
+1586-1593.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from aeromatch_cli.data import Features, FloatArray, Matches, PairGeometry, Raster
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
+from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
+from aeromatch_cli.strategies.matchers.polar.registration import Prior, Registration, register
+from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """A pair's sides in their frames, their pictures from coarse to fine, and the registration between the frames."""
+
+    side0: Side
+    side1: Side
+    levels: Pyramid
+    registration: Registration
+
+
+class Polar(Strategy):
+    """Least-squares registration of the whole overlap, and least-squares tie points."""
+
+    version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
+    reads_pixels: ClassVar[bool] = True
+    name: Literal["polar"] = "polar"
+    sigmas: float = Field(3.0, gt=0.0, description="Poses may be wrong by so many standard deviations.")
+    smallest_scale: float = Field(0.78, gt=0.0, description="Without poses: scale of image 1 over image 0, at least.")
+    largest_scale: float = Field(1.28, gt=0.0, description="Without poses: at most.")
+    window: int = Field(21, ge=7, le=101, description="Side of the windows that tie points are measured with, pixels.")
+    least_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
+    largest_sigma_px: float = Field(0.3, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
+
+    def __call__(
+        self,
+        features0: Features,
+        features1: Features,
+        geometry: PairGeometry,
+        rasters: tuple[Raster, Raster] | None = None,
+    ) -> Matches:
+        """features0.keypoints_px are measured in image 1; features1 is not read. Scores are correlations."""
+        del features1
+        if rasters is None:
+            raise ValueError("polar compares pixels: it needs both rasters")
+        found = self.registered(rasters[0], rasters[1], geometry)
+        points = self.measured(found, features0.keypoints_px)
+        indices = np.full((len(points.rows), 2), -1, np.int32)
+        indices[:, 0] = points.rows
+        return Matches(
+            indices=indices,
+            scores=np.clip(points.correlations, 0.0, 1.0).astype(np.float32),
+            view_pairs=np.zeros((len(indices), 2), np.int16),
+            points0_px=features0.keypoints_px[points.rows].astype(np.float64),
+            points1_px=points.points1_px,
+            remark=found.registration.reason,
+        )
+
+    def registered(self, raster0: Raster, raster1: Raster, geometry: PairGeometry) -> Registered:
+        """Registration of one pair, in the frames of its sides, with what tie points need afterwards."""
+        posed = grounded(raster0, raster1, geometry, self.sigmas)
+        side0, side1 = (Side.stored(raster0), Side.stored(raster1)) if posed is None else (posed.side0, posed.side1)
+        longest = max(side0.width_px, side0.height_px, side1.width_px, side1.height_px)
+        levels = Pyramid(side0.read, side1.read, longest)
+        prior = None
+        if posed is not None:
+            prior = Prior(posed.expected, posed.turn_rad, posed.log_scale, posed.reach_px)
+        registration = register(levels, prior, (self.smallest_scale, self.largest_scale))
+        return Registered(side0, side1, levels, registration)
+
+    def measured(self, found: Registered, points_px: FloatArray) -> TiePoints:
+        """Points (K, 2), stored pixels of image 0, measured in image 1; none where the registration is not accepted."""
+        points = points_px.astype(np.float64) if found.registration.accepted else np.zeros((0, 2))
+        limits = Limits(self.window // 2, self.least_correlation, self.largest_sigma_px)
+        return tie_points(found.side0, found.side1, found.levels, found.registration, points, limits)

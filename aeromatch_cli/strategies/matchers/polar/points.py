@@ -1,0 +1,178 @@
+"""Least-squares tie points: every lattice point of image 0 that image 1 shows too, measured there.
+
+The registration says about where; windows on reduced pictures are searched for around it, so that relief and what is
+left of tilt are followed; least squares on the way up to stored pixels measure. At every step the neighbours have a
+say: what contradicts them starts again from where they see it, and in the end is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Raster
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.strategies.matchers.polar.affine import Windows, adjusted
+from aeromatch_cli.strategies.matchers.polar.level import Level, level_of
+from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid
+from aeromatch_cli.strategies.matchers.polar.registration import SECOND_PX, Registration
+from aeromatch_cli.strategies.matchers.polar.relief import agreed, searched
+from aeromatch_cli.strategies.matchers.polar.sides import Side
+
+# Half windows and reach of the search, level px; how far off a point may be from what its neighbours say, whatever they
+# scatter, on every level.
+_COARSE_HALF, _COARSE_REACH, _FINE_HALF, _FINE_REACH = 7, 6, 8, 3
+_LEAST_OFF_PX = 1.0
+_LARGEST_STEP = 4.0  # between levels
+_TILE_PX = 1024
+_MARGIN_PX = 6
+_STEP_PX = 8.0  # over which shapes are taken from one frame to another
+
+
+@dataclass(frozen=True, eq=False)
+class TiePoints:
+    """rows: (M,) int32 of the lattice. points1_px: (M, 2) stored pixels of image 1. correlations: (M,). sigmas_px:
+    (M,) in stored pixels of image 1.
+    """
+
+    rows: IntArray
+    points1_px: FloatArray
+    correlations: FloatArray
+    sigmas_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Limits:
+    """half: of the final window, stored px. correlation: least. sigma_px: largest."""
+
+    half: int
+    correlation: float
+    sigma_px: float
+
+
+def tie_points(
+    side0: Side, side1: Side, levels: Pyramid, registration: Registration, lattice_px: FloatArray, limits: Limits
+) -> TiePoints:
+    """Of lattice points (K, 2), stored pixels of image 0."""
+    frame0 = side0.frame_from_source(lattice_px)
+    frame1 = apply_homography(registration.warp, frame0)
+    rows = np.flatnonzero(_inside(side1.source_from_frame(frame1), side1.raster) & np.isfinite(frame0).all(axis=1))
+    if not len(rows):
+        return _found(rows, Windows.start(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2))))
+    expected = frame1[rows]
+    start = Windows.start(frame0[rows], expected, _jacobians(registration.warp, frame0[rows], expected))
+    windows = _followed(levels, start)
+    stored = _stored(side0, side1, windows, lattice_px[rows])
+    straight = side1.source_from_frame(expected)
+    for scale in _scales(levels.scale(FINEST_PX), min(side0.raster.finest, side1.raster.finest)):
+        stored = _measured(side0.raster, side1.raster, stored, scale, limits.half)
+        shifts, good = agreed(stored.places0_px, stored.places1_px - straight, stored.matched, _LEAST_OFF_PX)
+        last, stored = replace(stored, matched=good), _corrected(stored, straight + shifts, good)
+    good = last.matched & (last.correlations >= limits.correlation) & (last.sigmas_px <= limits.sigma_px)
+    good &= _inside(last.places1_px, side1.raster)
+    return _found(rows[good], last.take(good))
+
+
+def _found(rows: IntArray, windows: Windows) -> TiePoints:
+    return TiePoints(rows.astype(np.int32), windows.places1_px, windows.correlations, windows.sigmas_px)
+
+
+def _followed(levels: Pyramid, start: Windows) -> Windows:
+    """In frame px, searched for on two levels and adjusted on the finer."""
+    straight = start.places1_px
+    windows = start
+    for size, half, reach in ((SECOND_PX, _COARSE_HALF, _COARSE_REACH), (FINEST_PX, _FINE_HALF, _FINE_REACH)):
+        scale = levels.scale(size)
+        level = levels.at(size, even=size < FINEST_PX)
+        found = searched(*level, windows.rescaled(scale), half, reach)
+        if size == FINEST_PX:
+            tried = adjusted(*level, found, half)
+            found = replace(tried, matched=found.matched)
+        found = found.rescaled(1.0 / scale)
+        shifts, good = agreed(start.places0_px, found.places1_px - straight, found.matched, _LEAST_OFF_PX / scale)
+        windows = _corrected(found, straight + shifts, good)
+    return windows
+
+
+def _corrected(windows: Windows, expected_px: FloatArray, good: BoolArray) -> Windows:
+    """Those that are not good start again from where they are expected."""
+    places = np.where(good[:, None], windows.places1_px, expected_px)
+    return replace(windows, places1_px=places, matched=np.asarray(np.isfinite(places).all(axis=1)))
+
+
+def _jacobians(warp: FloatArray, places0: FloatArray, places1: FloatArray) -> FloatArray:
+    """(N, 2, 2) of a homography."""
+    depth = places0 @ warp[2, :2] + warp[2, 2]
+    return np.asarray((warp[:2, :2] - places1[:, :, None] * warp[2, :2]) / depth[:, None, None])
+
+
+def _stored(side0: Side, side1: Side, windows: Windows, lattice_px: FloatArray) -> Windows:
+    """Windows of frames in stored pixels."""
+    places1 = side1.source_from_frame(windows.places1_px)
+    columns = []
+    for axis in (0, 1):
+        step = np.zeros(2)
+        step[axis] = _STEP_PX
+        ends = []
+        for sign in (-1.0, 1.0):
+            arms = side0.frame_from_source(lattice_px + sign * step) - windows.places0_px
+            ends.append(side1.source_from_frame(windows.places1_px + np.einsum("nij,nj->ni", windows.shapes, arms)))
+        columns.append((ends[1] - ends[0]) / (2.0 * _STEP_PX))
+    shapes = np.stack(columns, axis=2)
+    usable = np.isfinite(places1).all(axis=1) & np.isfinite(shapes).all(axis=(1, 2))
+    found = Windows.start(lattice_px.astype(np.float64), places1, shapes)
+    return replace(found, matched=np.asarray(usable))
+
+
+def _scales(reached: float, finest: float) -> list[float]:
+    """Of the levels from the registration's up to the finest, none more than four times the one before."""
+    steps = max(1, int(np.ceil(np.log(finest / reached) / np.log(_LARGEST_STEP) - 1e-9)))
+    return [float(reached * (finest / reached) ** (step / steps)) for step in range(1, steps + 1)]
+
+
+def _measured(raster0: Raster, raster1: Raster, windows: Windows, scale: float, half: int) -> Windows:
+    """After least squares at a scale."""
+    if scale < 1.0:
+        levels = [level_of(*raster.reduced(scale), scale, even=False) for raster in (raster0, raster1)]
+        return adjusted(levels[0], levels[1], windows.rescaled(scale), half).rescaled(1.0 / scale)
+    found = windows.take(np.arange(len(windows.matched)))  # a copy
+    found.matched[:] = False
+    for rows in _tiles(windows):
+        part = windows.take(rows)
+        level0, corner0 = _window(raster0, part.places0_px, half + _MARGIN_PX)
+        reach = int(np.ceil(half * (1.0 + np.abs(part.shapes).sum(axis=2).max()))) + _MARGIN_PX
+        level1, corner1 = _window(raster1, part.places1_px, reach)
+        moved = replace(part, places0_px=part.places0_px - corner0, places1_px=part.places1_px - corner1)
+        done = adjusted(level0, level1, moved, half)
+        found.places1_px[rows] = done.places1_px + corner1
+        for name in ("shapes", "correlations", "sigmas_px", "matched"):
+            vars(found)[name][rows] = vars(done)[name]
+    return found
+
+
+def _tiles(windows: Windows) -> Iterator[IntArray]:
+    """Rows of the windows that can be matched, by tiles of image 0."""
+    usable = np.flatnonzero(windows.matched)
+    tiles = (windows.places0_px[usable] // _TILE_PX).astype(np.int64)
+    _, numbers = np.unique(tiles, axis=0, return_inverse=True)
+    for number in range(int(numbers.max(initial=-1)) + 1):
+        yield usable[numbers.ravel() == number]
+
+
+def _window(raster: Raster, places_px: FloatArray, reach: int) -> tuple[Level, FloatArray]:
+    """Stored pixels around places (N, 2), and the first one's place (2,)."""
+    low = np.clip(np.floor(places_px.min(axis=0)).astype(int) - reach, 0, None)
+    high = np.ceil(places_px.max(axis=0)).astype(int) + reach + 1
+    size = np.minimum(high, (raster.width_px, raster.height_px)) - low
+    size = np.maximum(size, 8)
+    low = np.clip(np.minimum(low, np.array([raster.width_px, raster.height_px]) - size), 0, None)
+    pixels, valid = raster.window(int(low[0]), int(low[1]), int(size[0]), int(size[1]))
+    return level_of(pixels, valid, 1.0, even=False), low.astype(np.float64)
+
+
+def _inside(points_px: FloatArray, raster: Raster) -> BoolArray:
+    size = np.array([raster.width_px, raster.height_px])
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((points_px >= 0.0) & (points_px <= size - 1.0)).all(axis=1))

@@ -1,0 +1,241 @@
+"""Registration of one pair: a start, least squares from coarse to fine, and whether to believe it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.strategies.matchers.polar.evidence import Evidence, cell_size_px, evidence
+from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit
+from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid, rescaled
+from aeromatch_cli.strategies.matchers.polar.start import Search, candidates, everywhere
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """size_px: longer side of the pictures searched. turn_step_deg, scales: tried. followed: candidates. samples: of
+    the coarse level's fits, thrice as many of the next. hopeless: share of the best fit's significance below which one
+    is not followed. promising: most that are, and rivals: most that are looked at closely.
+    """
+
+    size_px: float
+    turn_step_deg: float
+    scales: int
+    followed: int
+    samples: int
+    hopeless: float
+    promising: int
+    rivals: int
+
+
+# Most pairs are clear at once. The rest is searched as if time did not matter.
+_EFFORTS = (_Effort(48.0, 8.0, 5, 8, 2000, 0.6, 4, 2), _Effort(96.0, 4.0, 9, 32, 3000, 0.2, 12, 8))
+# Longer side of the pictures at each step of refinement, px.
+_COARSE_PX, _FIRST_PX = 90.0, 180.0
+SECOND_PX = 400.0
+_LEAST_CORRELATION = 0.15
+_LEAST_CELLS = 12
+_LEAST_AGREEING = 0.4
+_LEAST_PREFERRED = 0.8
+_CLEAR = 0.95
+_CREDIBLE = 0.4
+# What a prior allows in the end: so much more than its reach, and a share of the longer side.
+_STRETCH, _ROUGH = 1.25, 0.01
+_APART, _APART_RAD = 0.035, np.deg2rad(5.0)
+_LOST = "the overlap was lost on the way to finer pictures"
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """matrix: (3, 3) similarity, frame px1 from frame px0. warp: (3, 3) homography, the same with tilt. fit: of the
+    similarity on the finest level, in its px. scale: of that level. reason: why it is not to be believed, "" where it
+    is. preferred: share of the overlap that fits no rival better.
+    """
+
+    matrix: FloatArray
+    warp: FloatArray
+    fit: Fit | None
+    evidence: Evidence | None
+    scale: float
+    reason: str
+    preferred: float = 1.0
+
+    @property
+    def accepted(self) -> bool:
+        return not self.reason
+
+    @property
+    def clear(self) -> bool:
+        """Whether there is no need to look elsewhere."""
+        proof = self.evidence
+        return self.accepted and proof is not None and min(proof.share, self.preferred) >= _CLEAR
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """expected: (3, 3) frame px1 from frame px0. turn_rad, log_scale, reach_px: how far off it may be."""
+
+    expected: FloatArray
+    turn_rad: float
+    log_scale: float
+    reach_px: float
+
+    def search(self, scale: float, turn_step_deg: float, scale_ratio: float) -> Search:
+        """For pictures reduced to `scale`."""
+        turns = int(np.ceil(np.rad2deg(self.turn_rad) / turn_step_deg))
+        scales = int(np.ceil(self.log_scale / np.log(scale_ratio)))
+        return Search(
+            np.deg2rad(turn_step_deg) * np.arange(-turns, turns + 1),
+            scale_ratio ** np.arange(-scales, scales + 1.0),
+            opposites=False,
+            expected=rescaled(self.expected, 1.0, scale),
+            reach_px=self.reach_px * scale + 3.0,
+        )
+
+    def allows(self, item: Fit, scale: float, longest_px: float) -> bool:
+        """Whether a fit of pictures at `scale` says what may be: least squares may slide along rows, out of reach."""
+        middle = item.middle_px[None]
+        places = [apply_homography(m, middle)[0] for m in (rescaled(self.expected, 1.0, scale), item.matrix)]
+        off_px = float(np.linalg.norm(places[0] - places[1])) / scale
+        return off_px <= _STRETCH * self.reach_px + _ROUGH * longest_px
+
+
+def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, float] = (0.78, 1.28)) -> Registration:
+    """Similarity between the frames of both sides. scales: smallest and largest, without a prior."""
+    best: Registration | None = None
+    warps: list[FloatArray] = []
+    for effort in _EFFORTS:
+        ratio = (scales[1] / scales[0]) ** (1.0 / (effort.scales - 1))
+        if prior is not None:
+            search = prior.search(levels.scale(effort.size_px), effort.turn_step_deg, ratio)
+        else:
+            search = everywhere(effort.turn_step_deg, effort.scales, *scales)
+        warps = _ranked(levels, effort, _searched(levels, effort.size_px, search)[: effort.followed], warps, prior)
+        best = _refined(levels, warps, prior)
+        if best.clear:
+            break
+    assert best is not None
+    return best
+
+
+def _searched(levels: Pyramid, size_px: float, search: Search) -> Sequence[FloatArray]:
+    """Similarities (3, 3) between frames, best first."""
+    scale = levels.scale(size_px)
+    (first, valid0), (second, valid1) = levels.pictures(scale)
+    found = candidates((first, second), (valid0, valid1), search)
+    return [rescaled(item.matrix, scale, 1.0) for item in found]
+
+
+def _refined(levels: Pyramid, ranked: Sequence[FloatArray], prior: Prior | None) -> Registration:
+    """The first of some homographies (3, 3) between frames, followed to the finest level, beside its rivals."""
+    if not ranked:
+        return Registration(np.eye(3), np.eye(3), None, None, 1.0, "no overlap found")
+    second, scale = levels.at(SECOND_PX, even=True), levels.scale(SECOND_PX)
+    starts = [rescaled(warp, 1.0, scale) for warp in ranked]
+    followed = [fit(*second, start, samples=15_000, still_px=0.01, tilted=True) for start in starts]
+    apart = _apart(_allowed(followed, prior, levels, scale), 0.0, SECOND_PX)
+    if not apart:
+        return Registration(ranked[0], ranked[0], None, None, scale, _LOST)
+    cell = cell_size_px(second[0], apart[0].share)
+    judged = [(evidence(*second, item.matrix, cell), item) for item in apart]
+    judged.sort(key=lambda item: -item[0].agreeing)
+    proofs, fits = [proof for proof, _ in judged], [item for _, item in judged]
+    warp = rescaled(fits[0].matrix, scale, 1.0)
+    finest, finer = levels.at(FINEST_PX, even=False), levels.scale(FINEST_PX)
+    similar = _similar(warp, fits[0].middle_px / scale)
+    tilted = fit(*finest, rescaled(warp, 1.0, finer), samples=15_000, still_px=0.01, tilted=True)
+    found = fit(*finest, rescaled(similar, 1.0, finer), samples=40_000)
+    if found is None or tilted is None:
+        return Registration(similar, warp, None, proofs[0], scale, _LOST)
+    matrix, warp = (rescaled(item.matrix, finer, 1.0) for item in (found, tilted))
+    # What hardly agrees with itself is no rival.
+    rivals = [other for other in proofs[1:] if other.share > _CREDIBLE * proofs[0].share]
+    preferred = min((proofs[0].preferred_to(other) for other in rivals), default=1.0)
+    return Registration(matrix, warp, found, proofs[0], finer, _doubt(tilted, proofs[0], preferred), preferred)
+
+
+def _ranked(
+    levels: Pyramid,
+    effort: _Effort,
+    starts: Sequence[FloatArray],
+    others: Sequence[FloatArray],
+    prior: Prior | None,
+) -> list[FloatArray]:
+    """Homographies (3, 3) between frames: the best fits of a coarse level that say different things, best first.
+
+    starts: similarities (3, 3) between frames. others: homographies that are to be compared too.
+    """
+    coarse, scale = levels.at(_COARSE_PX, even=True), levels.scale(_COARSE_PX)
+    count = effort.samples
+    fits = [fit(*coarse, rescaled(start, 1.0, scale), samples=count, still_px=0.05) for start in starts]
+    promising = _apart(fits, effort.hopeless, _COARSE_PX)[: effort.promising]
+    bent = [fit(*coarse, item.matrix, samples=count, still_px=0.05, tilted=True) or item for item in promising]
+    first, finer = levels.at(_FIRST_PX, even=True), levels.scale(_FIRST_PX)
+    followed = [rescaled(item.matrix, scale, finer) for item in bent]
+    followed += [rescaled(warp, 1.0, finer) for warp in others]
+    fits = [fit(*first, start, samples=3 * count, still_px=0.03, tilted=True) for start in followed]
+    fits = _allowed(fits, prior, levels, finer)
+    return [rescaled(item.matrix, finer, 1.0) for item in _apart(fits, effort.hopeless, _FIRST_PX)[: effort.rivals]]
+
+
+def _allowed(fits: list[Fit | None], prior: Prior | None, levels: Pyramid, scale: float) -> list[Fit | None]:
+    """Those of pictures at `scale` that a prior does not rule out."""
+    if prior is None:
+        return fits
+    return [item for item in fits if item is not None and prior.allows(item, scale, levels.longest_px)]
+
+
+def _apart(fits: Sequence[Fit | None], hopeless: float, side_px: float) -> list[Fit]:
+    """Best first, without those that say the same as a better one, or fit far worse than the best."""
+    usable = [item for item in fits if item is not None and item.correlation > 0.0]
+    kept: list[Fit] = []
+    for item in sorted(usable, key=lambda item: -_significance(item)):
+        if _significance(item) < hopeless * _significance(kept[0] if kept else item):
+            break
+        if all(_differs(item, other, side_px) for other in kept):
+            kept.append(item)
+    return kept
+
+
+def _significance(item: Fit) -> float:
+    """Correlation in deviations of chance, but for a factor: samples that resemble their neighbours."""
+    return item.correlation * float(np.sqrt(item.samples))
+
+
+def _differs(first: Fit, second: Fit, side_px: float) -> bool:
+    """At the middle of either's overlap, by a share of the longer side: what is nearer, `evidence` looks after."""
+    for middle in (first.middle_px, second.middle_px):
+        places = [apply_homography(item.matrix, middle[None])[0] for item in (first, second)]
+        if not np.linalg.norm(places[0] - places[1]) < _APART * side_px:
+            return True
+    turns = [np.arctan2(item.matrix[1, 0], item.matrix[0, 0]) for item in (first, second)]
+    return abs((turns[0] - turns[1] + np.pi) % (2.0 * np.pi) - np.pi) > _APART_RAD
+
+
+def _similar(warp: FloatArray, middle_px: FloatArray) -> FloatArray:
+    """The similarity (3, 3) that a homography is at a place of side 0."""
+    there = apply_homography(warp, middle_px[None])[0]
+    depth = warp[2, :2] @ middle_px + warp[2, 2]
+    linear = (warp[:2, :2] - np.outer(there, warp[2, :2])) / depth
+    cosine, sine = (linear[0, 0] + linear[1, 1]) / 2.0, (linear[1, 0] - linear[0, 1]) / 2.0
+    linear = np.array([[cosine, -sine], [sine, cosine]])
+    return np.vstack([np.column_stack([linear, there - linear @ middle_px]), [0.0, 0.0, 1.0]])
+
+
+def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
+    """Why not to believe it, "" for nothing."""
+    if not found.converged:
+        return f"least squares did not converge: still moving {found.moved_px:.2g} px"
+    if found.correlation < _LEAST_CORRELATION:
+        return f"the pictures correlate by {found.correlation:.2f} only"
+    if proof.cells < _LEAST_CELLS:
+        return f"only {proof.cells} parts of the overlap can be compared"
+    if proof.share < _LEAST_AGREEING:
+        return f"{proof.agreeing} of {proof.cells} parts of the overlap agree (by chance {proof.by_chance:.0f})"
+    if preferred < _LEAST_PREFERRED:
+        return f"{1.0 - preferred:.0%} of the overlap fits another place better: a repeated pattern"
+    return ""

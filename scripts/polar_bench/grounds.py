@@ -1,0 +1,166 @@
+"""Large pictures of flat ground, and pairs cut out of them of which everything is known.
+
+A ground is a mosaic: of pictures of a real block, or of rendered pictures of as many seeds, joined over a soft border.
+Both pictures of a pair are cut out by a similarity, with cubic interpolation; then gain, offset and noise are drawn
+for each, and gray values rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.images import read_pixels
+from aeromatch_cli.synthetic import render_block
+
+RENDERED, REAL = ("grass", "desert", "farmland"), ("seneca", "caliterra")
+_TILE = (3000, 2250)
+_SOFT = 0.06  # of a tile's side, where it is joined with the next
+_LEAST_OVERLAP = 0.3
+_SCALES = (0.8, 1.25)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPair:
+    """Two gray pictures (H, W) uint8, the (3, 3) similarity px1 from px0, and the share of picture 0 that is shared."""
+
+    first: NDArray[np.uint8]
+    second: NDArray[np.uint8]
+    truth: FloatArray
+    overlap: float
+
+
+def ground(kind: str, size: tuple[int, int], seed: int, data: Path, out: Path) -> NDArray[np.uint8]:
+    """(H, W) of about `size` (W, H), from the cache in `out` where it is there."""
+    path = out / f"{kind}-{size[0]}x{size[1]}-{seed}.png"
+    if not path.is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        tiles = _rendered(kind, size, seed, out) if kind in RENDERED else _real(data / kind, size, seed)
+        cv2.imwrite(str(path), _joined(tiles, size))
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+def _rendered(kind: str, size: tuple[int, int], seed: int, out: Path) -> list[list[NDArray[np.uint8]]]:
+    rows = []
+    for row in range(_count(size[1], _TILE[1])):
+        rows.append([])
+        for column in range(_count(size[0], _TILE[0])):
+            folder = out / f"{kind}-{seed}-{row}-{column}"
+            number = 10_000 + 1000 * seed + 32 * row + column
+            render_block(folder, kind, seed=number, width_px=_TILE[0], height_px=_TILE[1], images=1)
+            rows[-1].append(read_pixels(next((folder / "images").iterdir()), colour=False))
+    return rows
+
+
+def _real(block: Path, size: tuple[int, int], seed: int) -> list[list[NDArray[np.uint8]]]:
+    paths = sorted((block / "images").iterdir())
+    chosen = np.random.default_rng([seed, 3]).permutation(len(paths))
+    shape = read_pixels(paths[0], colour=False).shape
+    rows, columns = _count(size[1], shape[0]), _count(size[0], shape[1])
+    numbers = chosen[: rows * columns].reshape(rows, columns)
+    return [[read_pixels(paths[number], colour=False) for number in row] for row in numbers]
+
+
+def _count(length: int, tile: int) -> int:
+    """Tiles that cover a length, each giving its soft border to the next."""
+    return max(1, int(np.ceil((length / tile - _SOFT) / (1.0 - _SOFT))))
+
+
+def _joined(tiles: Sequence[Sequence[NDArray[np.uint8]]], size: tuple[int, int]) -> NDArray[np.uint8]:
+    height, width = tiles[0][0].shape
+    down, across = int(height * (1.0 - _SOFT)), int(width * (1.0 - _SOFT))
+    shape = (down * (len(tiles) - 1) + height, across * (len(tiles[0]) - 1) + width)
+    values, weights = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    weight = np.minimum.outer(_ramp(height, height - down), _ramp(width, width - across))
+    for row, line in enumerate(tiles):
+        for column, tile in enumerate(line):
+            part = (slice(row * down, row * down + height), slice(column * across, column * across + width))
+            values[part] += weight * tile
+            weights[part] += weight
+    return np.rint(values / weights)[: size[1], : size[0]].astype(np.uint8)
+
+
+def _ramp(length: int, soft: int) -> NDArray[np.float32]:
+    steps = np.minimum(np.arange(length), np.arange(length)[::-1]) + 1.0
+    return np.clip(steps / soft, 0.0, 1.0).astype(np.float32)
+
+
+def known_pair(source: NDArray[np.uint8], size: tuple[int, int], rng: np.random.Generator) -> KnownPair:
+    """Any turn, scale 0.8 to 1.25, overlap from 0.3 evenly, gain, offset and noise."""
+    width, height = size
+    wanted = rng.uniform(_LEAST_OVERLAP, 1.0)
+    for _ in range(20_000):
+        turns, scale = rng.uniform(-np.pi, np.pi, 2), float(np.exp(rng.uniform(*np.log(_SCALES))))
+        middle = np.array([source.shape[1], source.shape[0]]) * rng.uniform(0.3, 0.7, 2)
+        way, direction = rng.uniform(0.0, width), rng.uniform(0.0, 2.0 * np.pi)
+        there = middle + way * np.array([np.cos(direction), np.sin(direction)])
+        from0, from1 = _cut(turns[0], 1.0, middle, size), _cut(turns[1], 1.0 / scale, there, size)
+        truth = np.linalg.inv(from1) @ from0
+        if _inside(from0, size, source) and _inside(from1, size, source):
+            share = overlap(truth, size)
+            if share >= _LEAST_OVERLAP and abs(share - wanted) < 0.05:
+                break
+    else:
+        raise SystemExit(f"a ground of {source.shape[1]}x{source.shape[0]} is too small for pairs of {width}x{height}")
+    first, second = (_shot(source, matrix, size, rng) for matrix in (from0, from1))
+    return KnownPair(first, second, truth, share)
+
+
+def _cut(turn: float, scale: float, middle: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """(3, 3) ground px from picture px."""
+    cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
+    linear = np.array([[cosine, -sine], [sine, cosine]])
+    own = np.array([(size[0] - 1) / 2.0, (size[1] - 1) / 2.0])
+    return np.vstack([np.column_stack([linear, middle - linear @ own]), [0.0, 0.0, 1.0]])
+
+
+def _inside(matrix: FloatArray, size: tuple[int, int], source: NDArray[np.uint8]) -> bool:
+    width, height = size
+    corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1.0]])
+    places = corners @ matrix[:2].T
+    return bool((places >= 0.0).all() and (places <= np.array(source.shape[::-1]) - 1.0).all())
+
+
+def overlap(truth: FloatArray, size: tuple[int, int]) -> float:
+    """Share of picture 0 that picture 1, of the same size, shows."""
+    return float(shared_places(truth, size)[1].mean())
+
+
+def shared_places(truth: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Places (N, 2) of picture 0 on an even grid, and which of them picture 1 shows."""
+    xs, ys = np.linspace(0, size[0] - 1, 64), np.linspace(0, size[1] - 1, 48)
+    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    there = places @ truth[:2, :2].T + truth[:2, 2]
+    return places, ((there >= 0.0) & (there <= np.array(size) - 1.0)).all(axis=1)
+
+
+def _shot(
+    source: NDArray[np.uint8], matrix: FloatArray, size: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
+    # A picture that shows the ground smaller has seen it through a wider lens.
+    soft = cv2.GaussianBlur(source, (0, 0), 0.5 * max(1.0, scale))
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    values = cv2.warpAffine(soft, matrix[:2], size, flags=flags).astype(np.float32)
+    gain, offset, noise = float(np.exp(rng.uniform(-0.3, 0.3))), rng.uniform(-20.0, 20.0), rng.uniform(1.0, 5.0)
+    values = gain * (values - 128.0) + 128.0 + offset + noise * rng.standard_normal(values.shape, np.float32)
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def errors(found: FloatArray, truth: FloatArray, size: tuple[int, int]) -> tuple[float, float, float]:
+    """Displacement at the overlap's middle (px of picture 1), turn (degrees), scale (relative)."""
+    places, shared = shared_places(truth, size)
+    middle = np.append(places[shared].mean(axis=0), 1.0)
+    turns = [np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])) for matrix in (found, truth)]
+    scales = [np.hypot(matrix[0, 0], matrix[1, 0]) for matrix in (found, truth)]
+    return (
+        float(np.linalg.norm((found - truth)[:2] @ middle)),
+        float(abs((turns[0] - turns[1] + 180.0) % 360.0 - 180.0)),
+        float(abs(scales[0] / scales[1] - 1.0)),
+    )

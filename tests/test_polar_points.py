@@ -1,0 +1,105 @@
+"""Least-squares tie points against known shifts, over relief, masks and outliers."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from make_ground import Shot, pair
+
+from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.matchers.polar import Polar
+from aeromatch_cli.strategies.matchers.polar.relief import agreed
+from aeromatch_cli.strategies.simulators.none import source_view
+
+CAMERA = Camera("PINHOLE", 720, 540, (700.0, 700.0, 359.5, 269.5))
+GEOMETRY = PairGeometry(Pair("a", "b", float("nan"), float("nan"), "name"), CAMERA, CAMERA, None, None, None)
+
+
+def lattice(image: Shot, points: int = 800) -> Features:
+    gray = image.pixels.astype(np.uint8)
+    return Lattice(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, image.valid)])
+
+
+def test_points_are_measured_to_a_few_hundredths_of_a_pixel():
+    first, second, truth = pair(40.0, 0.95, (80.0, 50.0), seed=12, gain=0.9, offset=10.0)
+    features = lattice(first)
+    matches = Polar()(features, features, GEOMETRY, (first, second))
+    there = apply_homography(truth, features.keypoints_px)
+    visible = ((there >= 12.0) & (there <= np.array([707.0, 527.0]))).all(axis=1)
+    assert len(matches.indices) > 0.9 * visible.sum()
+    assert (matches.indices[:, 1] == -1).all()
+    rows = matches.indices[:, 0]
+    assert np.array_equal(matches.points0_px, features.keypoints_px[rows])
+    off = np.linalg.norm(matches.points1_px - there[rows], axis=1)
+    assert np.median(off) < 0.06
+    assert np.percentile(off, 95) < 0.2
+    assert matches.remark == ""
+
+
+def test_relief_is_followed_point_by_point():
+    first, second, truth = pair(10.0, 1.0, (60.0, 0.0), seed=13)
+    # Hills move the ground along x by up to 6 px.
+    y, x = np.mgrid[0:540, 0:720].astype(np.float32)
+    hills = 6.0 * np.sin(x / 130.0) * np.cos(y / 110.0)
+    moved = cv2.remap(second.pixels, x + hills, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    features = lattice(first)
+    matches = Polar()(features, features, GEOMETRY, (first, Shot(moved.astype(np.float32))))
+    flat = apply_homography(truth, features.keypoints_px[matches.indices[:, 0]])
+    # What stands at (x, y) stood at (x + hills, y).
+    found = matches.points1_px + np.column_stack(
+        [6.0 * np.sin(matches.points1_px[:, 0] / 130.0) * np.cos(matches.points1_px[:, 1] / 110.0), np.zeros(len(flat))]
+    )
+    off = np.linalg.norm(found - flat, axis=1)
+    assert len(off) > 350
+    assert np.median(off) < 0.1
+    assert np.percentile(off, 95) < 0.4
+
+
+def test_nothing_is_measured_where_one_side_is_masked():
+    first, second, truth = pair(0.0, 1.0, (40.0, 0.0), seed=14)
+    valid = np.ones(second.pixels.shape, bool)
+    valid[:, :300] = False
+    features = lattice(first)
+    matches = Polar()(features, features, GEOMETRY, (first, replace(second, valid=valid)))
+    assert len(matches.indices) > 200
+    assert matches.points1_px[:, 0].min() > 300.0
+    there = apply_homography(truth, features.keypoints_px[matches.indices[:, 0]])
+    assert np.linalg.norm(matches.points1_px - there, axis=1).max() < 0.5
+
+
+def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():
+    first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
+    _, second, _ = pair(0.0, 1.0, (0.0, 0.0), seed=16)
+    features = lattice(first)
+    matches = Polar()(features, features, GEOMETRY, (first, second))
+    assert len(matches.indices) == 0
+    assert matches.remark
+
+
+def test_without_rasters_it_says_what_it_needs():
+    first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
+    features = lattice(first, 20)
+    with pytest.raises(ValueError, match="needs both rasters"):
+        Polar()(features, features, GEOMETRY)
+
+
+def test_neighbours_outvote_what_contradicts_them():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0.0, 1000.0, (300, 2))
+    shifts = 0.01 * places + 0.1 * rng.standard_normal((300, 2))
+    wrong = rng.choice(300, 60, replace=False)
+    shifts[wrong] += rng.uniform(3.0, 20.0, (60, 2))
+    expected, good = agreed(places, shifts, np.ones(300, bool), 1.0)
+    right = np.setdiff1d(np.arange(300), wrong)
+    assert not good[wrong].any()
+    assert good[right].mean() > 0.95
+    assert np.median(np.linalg.norm(expected - 0.01 * places, axis=1)) < 0.2
+
+
+def test_few_points_have_nobody_to_agree_with():
+    places = np.random.default_rng(1).uniform(0.0, 100.0, (8, 2))
+    assert not agreed(places, np.zeros((8, 2)), np.ones(8, bool), 1.0)[1].any()
