@@ -25,8 +25,8 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Found, Found]:
 def test_the_network_recalls_more_at_the_ratio_tests_precision(answers: tuple[Found, Found]) -> None:
     ratio, network = answers
     assert ratio.recall == pytest.approx(0.335, abs=0.03)  # a set as hard as it was
-    # 0.606 when these weights were made; those before them reach 0.526.
-    assert network.recall_at(ratio.precision) >= 0.58
+    # 0.634 when these weights were made; those before them reach 0.606.
+    assert network.recall_at(ratio.precision) >= 0.61
     assert network.wrong_at(ratio.recall) <= 0.4 * (~ratio.right).sum()
 
 

@@ -42,7 +42,7 @@ def extracted(root: Path, max_size_px: int) -> Features:
     (root / "images").mkdir(parents=True)
     cv2.imwrite(str(root / "images" / "blobs.png"), blobs())
     block = {"images": str(root / "images"), "max_size_px": max_size_px}
-    settings = validate({"block": block, "simulate": "none", "extract": {"keypoints": 400}})
+    settings = validate({"block": block, "simulate": "none", "extract": {"name": "sift", "keypoints": 400}})
     camera = Camera("SIMPLE_PINHOLE", WIDTH_PX, HEIGHT_PX, (600.0, 319.5, 239.5))
     image = Image("blobs", "blobs.png", WIDTH_PX, HEIGHT_PX, "cam")
     known = Block((image,), {"cam": camera}, {}, "local", (0.0, 0.0, 0.0), None, "unknown", None)
