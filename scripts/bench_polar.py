@@ -50,16 +50,15 @@ def known_rows(args: argparse.Namespace, size: tuple[int, int]) -> Iterator[dict
 def polar_row(kind: str, number: int, pair: KnownPair, size: tuple[int, int]) -> dict[str, Any]:
     found = own.registered(pair.first, pair.second, TIE_POINTS)
     row = _row("polar", kind, number, found.registration.matrix, pair, size, found.seconds)
-    right = _right(found.points0_px, found.points1_px, pair.truth)
-    return row | {
-        "seconds_tie_points": round(found.seconds_tie_points, 4),
-        "accepted": found.registration.accepted,
-        "reason": found.registration.reason,
-        "tie_points": len(right),
-        "tie_points_right": int(right.sum()),
-        "tie_point_error_px": _median(np.linalg.norm(_there(found.points0_px, pair.truth) - found.points1_px, axis=1)),
-        "coverage": coverage(found.points0_px[right], pair, size),
-    }
+    return (
+        row
+        | _of_points(found.points0_px, found.points1_px, pair, size)
+        | {
+            "seconds_tie_points": round(found.seconds_tie_points, 4),
+            "accepted": found.registration.accepted,
+            "reason": found.registration.reason,
+        }
+    )
 
 
 def sift_row(
@@ -67,16 +66,15 @@ def sift_row(
 ) -> dict[str, Any]:
     found = sift.registered(pair.first, pair.second, scale)
     row = _row(method, kind, number, found.matrix, pair, size, found.seconds)
-    right = _right(found.points0, found.points1, pair.truth)
-    return row | {
-        "seconds_tie_points": row["seconds"],
-        "accepted": found.accepted,
-        "reason": "" if found.accepted else f"{found.inliers} matches agree",
-        "tie_points": len(right),
-        "tie_points_right": int(right.sum()),
-        "tie_point_error_px": _median(np.linalg.norm(_there(found.points0, pair.truth) - found.points1, axis=1)),
-        "coverage": coverage(found.points0[right], pair, size),
-    }
+    return (
+        row
+        | _of_points(found.points0, found.points1, pair, size)
+        | {
+            "seconds_tie_points": row["seconds"],
+            "accepted": found.accepted,
+            "reason": "" if found.accepted else f"{found.inliers} matches agree",
+        }
+    )
 
 
 def _row(
@@ -94,8 +92,15 @@ def _there(points0: FloatArray, truth: FloatArray) -> FloatArray:
     return np.asarray(points0 @ truth[:2, :2].T + truth[:2, 2])
 
 
-def _right(points0: FloatArray, points1: FloatArray, truth: FloatArray) -> Any:
-    return np.linalg.norm(_there(points0, truth) - points1, axis=1) <= _RIGHT_PX
+def _of_points(points0: FloatArray, points1: FloatArray, pair: KnownPair, size: tuple[int, int]) -> dict[str, Any]:
+    off = np.linalg.norm(_there(points0, pair.truth) - points1, axis=1)
+    right = off <= _RIGHT_PX
+    return {
+        "tie_points": len(off),
+        "tie_points_right": int(right.sum()),
+        "tie_point_error_px": _median(off),
+        "coverage": coverage(points0[right], pair, size),
+    }
 
 
 def _median(values: FloatArray) -> float | None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from polar_bench.own import Shot
 
-from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.images import shrink
+from aeromatch_cli.data import FloatArray
 
 
 def ground(seed: int, size: tuple[int, int] = (1400, 1100)) -> NDArray[np.float32]:
@@ -29,33 +27,6 @@ def similarity(turn_deg: float, scale: float, at: tuple[float, float], to: tuple
     cosine, sine = scale * np.cos(np.deg2rad(turn_deg)), scale * np.sin(np.deg2rad(turn_deg))
     linear = np.array([[cosine, -sine], [sine, cosine]])
     return np.vstack([np.column_stack([linear, np.array(to) - linear @ np.array(at)]), [0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A `data.Raster` in memory."""
-
-    pixels: NDArray[np.float32]
-    valid: BoolArray | None = None
-    finest: float = 1.0
-
-    @property
-    def width_px(self) -> int:
-        return self.pixels.shape[1]
-
-    @property
-    def height_px(self) -> int:
-        return self.pixels.shape[0]
-
-    def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
-        small = shrink(self.pixels, scale).astype(np.float32)
-        if self.valid is None:
-            return small, None
-        return small, shrink(self.valid.astype(np.uint8) * 255, scale) > 254
-
-    def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
-        part = (slice(top, top + height), slice(left, left + width))
-        return self.pixels[part], None if self.valid is None else self.valid[part]
 
 
 def shot(

@@ -40,3 +40,9 @@ def apply_homography(homography: FloatArray, points_px: FloatArray) -> FloatArra
     w = homogeneous[:, 2]
     safe = np.where(w > 1e-12, w, np.nan)
     return homogeneous[:, :2] / safe[:, None]
+
+
+def homography_jacobians(homography: FloatArray, points_px: FloatArray, there_px: FloatArray) -> FloatArray:
+    """(N, 2, 2): how the images there_px (N, 2) of points (N, 2) under a (3, 3) homography move with the points."""
+    depth = points_px @ homography[2, :2] + homography[2, 2]
+    return np.asarray((homography[:2, :2] - there_px[:, :, None] * homography[2, :2]) / depth[:, None, None])

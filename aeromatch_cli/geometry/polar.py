@@ -46,7 +46,7 @@ class PolarGrid:
     @property
     def first(self) -> IntArray:
         """(R,) the first sample of every ring."""
-        return np.cumsum(self.counts) - self.counts
+        return _first(self.counts)
 
 
 def polar_grid(radius_px: float, step_px: float = 1.0) -> PolarGrid:
@@ -57,7 +57,7 @@ def polar_grid(radius_px: float, step_px: float = 1.0) -> PolarGrid:
     radii = np.arange(rings) + 0.5
     counts = np.maximum(np.rint(2.0 * np.pi * radii), _FEWEST).astype(np.int64)
     ring_idx = np.repeat(np.arange(rings), counts)
-    angles = 2.0 * np.pi * (np.arange(len(ring_idx)) - (np.cumsum(counts) - counts)[ring_idx]) / counts[ring_idx]
+    angles = 2.0 * np.pi * (np.arange(len(ring_idx)) - _first(counts)[ring_idx]) / counts[ring_idx]
     radii_px = radii[ring_idx] * step_px
     offsets = np.stack([radii_px * np.cos(angles), radii_px * np.sin(angles)], axis=1)
     return PolarGrid(float(step_px), counts, ring_idx, offsets)
@@ -106,10 +106,15 @@ def as_picture(values: FloatArray, grid: PolarGrid, size_px: tuple[int, int], ce
     outer = np.minimum(inner + 1, len(grid.counts) - 1)
     # Within the innermost ring there is nothing to interpolate towards.
     share = np.clip(place - inner, 0.0, 1.0)
-    rings = (_along(values, grid.first[ring], grid.counts[ring], turns * grid.counts[ring]) for ring in (inner, outer))
-    low, high = rings
+    low, high = (
+        _along(values, grid.first[ring], grid.counts[ring], turns * grid.counts[ring]) for ring in (inner, outer)
+    )
     known = place <= len(grid.counts) - 1
     return np.where(known, low * (1.0 - share) + high * share, np.nan).reshape(height, width)
+
+
+def _first(counts: IntArray) -> IntArray:
+    return np.cumsum(counts) - counts
 
 
 def _along(values: FloatArray, first: IntArray, counts: IntArray, place: FloatArray) -> FloatArray:

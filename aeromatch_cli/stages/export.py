@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -104,18 +104,17 @@ def _contents(context: Context) -> ExportContents:
 
     if not context.settings.match.reads_pixels:
         return ExportContents(context.block, keypoints_px, _pairs(context), context.guessed_cameras)
-    tracks = tracks_of(
-        list(_matched(context)), keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id])
-    )
+    matched = list(_matched(context))
+    tracks = tracks_of(matched, keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id]))
 
     def with_measured_px(image_id: str) -> FloatArray:
         return tracks.keypoints_px[image_id] if image_id in tracks.keypoints_px else keypoints_px(image_id)
 
-    return ExportContents(context.block, with_measured_px, _joined(context, tracks), context.guessed_cameras)
+    return ExportContents(context.block, with_measured_px, _joined(matched, tracks), context.guessed_cameras)
 
 
-def _joined(context: Context, tracks: Tracks) -> Iterator[PairContents]:
-    for item in _matched(context):
+def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:
+    for item in matched:
         key, verdict = (item.pair.image_id0, item.pair.image_id1), item.verified.verdict
         yield PairContents(item.pair, tracks.raw[key], tracks.verified[key], verdict.model_kind, verdict.model)
 

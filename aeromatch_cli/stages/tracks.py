@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, IntArray, Matches, Pair
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, IntArray, Matches, Pair
 from aeromatch_cli.formats import VerifiedEntry
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import fundamental, sampson_distance_px
@@ -31,6 +31,11 @@ class MatchedPair:
     pair: Pair
     raw: Matches
     verified: VerifiedEntry
+
+    @property
+    def kept(self) -> BoolArray:
+        """(M,) which of the raw matches the filters kept: a lattice point is measured once in a pair."""
+        return np.isin(self.raw.indices[:, 0], self.verified.matches.indices[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +79,7 @@ class _Table:
         self._tracks: dict[str, list[IntArray]] = {}
         self._first: dict[str, int] = {}
         self._count = 0
-        self._parent = np.zeros(0, np.int64)
+        self._joined: dict[str, IntArray] = {}
         self._standing: dict[str, IntArray] = {}
 
     def add_image(self, image_id: str, lattice_px: Callable[[str], FloatArray]) -> None:
@@ -93,8 +98,7 @@ class _Table:
         raw = item.raw
         assert raw.points1_px is not None
         numbers = self.sizes[id1] + np.arange(len(raw.indices))
-        kept = np.isin(raw.indices[:, 0], item.verified.matches.indices[:, 0])
-        tracks = np.where(kept, self._first[id0] + raw.indices[:, 0], -1)
+        tracks = np.where(item.kept, self._first[id0] + raw.indices[:, 0], -1)
         self._places[id1].append(raw.points1_px)
         self._tracks[id1].append(tracks)
         self.sizes[id1] += len(numbers)
@@ -117,12 +121,12 @@ class _Table:
                 if roots[0] != roots[1] and _agree(seen[roots[0]], seen[roots[1]]):
                     parent[roots[1]] = roots[0]
                     seen[roots[0]] = seen[roots[1]] | seen[roots[0]]
-        self._parent = np.arange(self._count + 1)  # the last for keypoints of no track
+        roots_of = np.arange(self._count + 1)  # the last for keypoints of no track
         for track in parent:
-            self._parent[track] = _root(parent, track)
-        self._parent[-1] = -1
+            roots_of[track] = _root(parent, track)
+        roots_of[-1] = -1
         for image_id in self.sizes:
-            tracks = self._parent[np.concatenate(self._tracks[image_id])]
+            tracks = self._joined[image_id] = roots_of[np.concatenate(self._tracks[image_id])]
             standing = np.arange(len(tracks))
             _, index, inverse = np.unique(tracks, return_index=True, return_inverse=True)
             self._standing[image_id] = np.where(tracks >= 0, index[inverse], standing)
@@ -146,12 +150,11 @@ class _Table:
         verdict = item.verified.verdict
         if verdict.state != "verified":
             return np.zeros((0, 2), np.int32)
-        kept = np.isin(item.raw.indices[:, 0], item.verified.matches.indices[:, 0])
-        direct = np.column_stack([item.raw.indices[kept, 0], own[kept]])
+        direct = np.column_stack([item.raw.indices[item.kept, 0], own[item.kept]])
         direct = np.column_stack([self.standing(id0, direct[:, 0]), self.standing(id1, direct[:, 1])])
-        sides = [self._parent[np.concatenate(self._tracks[image_id])] for image_id in (id0, id1)]
-        shared = np.intersect1d(*(side[side >= 0] for side in sides))
-        found = [self._first_of(side, shared) for side in sides]
+        side0, side1 = self._joined[id0], self._joined[id1]
+        shared = np.intersect1d(side0[side0 >= 0], side1[side1 >= 0])
+        found = [self._first_of(side, shared) for side in (side0, side1)]
         places = [self.places(image_id)[numbers] for image_id, numbers in zip((id0, id1), found, strict=True)]
         good = _on_model(verdict.model_kind, verdict.model, places, camera_of(id0), camera_of(id1))
         derived = np.column_stack([found[0], found[1]])[good]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
 from aeromatch_cli.images import shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.lattice import Lattice
@@ -19,9 +20,10 @@ from aeromatch_cli.strategies.simulators.none import source_view
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A decoded picture as a `data.Raster`."""
+    """A decoded picture (H, W) as a `data.Raster`, and where it is valid (None = everywhere)."""
 
-    pixels: NDArray[np.uint8]
+    pixels: NDArray[Any]
+    valid: BoolArray | None = None
     finest: float = 1.0
 
     @property
@@ -32,11 +34,15 @@ class Shot:
     def height_px(self) -> int:
         return self.pixels.shape[0]
 
-    def reduced(self, scale: float) -> tuple[FloatArray, None]:
-        return shrink(self.pixels, scale).astype(np.float32), None
+    def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
+        small = shrink(self.pixels, scale).astype(np.float32)
+        if self.valid is None:
+            return small, None
+        return small, shrink(self.valid.astype(np.uint8) * 255, scale) > 254
 
-    def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, None]:
-        return self.pixels[top : top + height, left : left + width].astype(np.float32), None
+    def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
+        part = (slice(top, top + height), slice(left, left + width))
+        return self.pixels[part].astype(np.float32), None if self.valid is None else self.valid[part]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from aeromatch_cli.data import Features, FloatArray, Matches, PairGeometry, Rast
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
-from aeromatch_cli.strategies.matchers.polar.registration import Prior, Registration, register
+from aeromatch_cli.strategies.matchers.polar.registration import SCALES, Registration, register
 from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
 
 
@@ -42,8 +42,10 @@ class Polar(Strategy):
     reads_pixels: ClassVar[bool] = True
     name: Literal["polar"] = "polar"
     sigmas: float = Field(3.0, gt=0.0, description="Poses may be wrong by so many standard deviations.")
-    smallest_scale: float = Field(0.78, gt=0.0, description="Without poses: scale of image 1 over image 0, at least.")
-    largest_scale: float = Field(1.28, gt=0.0, description="Without poses: at most.")
+    smallest_scale: float = Field(
+        SCALES[0], gt=0.0, description="Without poses: scale of image 1 over image 0, at least."
+    )
+    largest_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
     window: int = Field(21, ge=7, le=101, description="Side of the windows that tie points are measured with, pixels.")
     least_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
     largest_sigma_px: float = Field(0.3, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
@@ -78,10 +80,9 @@ class Polar(Strategy):
         side0, side1 = (Side.stored(raster0), Side.stored(raster1)) if posed is None else (posed.side0, posed.side1)
         longest = max(side0.width_px, side0.height_px, side1.width_px, side1.height_px)
         levels = Pyramid(side0.read, side1.read, longest)
-        prior = None
-        if posed is not None:
-            prior = Prior(posed.expected, posed.turn_rad, posed.log_scale, posed.reach_px)
-        registration = register(levels, prior, (self.smallest_scale, self.largest_scale))
+        registration = register(
+            levels, None if posed is None else posed.prior, (self.smallest_scale, self.largest_scale)
+        )
         return Registered(side0, side1, levels, registration)
 
     def measured(self, found: Registered, points_px: FloatArray) -> TiePoints:

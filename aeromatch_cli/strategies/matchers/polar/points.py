@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Raster
-from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
 from aeromatch_cli.strategies.matchers.polar.affine import Windows, adjusted
 from aeromatch_cli.strategies.matchers.polar.level import Level, level_of
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid
@@ -62,7 +62,7 @@ def tie_points(
     if not len(rows):
         return _found(rows, Windows.start(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2))))
     expected = frame1[rows]
-    start = Windows.start(frame0[rows], expected, _jacobians(registration.warp, frame0[rows], expected))
+    start = Windows.start(frame0[rows], expected, homography_jacobians(registration.warp, frame0[rows], expected))
     windows = _followed(levels, start)
     stored = _stored(side0, side1, windows, lattice_px[rows])
     straight = side1.source_from_frame(expected)
@@ -100,12 +100,6 @@ def _corrected(windows: Windows, expected_px: FloatArray, good: BoolArray) -> Wi
     """Those that are not good start again from where they are expected."""
     places = np.where(good[:, None], windows.places1_px, expected_px)
     return replace(windows, places1_px=places, matched=np.asarray(np.isfinite(places).all(axis=1)))
-
-
-def _jacobians(warp: FloatArray, places0: FloatArray, places1: FloatArray) -> FloatArray:
-    """(N, 2, 2) of a homography."""
-    depth = places0 @ warp[2, :2] + warp[2, 2]
-    return np.asarray((warp[:2, :2] - places1[:, :, None] * warp[2, :2]) / depth[:, None, None])
 
 
 def _stored(side0: Side, side1: Side, windows: Windows, lattice_px: FloatArray) -> Windows:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
 from aeromatch_cli.strategies.matchers.polar.evidence import Evidence, cell_size_px, evidence
 from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid, rescaled
@@ -37,6 +37,7 @@ _EFFORTS = (_Effort(48.0, 8.0, 5, 8, 2000, 0.6, 4, 2), _Effort(96.0, 4.0, 9, 32,
 # Longer side of the pictures at each step of refinement, px.
 _COARSE_PX, _FIRST_PX = 90.0, 180.0
 SECOND_PX = 400.0
+SCALES = (0.78, 1.28)  # of side 1 over side 0, without a prior: the asked 0.8 to 1.25, and what a search is off
 _LEAST_CORRELATION = 0.15
 _LEAST_CELLS = 12
 _LEAST_AGREEING = 0.4
@@ -104,7 +105,7 @@ class Prior:
         return off_px <= _STRETCH * self.reach_px + _ROUGH * longest_px
 
 
-def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, float] = (0.78, 1.28)) -> Registration:
+def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, float] = SCALES) -> Registration:
     """Similarity between the frames of both sides. scales: smallest and largest, without a prior."""
     best: Registration | None = None
     warps: list[FloatArray] = []
@@ -219,8 +220,7 @@ def _differs(first: Fit, second: Fit, side_px: float) -> bool:
 def _similar(warp: FloatArray, middle_px: FloatArray) -> FloatArray:
     """The similarity (3, 3) that a homography is at a place of side 0."""
     there = apply_homography(warp, middle_px[None])[0]
-    depth = warp[2, :2] @ middle_px + warp[2, 2]
-    linear = (warp[:2, :2] - np.outer(there, warp[2, :2])) / depth
+    linear = homography_jacobians(warp, middle_px[None], there[None])[0]
     cosine, sine = (linear[0, 0] + linear[1, 1]) / 2.0, (linear[1, 0] - linear[0, 1]) / 2.0
     linear = np.array([[cosine, -sine], [sine, cosine]])
     return np.vstack([np.column_stack([linear, there - linear @ middle_px]), [0.0, 0.0, 1.0]])

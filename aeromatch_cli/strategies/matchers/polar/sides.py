@@ -14,6 +14,7 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, PairGeometry, Pose, Raster
 from aeromatch_cli.geometry.footprints import ground_footprint, ground_sampling_distance_m
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
+from aeromatch_cli.strategies.matchers.polar.registration import Prior
 
 # Ground farther off than this many flying heights is left out: it is seen at less than 27 degrees.
 _FARTHEST = 2.0
@@ -86,16 +87,13 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Both sides as seen from above. expected: (3, 3) frame px1 from frame px0, a whole number of pixels. turn_rad,
-    log_scale, reach_px: how far off that may be by the standard deviations of the poses, at `sigmas` of them.
+    """Both sides as seen from above. prior: a shift by whole pixels, and how far off it may be by the standard
+    deviations of the poses, at `sigmas` of them.
     """
 
     side0: Side
     side1: Side
-    expected: FloatArray
-    turn_rad: float
-    log_scale: float
-    reach_px: float
+    prior: Prior
 
 
 def grounded(raster0: Raster, raster1: Raster, geometry: PairGeometry, sigmas: float) -> Posed | None:
@@ -117,14 +115,13 @@ def grounded(raster0: Raster, raster1: Raster, geometry: PairGeometry, sigmas: f
         for pose, height, turn in zip((pose0, pose1), heights, turns, strict=True)
     ]
     scales = [pose.sigma_position_m / height for pose, height in zip((pose0, pose1), heights, strict=True)]
-    return Posed(
-        side0,
-        side1,
+    prior = Prior(
         np.asarray(np.linalg.inv(ground1) @ ground0),
         sigmas * float(np.hypot(turns[0], turns[1])),
         sigmas * float(np.hypot(scales[0], scales[1])),
         sigmas * float(np.hypot(shifts[0], shifts[1])),
     )
+    return Posed(side0, side1, prior)
 
 
 def _side(
