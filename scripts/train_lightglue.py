@@ -43,7 +43,7 @@ DIMENSIONS = Dimensions(input_dim=128, descriptor_dim=128, n_layers=6, num_heads
 DECAY, CLIP = 0.999, 1.0
 ALL_KEYPOINTS = 4096
 # Arguments of which another value makes other data, and another run.
-OF_DATA, OF_RUN = ("trained_on", "unseen", "groups", "blocks"), ("start", "scale", "batch", "rate")
+OF_DATA, OF_RUN = ("trained_on", "unseen", "groups", "blocks", "seed"), ("start", "scale", "batch", "rate")
 REPORT_EVERY, SAVE_EVERY = 16_000, 2_000  # pairs
 
 
@@ -68,9 +68,9 @@ def phases(scale: float, *, anew: bool) -> tuple[Phase, ...]:
     )
 
 
-def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen: int) -> Batch:
+def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen: int, seed: int) -> Batch:
     """The batch after so many pairs."""
-    rng = np.random.default_rng([seen, 17])
+    rng = np.random.default_rng([seen, 17, seed])
     pieces = []
     for _ in range(size):
         source = stage2 if rng.random() < phase.rendered else stage1
@@ -133,7 +133,7 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
         size = max(1, args.batch * 256 // phase.count)
         for group in run.optimiser.param_groups:
             group["lr"] = args.rate * _rate(run.seen, total)
-        losses.append(step(run, on(drawn(stage1, stage2, phase, size, run.seen), device), phase, device))
+        losses.append(step(run, on(drawn(stage1, stage2, phase, size, run.seen, args.seed), device), phase, device))
         before, run.seen = run.seen, run.seen + size
         if run.seen // REPORT_EVERY > before // REPORT_EVERY or run.seen >= total:
             row = {"seen": run.seen, "phase": phase.name, "minutes": round((time.monotonic() - started) / 60, 1)}
@@ -287,6 +287,7 @@ def main() -> None:
     add("--blocks", type=int, default=60, help="rendered blocks, at least 19")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--start", type=Path, help="weights to go on from; the first phase, of homographies alone, is left out then")
+    add("--seed", type=int, default=0, help="of the homography groups and of what is drawn; rendered blocks stay")
     add("--scale", type=float, default=1.0, help="of the number of pairs of every phase")
     add("--batch", type=int, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
     add("--rate", type=float, default=6e-4, help="largest learning rate")

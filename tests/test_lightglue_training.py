@@ -183,13 +183,14 @@ def test_a_run_is_not_mixed_with_another(tmp_path: Path, capsys: pytest.CaptureF
         (tmp_path / "data" / name / "images").mkdir(parents=True)
     parser = argparse.ArgumentParser()
     plain = {"trained_on": "a", "unseen": "b", "groups": 200, "blocks": 19, "start": None, "scale": 1.0, "batch": 16}
-    args = argparse.Namespace(data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, **plain)
+    args = argparse.Namespace(data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, seed=0, **plain)
     train_lightglue.check(parser, args)
     args.only_data = False
     train_lightglue.check(parser, args)
     train_lightglue.check(parser, args)
     for name, value, said in (
         ("scale", 0.5, "holds another run (scale 1.0)"),
+        ("seed", 1, "holds another run (seed 0)"),
         ("groups", 250, "holds another run (groups 200)"),
         ("groups", 130, "multiple of 50"),
         ("blocks", 4, "give at least 19"),

@@ -39,7 +39,8 @@ def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[s
     jobs: list[Callable[[], None]] = []
     for shard in range(args.groups // SHARD):
         paths = made if shard % 4 == 3 else real
-        jobs.append(partial(write_groups, out / "stage1" / f"{shard:04d}.npz", paths, shard * SHARD, SHARD))
+        first = args.seed * 10**7 + shard * SHARD
+        jobs.append(partial(write_groups, out / "stage1" / f"{shard:04d}.npz", paths, first, SHARD))
     for index, paths in enumerate((other, left_out)):
         jobs.append(partial(write_groups, out / "unseen1" / f"{index}.npz", paths, 10**6 + index * SHARD, SHARD))
     for name, group in (("stage2", known), ("unseen2", left)):
