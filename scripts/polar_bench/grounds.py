@@ -1,6 +1,7 @@
 """Large pictures of flat ground, and pairs cut out of them of which everything is known.
 
 A ground is a mosaic: of pictures of a real block, or of rendered pictures of as many seeds, joined over a soft border.
+Where there are too few they come again mirrored, which no turn makes the same; real ones enlarged, if need be.
 Both pictures of a pair are cut out by a similarity, with cubic interpolation; then gain, offset and noise are drawn
 for each, and gray values rounded.
 """
@@ -21,6 +22,7 @@ from aeromatch_cli.synthetic import render_block
 
 RENDERED, REAL = ("grass", "desert", "farmland"), ("seneca", "caliterra")
 _TILE = (3000, 2250)
+_MOST_RENDERED = 18
 _SOFT = 0.06  # of a tile's side, where it is joined with the next
 _LEAST_OVERLAP = 0.3
 _SCALES = (0.8, 1.25)
@@ -47,24 +49,36 @@ def ground(kind: str, size: tuple[int, int], seed: int, data: Path, out: Path) -
 
 
 def _rendered(kind: str, size: tuple[int, int], seed: int, out: Path) -> list[list[NDArray[np.uint8]]]:
-    rows = []
-    for row in range(_count(size[1], _TILE[1])):
-        rows.append([])
-        for column in range(_count(size[0], _TILE[0])):
-            folder = out / f"{kind}-{seed}-{row}-{column}"
-            number = 10_000 + 1000 * seed + 32 * row + column
+    rows, columns = _count(size[1], _TILE[1]), _count(size[0], _TILE[0])
+    pictures = []
+    for index in range(min(_MOST_RENDERED, rows * columns)):
+        folder = out / f"{kind}-{seed}-{index}"
+        if not (folder / "truth.json").is_file():
+            number = 10_000 + 1000 * seed + index
             render_block(folder, kind, seed=number, width_px=_TILE[0], height_px=_TILE[1], images=1)
-            rows[-1].append(read_pixels(next((folder / "images").iterdir()), colour=False))
-    return rows
+        pictures.append(read_pixels(next((folder / "images").iterdir()), colour=False))
+    return _laid(pictures, rows, columns)
 
 
 def _real(block: Path, size: tuple[int, int], seed: int) -> list[list[NDArray[np.uint8]]]:
     paths = sorted((block / "images").iterdir())
     chosen = np.random.default_rng([seed, 3]).permutation(len(paths))
-    shape = read_pixels(paths[0], colour=False).shape
-    rows, columns = _count(size[1], shape[0]), _count(size[0], shape[1])
-    numbers = chosen[: rows * columns].reshape(rows, columns)
-    return [[read_pixels(paths[number], colour=False) for number in row] for row in numbers]
+    pictures = [read_pixels(paths[number], colour=False) for number in chosen]
+    height, width = pictures[0].shape
+    scale = 1.0
+    while _count(size[1], int(height * scale)) * _count(size[0], int(width * scale)) > 2 * len(pictures):
+        scale *= 1.1
+    rows, columns = _count(size[1], int(height * scale)), _count(size[0], int(width * scale))
+    wide = int(width * scale), int(height * scale)
+    if scale > 1.0:
+        pictures = [np.asarray(cv2.resize(p, wide, interpolation=cv2.INTER_CUBIC), np.uint8) for p in pictures]
+    return _laid(pictures, rows, columns)
+
+
+def _laid(pictures: Sequence[NDArray[np.uint8]], rows: int, columns: int) -> list[list[NDArray[np.uint8]]]:
+    """In rows, from the second round on mirrored."""
+    laid = [pictures[i % len(pictures)][:, :: -1 if i >= len(pictures) else 1] for i in range(rows * columns)]
+    return [laid[row * columns : (row + 1) * columns] for row in range(rows)]
 
 
 def _count(length: int, tile: int) -> int:

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
+from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.images import shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.lattice import Lattice
-from aeromatch_cli.strategies.matchers.polar import Polar
+from aeromatch_cli.strategies.matchers.polar import Polar, Registered
 from aeromatch_cli.strategies.matchers.polar.registration import Registration
 from aeromatch_cli.strategies.simulators.none import source_view
 
@@ -47,14 +48,14 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class PolarResult:
-    """points0_px, points1_px: (M, 2) tie points. seconds: of the registration; seconds_tie_points: of everything.
-
-    Everything but decoding, as for SIFT: the lattice too.
+    """matrix: (3, 3) px1 from px0 of stored pixels. points0, points1: (M, 2) tie points. seconds: of the registration;
+    seconds_tie_points: of everything. Everything but decoding, as for SIFT: the lattice too.
     """
 
+    matrix: FloatArray
     registration: Registration
-    points0_px: FloatArray
-    points1_px: FloatArray
+    points0: FloatArray
+    points1: FloatArray
     seconds: float
     seconds_tie_points: float
 
@@ -75,7 +76,30 @@ def registered(
         points0 = Lattice(points=cells)(geometry.camera0, [view]).keypoints_px.astype(np.float64)
     points = polar.measured(found, points0)
     total = time.perf_counter() - started
-    return PolarResult(found.registration, points0[points.rows], points.points1_px, seconds, total)
+    return PolarResult(_stored(found), found.registration, points0[points.rows], points.points1_px, seconds, total)
+
+
+def _stored(found: Registered) -> FloatArray:
+    """(3, 3) of stored pixels: of frames that look from above the similarity closest to it where both see ground."""
+    matrix, raster = found.registration.matrix, found.side0.raster
+    if found.side0.camera is None:
+        return matrix
+    xs, ys = np.linspace(0, raster.width_px - 1, 40), np.linspace(0, raster.height_px - 1, 30)
+    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    there = found.side1.source_from_frame(apply_homography(matrix, found.side0.frame_from_source(places)))
+    size = np.array([found.side1.raster.width_px, found.side1.raster.height_px])
+    with np.errstate(invalid="ignore"):
+        shared = ((there >= 0.0) & (there < size)).all(axis=1)
+    return closest_similarity(places[shared], there[shared]) if shared.sum() >= 2 else np.eye(3)
+
+
+def closest_similarity(places0: FloatArray, places1: FloatArray) -> FloatArray:
+    """(3, 3) that takes places (P, 2) to others by least squares."""
+    first, second = ((places - places.mean(axis=0)) @ np.array([1.0, 1j]) for places in (places0, places1))
+    factor = complex(np.vdot(first, second) / np.vdot(first, first))
+    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    shift = places1.mean(axis=0) - linear @ places0.mean(axis=0)
+    return np.vstack([np.column_stack([linear, shift]), [0.0, 0.0, 1.0]])
 
 
 def unknown_geometry(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> PairGeometry:

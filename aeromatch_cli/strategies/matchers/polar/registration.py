@@ -17,32 +17,30 @@ from aeromatch_cli.strategies.matchers.polar.start import Search, candidates, ev
 
 @dataclass(frozen=True)
 class _Effort:
-    """size_px: longer side of the pictures searched. turn_step_deg, scales: tried. followed: candidates. samples: of
-    the coarse level's fits, thrice as many of the next. hopeless: share of the best fit's significance below which one
-    is not followed. promising: most that are, and rivals: most that are looked at closely.
+    """size_px: longer side of the pictures searched. turn_step_deg, scales: tried. followed: candidates. ways: to
+    follow each. rivals: most that are looked at closely. samples: of the fits, a third of them on the coarse level.
     """
 
     size_px: float
     turn_step_deg: float
     scales: int
     followed: int
-    samples: int
-    hopeless: float
-    promising: int
+    ways: int
     rivals: int
+    samples: int
 
 
 # Most pairs are clear at once. The rest is searched as if time did not matter.
-_EFFORTS = (_Effort(48.0, 8.0, 5, 8, 2000, 0.6, 4, 2), _Effort(96.0, 4.0, 9, 32, 3000, 0.2, 12, 8))
+_EFFORTS = (_Effort(64.0, 6.0, 7, 3, 1, 2, 6000), _Effort(96.0, 4.0, 9, 8, 2, 6, 9000))
 # Longer side of the pictures at each step of refinement, px.
 _COARSE_PX, _FIRST_PX = 90.0, 180.0
 SECOND_PX = 400.0
 SCALES = (0.78, 1.28)  # of side 1 over side 0, without a prior: the asked 0.8 to 1.25, and what a search is off
-_LEAST_CORRELATION = 0.15
+_LEAST_CORRELATION = 0.1
 _LEAST_CELLS = 12
 _LEAST_AGREEING = 0.4
 _LEAST_PREFERRED = 0.8
-_CLEAR = 0.95
+_CLEAR, _CLEARLY_PREFERRED = 0.85, 0.95
 _CREDIBLE = 0.4
 # What a prior allows in the end: so much more than its reach, and a share of the longer side.
 _STRETCH, _ROUGH = 1.25, 0.01
@@ -73,7 +71,7 @@ class Registration:
     def clear(self) -> bool:
         """Whether there is no need to look elsewhere."""
         proof = self.evidence
-        return self.accepted and proof is not None and min(proof.share, self.preferred) >= _CLEAR
+        return self.accepted and proof is not None and proof.share >= _CLEAR and self.preferred >= _CLEARLY_PREFERRED
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +136,7 @@ def _refined(levels: Pyramid, ranked: Sequence[FloatArray], prior: Prior | None)
     second, scale = levels.at(SECOND_PX, even=True), levels.scale(SECOND_PX)
     starts = [rescaled(warp, 1.0, scale) for warp in ranked]
     followed = [fit(*second, start, samples=15_000, still_px=0.01, tilted=True) for start in starts]
-    apart = _apart(_allowed(followed, prior, levels, scale), 0.0, SECOND_PX)
+    apart = _apart(_allowed(followed, prior, levels, scale), SECOND_PX)
     if not apart:
         return Registration(ranked[0], ranked[0], None, None, scale, _LOST)
     cell = cell_size_px(second[0], apart[0].share)
@@ -166,21 +164,36 @@ def _ranked(
     others: Sequence[FloatArray],
     prior: Prior | None,
 ) -> list[FloatArray]:
-    """Homographies (3, 3) between frames: the best fits of a coarse level that say different things, best first.
+    """Homographies (3, 3) between frames: what a coarse level makes of starts and says different things, in order.
 
     starts: similarities (3, 3) between frames. others: homographies that are to be compared too.
     """
+    first, scale = levels.at(_FIRST_PX, even=True), levels.scale(_FIRST_PX)
+    fits = [_risen(levels, start, effort) for start in starts]
+    fits += [fit(*first, rescaled(warp, 1.0, scale), samples=effort.samples, tilted=True) for warp in others]
+    apart = _apart(_allowed(fits, prior, levels, scale), _FIRST_PX)
+    return [rescaled(item.matrix, scale, 1.0) for item in apart[: effort.rivals + len(others)]]
+
+
+def _risen(levels: Pyramid, start: FloatArray, effort: _Effort) -> Fit | None:
+    """A start (3, 3) between frames fitted on the coarse level and on the next, with tilt.
+
+    What is fitted with tilt at once may slide along rows, what is not may be too far off: thorough is to try both.
+    """
     coarse, scale = levels.at(_COARSE_PX, even=True), levels.scale(_COARSE_PX)
-    count = effort.samples
-    fits = [fit(*coarse, rescaled(start, 1.0, scale), samples=count, still_px=0.05) for start in starts]
-    promising = _apart(fits, effort.hopeless, _COARSE_PX)[: effort.promising]
-    bent = [fit(*coarse, item.matrix, samples=count, still_px=0.05, tilted=True) or item for item in promising]
     first, finer = levels.at(_FIRST_PX, even=True), levels.scale(_FIRST_PX)
-    followed = [rescaled(item.matrix, scale, finer) for item in bent]
-    followed += [rescaled(warp, 1.0, finer) for warp in others]
-    fits = [fit(*first, start, samples=3 * count, still_px=0.03, tilted=True) for start in followed]
-    fits = _allowed(fits, prior, levels, finer)
-    return [rescaled(item.matrix, finer, 1.0) for item in _apart(fits, effort.hopeless, _FIRST_PX)[: effort.rivals]]
+    plain = fit(*coarse, rescaled(start, 1.0, scale), samples=effort.samples // 3, still_px=0.05)
+    bent = plain and fit(*coarse, plain.matrix, samples=effort.samples // 3, still_px=0.05, tilted=True)
+    # What shares a tenth is too small on the coarse level: the search has found it to a pixel or two there.
+    ways = [item.matrix for item in (bent, plain) if item is not None] or [rescaled(start, 1.0, scale)]
+    starts = [rescaled(way, scale, finer) for way in ways[: effort.ways]]
+    fits = [fit(*first, way, samples=effort.samples, still_px=0.03, tilted=True) for way in starts]
+    return max((item for item in fits if item is not None), key=_significance, default=None)
+
+
+def _significance(item: Fit) -> float:
+    """Correlation in deviations of chance, but for a factor: samples that resemble their neighbours."""
+    return item.correlation * float(np.sqrt(item.samples))
 
 
 def _allowed(fits: list[Fit | None], prior: Prior | None, levels: Pyramid, scale: float) -> list[Fit | None]:
@@ -190,21 +203,13 @@ def _allowed(fits: list[Fit | None], prior: Prior | None, levels: Pyramid, scale
     return [item for item in fits if item is not None and prior.allows(item, scale, levels.longest_px)]
 
 
-def _apart(fits: Sequence[Fit | None], hopeless: float, side_px: float) -> list[Fit]:
-    """Best first, without those that say the same as a better one, or fit far worse than the best."""
-    usable = [item for item in fits if item is not None and item.correlation > 0.0]
+def _apart(fits: Sequence[Fit | None], side_px: float) -> list[Fit]:
+    """In order, without those that say the same as one before."""
     kept: list[Fit] = []
-    for item in sorted(usable, key=lambda item: -_significance(item)):
-        if _significance(item) < hopeless * _significance(kept[0] if kept else item):
-            break
-        if all(_differs(item, other, side_px) for other in kept):
+    for item in fits:
+        if item is not None and item.correlation > 0.0 and all(_differs(item, other, side_px) for other in kept):
             kept.append(item)
     return kept
-
-
-def _significance(item: Fit) -> float:
-    """Correlation in deviations of chance, but for a factor: samples that resemble their neighbours."""
-    return item.correlation * float(np.sqrt(item.samples))
 
 
 def _differs(first: Fit, second: Fit, side_px: float) -> bool:
@@ -230,10 +235,10 @@ def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
     """Why not to believe it, "" for nothing."""
     if not found.converged:
         return f"least squares did not converge: still moving {found.moved_px:.2g} px"
-    if found.correlation < _LEAST_CORRELATION:
-        return f"the pictures correlate by {found.correlation:.2f} only"
     if proof.cells < _LEAST_CELLS:
         return f"only {proof.cells} parts of the overlap can be compared"
+    if proof.correlation < _LEAST_CORRELATION:
+        return f"the pictures correlate by {proof.correlation:.2f} only"
     if proof.share < _LEAST_AGREEING:
         return f"{proof.agreeing} of {proof.cells} parts of the overlap agree (by chance {proof.by_chance:.0f})"
     if preferred < _LEAST_PREFERRED:

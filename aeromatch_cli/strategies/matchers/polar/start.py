@@ -5,8 +5,13 @@ either spectrum are noise. Trying 45 turns and 5 scales of pictures 48 px long c
 transforms, and each compares the shared part alone. Half of the turns are free: a turn by 180 degrees more is the
 conjugate spectrum.
 
+Both pictures are whitened beforehand: every frequency counts alike. Ploughed rows have nearly all their contrast in a
+few, and fit as well anywhere along the rows; what is left when these count no more than others says where. (Of eight
+pairs of one such block, overlap 0.35 to 0.7, the right place was the best of all for every one; for five without.)
+
 Source: normalised correlation of masked pictures by FFT, Padfield, IEEE TIP 21(5), 2012, here of pictures that are
-normalised locally beforehand, so that a sum over the overlap needs to be divided by the root of its area only.
+normalised locally beforehand, so that a sum over the overlap needs to be divided by the root of its area only; phase
+correlation of both spectra, Chen, Defrise and Deconinck, IEEE TPAMI 16(12), 1994, here over smoothed spectra.
 """
 
 from __future__ import annotations
@@ -23,6 +28,9 @@ from aeromatch_cli.strategies.matchers.polar.level import normalised
 _LEAST_OVERLAP = 0.22  # of the smaller picture; shares below 0.3 come out of the similarity's own inexactness
 _SPREAD = 12.0  # pictures are normalised over the longer side by this
 _SAME_PX, _SAME_RAD = 3.0, np.deg2rad(12.0)
+# Whitening: a spectrum is divided by itself, smoothed by so many of its samples; what holds less than this share of the
+# mean is not raised; frequencies beyond about so many cycles per pixel fade.
+_SMOOTH, _FAINT, _FINEST = 2.0, 0.03, 0.22
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +69,7 @@ def candidates(
         for picture, mask in zip(pictures, valid, strict=True)
     ]
     spread_px = max(max(picture.shape) for picture in pictures) / _SPREAD
-    flat = [normalised(picture, mask, spread_px) for picture, mask in zip(pictures, ones, strict=True)]
+    flat = [_whitened(normalised(picture, mask, spread_px), mask) for picture, mask in zip(pictures, ones, strict=True)]
     canvas = int(np.ceil(np.hypot(*flat[1].shape) / search.scales.min())) | 1
     still = _Still.of(flat[0], ones[0], canvas)
     found, spreads = [], []
@@ -74,6 +82,25 @@ def candidates(
     spread = float(np.median(spreads)) or 1.0
     ranked = sorted((Candidate(item.score / spread, item.matrix) for item in found), key=lambda item: -item.score)
     return _apart(ranked, flat[0].shape)
+
+
+def _whitened(flat: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) with a flat spectrum where it is known, 0 elsewhere, deviation 1."""
+    import cv2
+    from scipy import fft
+
+    size = fft.next_fast_len(2 * max(flat.shape), real=True)
+    framed = cv2.copyMakeBorder(known, 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+    window = cv2.GaussianBlur(framed, (0, 0), 2.0)[2:-2, 2:-2] * known
+    spectrum = fft.fft2(flat * window, (size, size))
+    power = fft.fftshift((spectrum * spectrum.conj()).real.astype(np.float32))
+    power = fft.ifftshift(cv2.GaussianBlur(power, (0, 0), _SMOOTH, borderType=cv2.BORDER_REFLECT))
+    frequencies = np.fft.fftfreq(size)
+    fade = np.exp(-0.5 * (frequencies / _FINEST) ** 2)
+    least = _FAINT * np.sqrt(float(power.mean())) + 1e-9
+    even = spectrum / np.maximum(np.sqrt(power), least) * np.outer(fade, fade)
+    found = fft.ifft2(even)[: flat.shape[0], : flat.shape[1]].real.astype(np.float32) * known
+    return np.asarray(found / (np.sqrt((found**2).sum() / max(float(known.sum()), 1.0)) + 1e-9), np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,135 @@
+"""Pairs of blocks, of which nothing is told, or the poses: real ones with reference poses, rendered ones with relief.
+
+Right or wrong is said by reference poses (epipolar distance), or by the renderer (where every pixel really lands).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import FloatArray, Pair, PairGeometry
+from aeromatch_cli.evaluate import BlockTruth, open_truth
+from aeromatch_cli.evaluate.scores import PairScore
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
+from aeromatch_cli.images import read_pixels
+from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.pairs import prepare
+from aeromatch_cli.synthetic import render_block
+from polar_bench.grounds import RENDERED
+
+_LEAST_OVERLAP = 0.3
+_NO_SCORES = np.zeros((0, 2))
+# Of the longer side: how far the middle of the overlap may be off where a registration is called right. The ground is
+# no plane, and reference poses are good to some pixels.
+_RIGHT = 0.03
+Poses = tuple[Path, Path]  # told, and right
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPair:
+    """first, second: (H, W) uint8 gray. names: of the images. geometry: with what is known of the poses. overlap: share
+    of the larger part. plane: (P, 2) places of picture 0 over the overlap and where the plane of the ground puts them.
+    """
+
+    kind: str
+    names: tuple[str, str]
+    first: NDArray[np.uint8]
+    second: NDArray[np.uint8]
+    geometry: PairGeometry
+    overlap: float
+    plane: tuple[FloatArray, FloatArray]
+    truth: BlockTruth
+
+    @property
+    def middle_px(self) -> FloatArray:
+        """(2,) of the overlap, in picture 0."""
+        return np.asarray(self.plane[0].mean(axis=0))
+
+    def judged(self, points0_px: FloatArray, points1_px: FloatArray) -> PairScore:
+        """Matches (M, 2) of stored pixels."""
+        equal = np.ones(len(points0_px))
+        return self.truth.judge(*self.names, _NO_SCORES, _NO_SCORES, points0_px, points1_px, equal)
+
+    def right(self, matrix: FloatArray) -> bool:
+        """Whether a similarity (3, 3), px1 from px0, puts the overlap about where it lies."""
+        off = np.linalg.norm(apply_homography(matrix, self.plane[0]) - self.plane[1], axis=1)
+        return bool(np.median(off) <= _RIGHT * max(self.first.shape))
+
+
+def block_pairs(
+    kind: str, size: tuple[int, int], images: int, count: int, seed: int, data: Path, out: Path
+) -> Iterator[BlockPair]:
+    """Up to `count` pairs, at random, of overlap 0.3 at least. size, images: of rendered blocks."""
+    folder, poses = _rendered(kind, size, images, seed, out) if kind in RENDERED else _real(data / kind)
+    truth = open_truth(folder)
+    with tempfile.TemporaryDirectory() as scratch:
+        told, right = (_context(folder, path, Path(scratch)) for path in poses)
+    overlaps = {
+        names: truth.conditions(*names).overlap
+        for names in combinations(sorted(truth.cameras), 2)
+        if truth.overlap_at_most(*names) >= _LEAST_OVERLAP
+    }
+    usable = [names for names, overlap in overlaps.items() if overlap >= _LEAST_OVERLAP]
+    for number in sorted(np.random.default_rng([seed, 11]).permutation(len(usable))[:count]):
+        yield _pair(kind, told, right, truth, usable[number], overlaps[usable[number]])
+
+
+def _rendered(kind: str, size: tuple[int, int], images: int, seed: int, out: Path) -> tuple[Path, Poses]:
+    """A block over relief; its poses as a navigation unit gives them, and as they are."""
+    folder = out / f"block-{kind}-{size[0]}x{size[1]}-{images}-{seed}"
+    if not (folder / "truth.json").is_file():
+        render_block(folder, kind, seed=2_000_000 + seed, width_px=size[0], height_px=size[1], images=images)
+    return folder, (folder / "poses_noisy.csv", folder / "poses.csv")
+
+
+def _real(folder: Path) -> tuple[Path, Poses]:
+    return folder, (folder / "reference" / "poses.csv", folder / "reference" / "poses.csv")
+
+
+def _context(folder: Path, poses: Path, workspace: Path) -> Context:
+    cameras = folder / "block.json" if (folder / "block.json").is_file() else folder / "reference" / "block.json"
+    block = {"images": str(folder / "images"), "poses": str(poses), "cameras": str(cameras)}
+    settings = load("polar", ["pairs=exhaustive"], block, workspace=str(workspace))
+    return prepare(settings, Executor("serial", 1), dry=True)[0]
+
+
+def _pair(
+    kind: str, told: Context, right: Context, truth: BlockTruth, names: tuple[str, str], overlap: float
+) -> BlockPair:
+    ids = {image.name: image.image_id for image in told.block.images}
+    images = [told.image_by_id[ids[name]] for name in names]
+    pair = Pair(ids[names[0]], ids[names[1]], overlap, float("nan"), "bench")
+    first, second = (read_pixels(told.image_path(image), colour=False) for image in images)
+    plane = _plane(right.geometry(pair))
+    return BlockPair(kind, names, _eight(first), _eight(second), told.geometry(pair), overlap, plane, truth)
+
+
+def _eight(gray: NDArray[np.generic]) -> NDArray[np.uint8]:
+    if gray.dtype == np.uint8:
+        return np.asarray(gray, np.uint8)
+    return np.asarray(cv2.normalize(np.asarray(gray), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
+
+
+def _plane(geometry: PairGeometry) -> tuple[FloatArray, FloatArray]:
+    """Places (P, 2) of picture 0 on an even grid which the plane of the ground puts into picture 1, and where."""
+    camera0, camera1 = geometry.camera0, geometry.camera1
+    if geometry.pose0 is None or geometry.pose1 is None or geometry.ground_z_m is None:
+        raise ValueError("both poses and the ground must be known")
+    xs, ys = np.linspace(0, camera0.width_px - 1, 40), np.linspace(0, camera0.height_px - 1, 30)
+    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    ground = view_from_source(camera0, undistorted_from_ground(camera0, geometry.pose0, geometry.ground_z_m), places)
+    there = source_from_view(camera1, undistorted_from_ground(camera1, geometry.pose1, geometry.ground_z_m), ground)
+    with np.errstate(invalid="ignore"):
+        inside = ((there >= 0.0) & (there <= [camera1.width_px - 1.0, camera1.height_px - 1.0])).all(axis=1)
+    return places[inside], there[inside]
