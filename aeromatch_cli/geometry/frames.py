@@ -46,3 +46,15 @@ def homography_jacobians(homography: FloatArray, points_px: FloatArray, there_px
     """(N, 2, 2): how the images there_px (N, 2) of points (N, 2) under a (3, 3) homography move with the points."""
     depth = points_px @ homography[2, :2] + homography[2, 2]
     return np.asarray((homography[:2, :2] - there_px[:, :, None] * homography[2, :2]) / depth[:, None, None])
+
+
+def closest_similarity(points0: FloatArray, points1: FloatArray) -> FloatArray:
+    """(3, 3) similarity that takes points (N, 2), two different ones at least, to others by least squares.
+
+    Source: Umeyama, IEEE TPAMI 13(4), 1991, in the plane without mirroring.
+    """
+    first, second = ((points - points.mean(axis=0)) @ np.array([1.0, 1j]) for points in (points0, points1))
+    factor = complex(np.vdot(first, second) / np.vdot(first, first))
+    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    shift = points1.mean(axis=0) - linear @ points0.mean(axis=0)
+    return np.vstack([np.column_stack([linear, shift]), [0.0, 0.0, 1.0]])

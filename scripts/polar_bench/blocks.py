@@ -51,11 +51,6 @@ class BlockPair:
     plane: tuple[FloatArray, FloatArray]
     truth: BlockTruth
 
-    @property
-    def middle_px(self) -> FloatArray:
-        """(2,) of the overlap, in picture 0."""
-        return np.asarray(self.plane[0].mean(axis=0))
-
     def judged(self, points0_px: FloatArray, points1_px: FloatArray) -> PairScore:
         """Matches (M, 2) of stored pixels."""
         equal = np.ones(len(points0_px))

@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
-from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from aeromatch_cli.images import shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.lattice import Lattice
 from aeromatch_cli.strategies.matchers.polar import Polar, Registered
 from aeromatch_cli.strategies.matchers.polar.registration import Registration
 from aeromatch_cli.strategies.simulators.none import source_view
+
+_PROBES = 40  # places across a picture that its overlap is found from
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +50,25 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class PolarResult:
-    """matrix: (3, 3) px1 from px0 of stored pixels. points0, points1: (M, 2) tie points. seconds: of the registration;
-    seconds_tie_points: of everything. Everything but decoding, as for SIFT: the lattice too.
+    """matrix: (3, 3) px1 from px0 of stored pixels. found: what it is of. points0, points1: (M, 2) tie points. seconds:
+    of the registration; seconds_tie_points: of everything. Everything but decoding, as for SIFT: the lattice too.
     """
 
     matrix: FloatArray
-    registration: Registration
+    found: Registered
     points0: FloatArray
     points1: FloatArray
     seconds: float
     seconds_tie_points: float
+
+    @property
+    def registration(self) -> Registration:
+        return self.found.registration
+
+    def places1(self, places0: FloatArray) -> FloatArray:
+        """Where stored pixels (N, 2) of picture 0 lie in picture 1, as far as a homography can say."""
+        there = apply_homography(self.registration.warp, self.found.side0.frame_from_source(places0))
+        return self.found.side1.source_from_frame(there)
 
 
 def registered(
@@ -70,36 +81,31 @@ def registered(
     found = polar.registered(*shots, geometry)
     seconds = time.perf_counter() - started
     points0 = np.zeros((0, 2))
-    if tie_points and found.registration.fit is not None:
-        cells = int(np.ceil(tie_points / max(found.registration.fit.share, 0.1)))
+    shared0, shared1 = _shared(found)
+    if tie_points and found.registration.accepted:
+        cells = int(np.ceil(tie_points * _PROBES**2 / max(len(shared0), 1)))
         view = ViewPixels(source_view(geometry.camera0), first, None)
         points0 = Lattice(points=cells)(geometry.camera0, [view]).keypoints_px.astype(np.float64)
     points = polar.measured(found, points0)
     total = time.perf_counter() - started
-    return PolarResult(_stored(found), found.registration, points0[points.rows], points.points1_px, seconds, total)
+    # Of frames that look from above, the similarity of stored pixels that is closest.
+    straight = found.registration.matrix if found.side0.camera is None else np.eye(3)
+    if found.side0.camera is not None and len(shared0) >= 2:
+        straight = closest_similarity(shared0, shared1)
+    return PolarResult(straight, found, points0[points.rows], points.points1_px, seconds, total)
 
 
-def _stored(found: Registered) -> FloatArray:
-    """(3, 3) of stored pixels: of frames that look from above the similarity closest to it where both see ground."""
-    matrix, raster = found.registration.matrix, found.side0.raster
-    if found.side0.camera is None:
-        return matrix
-    xs, ys = np.linspace(0, raster.width_px - 1, 40), np.linspace(0, raster.height_px - 1, 30)
+def _shared(found: Registered) -> tuple[FloatArray, FloatArray]:
+    """Stored pixels (N, 2) of picture 0 on an even grid that picture 1 shows, and where."""
+    sides = found.side0, found.side1
+    sizes = [np.array([side.raster.width_px, side.raster.height_px]) for side in sides]
+    xs, ys = (np.linspace(0, length - 1, _PROBES) for length in sizes[0])
     places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    there = found.side1.source_from_frame(apply_homography(matrix, found.side0.frame_from_source(places)))
-    size = np.array([found.side1.raster.width_px, found.side1.raster.height_px])
+    there = apply_homography(found.registration.warp, sides[0].frame_from_source(places))
+    there = sides[1].source_from_frame(there)
     with np.errstate(invalid="ignore"):
-        shared = ((there >= 0.0) & (there < size)).all(axis=1)
-    return closest_similarity(places[shared], there[shared]) if shared.sum() >= 2 else np.eye(3)
-
-
-def closest_similarity(places0: FloatArray, places1: FloatArray) -> FloatArray:
-    """(3, 3) that takes places (P, 2) to others by least squares."""
-    first, second = ((places - places.mean(axis=0)) @ np.array([1.0, 1j]) for places in (places0, places1))
-    factor = complex(np.vdot(first, second) / np.vdot(first, first))
-    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    shift = places1.mean(axis=0) - linear @ places0.mean(axis=0)
-    return np.vstack([np.column_stack([linear, shift]), [0.0, 0.0, 1.0]])
+        shared = ((there >= 0.0) & (there < sizes[1])).all(axis=1)
+    return places[shared], there[shared]
 
 
 def unknown_geometry(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> PairGeometry:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from polar_bench import own
 from polar_bench.blocks import BlockPair, block_pairs
 from polar_bench.grounds import KnownPair, errors, ground, known_pair
@@ -21,6 +21,7 @@ Row = dict[str, Any]
 TIE_POINTS = 1000
 RATIOS = (0.6, 0.7, 0.8, 0.9)
 RIGHT_PX = 3.0
+_VERIFIED = 30  # matches of SIFT's that a comparison with it rests on
 _GRID = 16  # cells along either side of the overlap that coverage counts
 _REDUCED = 0.125
 _ROOM = (2.0, 1.56)  # of a picture's width: two pictures side by side in any direction, and room to turn
@@ -46,8 +47,11 @@ def known_rows(task: Task, pairs: int, with_sift: int) -> Iterator[Row]:
     """Rows of all methods, pair by pair, of every kind of ground. with_sift: of so many pairs at full size too."""
     count = len(task.kinds)
     for index, kind in enumerate(task.kinds):
+        wanted = pairs // count + (index < pairs % count)
+        if not wanted:
+            continue
         source = task.ground(kind)
-        for number in range(pairs // count + (index < pairs % count)):
+        for number in range(wanted):
             pair = known_pair(source, task.size, np.random.default_rng([task.seed, index, number]))
             head = {"section": "known", "kind": kind, "pair": number, "size": _size(pair.first),
                     "overlap": pair.overlap, "valid": True}  # fmt: skip
@@ -111,7 +115,7 @@ def unknown_rows(task: Task, pairs: int) -> Iterator[Row]:
                     "size": _size(pair.first), "overlap": round(pair.overlap, 3), "valid": True}  # fmt: skip
             sift = SiftPair(pair.first, pair.second)
             reference = sift.matched(RATIO)
-            usable = reference.accepted and pair.right(reference.matrix)
+            usable = reference.accepted and pair.right(reference.matrix) and int(reference.verified.sum()) >= _VERIFIED
             for ratio in RATIOS:
                 found = sift.matched(ratio)
                 right = found.accepted and pair.right(found.matrix)
@@ -120,7 +124,7 @@ def unknown_rows(task: Task, pairs: int) -> Iterator[Row]:
                 mine = own.registered(pair.first, pair.second, TIE_POINTS, geometry)
                 row = head | {"method": method} | _of_polar(mine) | _judged(mine, pair)
                 right = mine.registration.accepted and pair.right(mine.matrix)
-                yield row | {"right": right} | (_against(mine.matrix, reference.matrix, pair) if usable else {})
+                yield row | {"right": right} | (_against(mine, reference) if usable else {})
 
 
 def _judged(found: own.PolarResult | SiftResult, pair: BlockPair) -> Row:
@@ -131,15 +135,22 @@ def _judged(found: own.PolarResult | SiftResult, pair: BlockPair) -> Row:
     }  # fmt: skip
 
 
-def _against(matrix: FloatArray, reference: FloatArray, pair: BlockPair) -> Row:
-    """Differences to another similarity, at the middle of the overlap; `translation_px` is how far that moves it."""
-    middle = pair.middle_px[None]
-    places = [apply_homography(found, middle)[0] for found in (matrix, reference)]
-    turns = [np.rad2deg(np.arctan2(found[1, 0], found[0, 0])) for found in (matrix, reference)]
-    scales = [np.hypot(found[0, 0], found[1, 0]) for found in (matrix, reference)]
+def _against(mine: own.PolarResult, reference: SiftResult) -> Row:
+    """Differences between both similarities over SIFT's verified matches; `translation_px` is how far it moves them.
+
+    A similarity of tilted pictures depends on where they are looked at. Those of a RANSAC for similarities gather where
+    one fits by chance, so all that a fundamental matrix explains are taken, and polar is asked at the same places.
+    """
+    good = reference.verified
+    places = reference.points0[good]
+    found, other = (closest_similarity(places, there) for there in (mine.places1(places), reference.points1[good]))
+    middle = places.mean(axis=0)[None]
+    ends = [apply_homography(matrix, middle)[0] for matrix in (found, other)]
+    turns = [np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])) for matrix in (found, other)]
+    scales = [np.hypot(matrix[0, 0], matrix[1, 0]) for matrix in (found, other)]
     return {
-        "translation_error_px": float(np.linalg.norm(places[0] - places[1])),
-        "translation_px": float(np.linalg.norm(places[1] - middle[0])),
+        "translation_error_px": float(np.linalg.norm(ends[0] - ends[1])),
+        "translation_px": float(np.linalg.norm(ends[1] - middle[0])),
         "rotation_error_deg": float(abs((turns[0] - turns[1] + 180.0) % 360.0 - 180.0)),
         "rotation_deg": float(abs((turns[1] + 180.0) % 360.0 - 180.0)),
         "scale_error": float(abs(scales[0] / scales[1] - 1.0)),

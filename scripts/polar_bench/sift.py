@@ -16,7 +16,7 @@ from aeromatch_cli.images import shrink
 
 FEATURES = 20_000
 RATIO = 0.8
-_RANSAC_PX = 3.0
+_RANSAC_PX, _EPIPOLAR_PX = 3.0, 2.0
 _FEWEST = 15
 
 
@@ -31,6 +31,14 @@ class SiftResult:
     points1: FloatArray
     agree: BoolArray
     seconds: float
+
+    @property
+    def verified(self) -> BoolArray:
+        """(M,) which one fundamental matrix explains, whatever tilt and relief do."""
+        if len(self.points0) < _FEWEST:
+            return np.zeros(len(self.points0), bool)
+        _, mask = cv2.findFundamentalMat(self.points0, self.points1, cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 10_000)
+        return np.zeros(len(self.points0), bool) if mask is None else np.asarray(mask).ravel() > 0
 
     @property
     def inliers(self) -> int:

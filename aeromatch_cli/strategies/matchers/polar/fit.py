@@ -79,15 +79,19 @@ class Overlap:
 
 def overlap_of(level0: Level, level1: Level, matrix: FloatArray) -> Overlap | None:
     """What of side 0 a homography (3, 3) puts into side 1; None for next to nothing."""
-    width, height = level0.size_px
-    places = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
-    places = places.reshape(-1, 2)
-    known = level0.knows(places) & level1.knows(apply_homography(matrix, places))
-    shared = places[known]
+    shared = shared_places(level0, level1, matrix)
     if len(shared) < _PROBES:
         return None
     middle = shared.mean(axis=0)
-    return Overlap(middle, float(np.linalg.norm(shared - middle, axis=1).max()), len(shared) / len(places))
+    return Overlap(middle, float(np.linalg.norm(shared - middle, axis=1).max()), len(shared) / _PROBES**2)
+
+
+def shared_places(level0: Level, level1: Level, matrix: FloatArray) -> FloatArray:
+    """Places (N, 2) of side 0 on an even grid that a homography (3, 3) puts into side 1."""
+    width, height = level0.size_px
+    places = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
+    places = places.reshape(-1, 2)
+    return np.asarray(places[level0.knows(places) & level1.knows(apply_homography(matrix, places))])
 
 
 def fit(

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
+from aeromatch_cli.geometry.frames import apply_homography, closest_similarity, homography_jacobians
 from aeromatch_cli.strategies.matchers.polar.evidence import Evidence, cell_size_px, evidence
-from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit
+from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit, shared_places
+from aeromatch_cli.strategies.matchers.polar.level import Level
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid, rescaled
 from aeromatch_cli.strategies.matchers.polar.start import Search, candidates, everywhere
 
@@ -44,15 +45,18 @@ _CLEAR, _CLEARLY_PREFERRED = 0.85, 0.95
 _CREDIBLE = 0.4
 # What a prior allows in the end: so much more than its reach, and a share of the longer side.
 _STRETCH, _ROUGH = 1.25, 0.01
+# On the finest level: a similarity that is off by more, in the mean, holds in a part of the overlap only.
+_BENT_PX = 0.5
 _APART, _APART_RAD = 0.035, np.deg2rad(5.0)
 _LOST = "the overlap was lost on the way to finer pictures"
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """matrix: (3, 3) similarity, frame px1 from frame px0. warp: (3, 3) homography, the same with tilt. fit: of the
-    similarity on the finest level, in its px. scale: of that level. reason: why it is not to be believed, "" where it
-    is. preferred: share of the overlap that fits no rival better.
+    """matrix: (3, 3) similarity, frame px1 from frame px0; of tilted pictures the closest to warp over the overlap.
+    warp: (3, 3) homography, the same with tilt. fit: of a similarity on the finest level, in its px; None where that
+    was not reached. scale: of that level. reason: why it is not to be believed, "" where it is. preferred: share of the
+    overlap that fits no rival better.
     """
 
     matrix: FloatArray
@@ -142,19 +146,40 @@ def _refined(levels: Pyramid, ranked: Sequence[FloatArray], prior: Prior | None)
     cell = cell_size_px(second[0], apart[0].share)
     judged = [(evidence(*second, item.matrix, cell), item) for item in apart]
     judged.sort(key=lambda item: -item[0].agreeing)
-    proofs, fits = [proof for proof, _ in judged], [item for _, item in judged]
-    warp = rescaled(fits[0].matrix, scale, 1.0)
+    proof, best = judged[0]
+    # What hardly agrees with itself is no rival.
+    rivals = [other for other, _ in judged[1:] if other.share > _CREDIBLE * proof.share]
+    preferred = min((proof.preferred_to(other) for other in rivals), default=1.0)
+    return _finished(levels, best, scale, proof, preferred)
+
+
+def _finished(levels: Pyramid, best: Fit, scale: float, proof: Evidence, preferred: float) -> Registration:
+    """The best fit of pictures at `scale` on the finest level, unless there is a doubt already."""
+    warp = rescaled(best.matrix, scale, 1.0)
+    similar = _similar(warp, best.middle_px / scale)
+    doubt = _doubt(best, proof, preferred)
+    if doubt:
+        return Registration(similar, warp, None, proof, scale, doubt, preferred)
     finest, finer = levels.at(FINEST_PX, even=False), levels.scale(FINEST_PX)
-    similar = _similar(warp, fits[0].middle_px / scale)
     tilted = fit(*finest, rescaled(warp, 1.0, finer), samples=15_000, still_px=0.01, tilted=True)
     found = fit(*finest, rescaled(similar, 1.0, finer), samples=40_000)
-    if found is None or tilted is None:
-        return Registration(similar, warp, None, proofs[0], scale, _LOST)
-    matrix, warp = (rescaled(item.matrix, finer, 1.0) for item in (found, tilted))
-    # What hardly agrees with itself is no rival.
-    rivals = [other for other in proofs[1:] if other.share > _CREDIBLE * proofs[0].share]
-    preferred = min((proofs[0].preferred_to(other) for other in rivals), default=1.0)
-    return Registration(matrix, warp, found, proofs[0], finer, _doubt(tilted, proofs[0], preferred), preferred)
+    if tilted is None:
+        return Registration(similar, warp, found, proof, finer, _LOST, preferred)
+    matrix, warp = _straight(*finest, found, tilted), rescaled(tilted.matrix, finer, 1.0)
+    return Registration(
+        rescaled(matrix, finer, 1.0), warp, found, proof, finer, _doubt(tilted, proof, preferred), preferred
+    )
+
+
+def _straight(level0: Level, level1: Level, found: Fit | None, tilted: Fit) -> FloatArray:
+    """The similarity of a pair: as fitted, or the closest to the homography where tilt makes more of it than that."""
+    places = shared_places(level0, level1, tilted.matrix)
+    there = apply_homography(tilted.matrix, places)
+    if found is not None:
+        off = np.linalg.norm(apply_homography(found.matrix, places) - there, axis=1)
+        if float(np.sqrt(np.mean(off**2))) < _BENT_PX:
+            return found.matrix
+    return closest_similarity(places, there)
 
 
 def _ranked(
