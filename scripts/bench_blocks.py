@@ -1,6 +1,7 @@
 """Real blocks: this project's presets beside pycolmap's own SIFT, same images, budget and thresholds.
 
-DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}. A method is a preset, with settings in
+DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}; a block that it lacks is rendered, nadir,
+where it is the name of a preset of synth. A method is a preset, with settings in
 brackets as in `--set` and a label before it where the name gets long ('plain=fusion[enhance=none]'), or COLMAP's CPU
 SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
 
@@ -34,6 +35,8 @@ from realblocks.counts import count_matches
 from realblocks.tables import Row, blocks_table, cross_table, easy_table
 
 from aeromatch_cli.errors import AeromatchError, ConfigError
+from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.workspace import write_text
 
 
@@ -57,19 +60,17 @@ SECTIONS = {
     "easy": Section("sheffield,brighton", "1", 4000, "baseline", easy_table, False),
 }
 QUICK_IMAGES, QUICK_KEYPOINTS = 8, 1000
+RENDERED_IMAGES, RENDERED_SEED = 20, 3_000_001
 
 
 def rows_of(args: argparse.Namespace, names: Sequence[Named]) -> Iterator[Row]:
     """Rows in the order of the table."""
     for block in args.blocks.split(","):
-        source = args.data / block
-        if not (source / "reference" / "block.json").is_file():
-            raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
+        source, reference = block_folders(args, block)
         for every in (int(k) for k in args.thin.split(",")):
             limit = QUICK_IMAGES if args.quick else 0
             folder = args.out / "images" / f"{block}-{every}-{limit or 'all'}"
             images = chosen_images(source / "images", every, limit, folder)
-            reference = source / "reference"
             pairs = cross_pairs(images, reference) if args.section == "cross" else None
             mapping = SECTIONS[args.section].mapping and not args.no_mapping
             case = Case(images, reference, pairs, args.keypoints, args.jobs, args.section == "easy", mapping)
@@ -80,6 +81,22 @@ def rows_of(args: argparse.Namespace, names: Sequence[Named]) -> Iterator[Row]:
                 head |= {"images": len(case.pictures), "asked_keypoints": args.keypoints, "cores": args.jobs}
                 asked = {} if pairs is None else {"asked_pairs": len(pairs)}
                 yield head | asked | found | count_matches(database, reference, only)
+
+
+def block_folders(args: argparse.Namespace, block: str) -> tuple[Path, Path]:
+    """Folders of a block, with a folder images, and of its reference poses. One that DATA lacks is rendered where it
+    is the name of a preset of synth.
+    """
+    source = args.data / block
+    if (source / "reference" / "block.json").is_file():
+        return source, source / "reference"
+    if block not in PRESETS or source.exists():
+        raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
+    folder = args.out / "rendered" / f"{block}-{RENDERED_SEED}"
+    if not (folder / "truth.json").is_file():
+        images = RENDERED_IMAGES
+        render_block(folder, block, seed=RENDERED_SEED, images=images, width_px=1600, height_px=1200, jobs=args.jobs)
+    return folder, folder
 
 
 def command(args: argparse.Namespace) -> str:

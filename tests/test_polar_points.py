@@ -24,20 +24,37 @@ def lattice(image: Shot, points: int = 800) -> Features:
     return Lattice(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, image.valid)])
 
 
-def test_points_are_measured_to_a_few_hundredths_of_a_pixel():
+def test_points_are_measured_to_a_few_hundredths_of_a_pixel_both_ways():
     first, second, truth = pair(40.0, 0.95, (80.0, 50.0), seed=12, gain=0.9, offset=10.0)
-    features = lattice(first)
-    matches = Polar()(features, features, GEOMETRY, (first, second))
-    there = apply_homography(truth, features.keypoints_px)
-    visible = ((there >= 12.0) & (there <= np.array([707.0, 527.0]))).all(axis=1)
-    assert len(matches.indices) > 0.9 * visible.sum()
-    assert (matches.indices[:, 1] == -1).all()
-    rows = matches.indices[:, 0]
-    assert np.array_equal(matches.points0_px, features.keypoints_px[rows])
-    off = np.linalg.norm(matches.points1_px - there[rows], axis=1)
-    assert np.median(off) < 0.06
-    assert np.percentile(off, 95) < 0.2
+    sides = lattice(first), lattice(second)
+    matches = Polar()(*sides, GEOMETRY, (first, second))
+    assert ((matches.indices < 0).sum(axis=1) == 1).all()
     assert matches.remark == ""
+    ways = (truth, np.linalg.inv(truth))
+    for side, (features, way) in enumerate(zip(sides, ways, strict=True)):
+        rows = np.flatnonzero(matches.indices[:, side] >= 0)
+        own, there = (matches.points0_px, matches.points1_px)[:: 1 - 2 * side]
+        assert np.array_equal(own[rows], features.keypoints_px[matches.indices[rows, side]])
+        ends = apply_homography(way, features.keypoints_px)
+        visible = ((ends >= 12.0) & (ends <= np.array([707.0, 527.0]))).all(axis=1)
+        assert len(rows) > 0.9 * visible.sum()
+        off = np.linalg.norm(there[rows] - apply_homography(way, own[rows]), axis=1)
+        assert np.median(off) < 0.06
+        assert np.percentile(off, 95) < 0.2
+
+
+def test_the_order_of_the_images_makes_no_difference_to_where_points_lie():
+    first, second, _ = pair(12.0, 1.05, (50.0, 20.0), seed=18)
+    sides = lattice(first, 300), lattice(second, 300)
+    one = Polar()(*sides, GEOMETRY, (first, second))
+    other = Polar()(*sides[::-1], GEOMETRY, (second, first))
+    found, turned = ({tuple(row): place for row, place in zip(rows, places, strict=True)} for rows, places in (
+        (one.indices.tolist(), np.hstack([one.points0_px, one.points1_px])),
+        (other.indices[:, ::-1].tolist(), np.hstack([other.points1_px, other.points0_px])),
+    ))  # fmt: skip
+    assert len(found.keys() ^ turned.keys()) <= 0.03 * len(found)
+    off = [np.abs(found[row] - turned[row]).max() for row in found.keys() & turned.keys()]
+    assert np.percentile(off, 95) < 0.02
 
 
 def test_relief_is_followed_point_by_point():
@@ -46,15 +63,15 @@ def test_relief_is_followed_point_by_point():
     y, x = np.mgrid[0:540, 0:720].astype(np.float32)
     hills = 6.0 * np.sin(x / 130.0) * np.cos(y / 110.0)
     moved = cv2.remap(second.pixels, x + hills, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    features = lattice(first)
-    matches = Polar()(features, features, GEOMETRY, (first, Shot(moved.astype(np.float32))))
-    flat = apply_homography(truth, features.keypoints_px[matches.indices[:, 0]])
+    other = Shot(moved.astype(np.float32))
+    matches = Polar()(lattice(first), lattice(other), GEOMETRY, (first, other))
+    flat = apply_homography(truth, matches.points0_px)
     # What stands at (x, y) stood at (x + hills, y).
     found = matches.points1_px + np.column_stack(
         [6.0 * np.sin(matches.points1_px[:, 0] / 130.0) * np.cos(matches.points1_px[:, 1] / 110.0), np.zeros(len(flat))]
     )
     off = np.linalg.norm(found - flat, axis=1)
-    assert len(off) > 350
+    assert len(off) > 700
     assert np.median(off) < 0.1
     assert np.percentile(off, 95) < 0.4
 
@@ -63,12 +80,12 @@ def test_nothing_is_measured_where_one_side_is_masked():
     first, second, truth = pair(0.0, 1.0, (40.0, 0.0), seed=14)
     valid = np.ones(second.pixels.shape, bool)
     valid[:, :300] = False
-    features = lattice(first)
-    matches = Polar()(features, features, GEOMETRY, (first, replace(second, valid=valid)))
-    assert len(matches.indices) > 200
+    masked = replace(second, valid=valid)
+    matches = Polar()(lattice(first), lattice(masked), GEOMETRY, (first, masked))
+    assert len(matches.indices) > 400
     assert matches.points1_px[:, 0].min() > 300.0
-    there = apply_homography(truth, features.keypoints_px[matches.indices[:, 0]])
-    assert np.linalg.norm(matches.points1_px - there, axis=1).max() < 0.5
+    off = np.linalg.norm(matches.points1_px - apply_homography(truth, matches.points0_px), axis=1)
+    assert off.max() < 0.5
 
 
 def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():

@@ -36,7 +36,7 @@ def tracks(*pairs):
     return tracks_of(pairs, LATTICE.__getitem__, lambda _: CAMERA)
 
 
-def places(found, pair):
+def places_of(found, pair):
     """What the verified matches of a pair join."""
     numbers = found.verified[pair]
     return [found.keypoints_px[name][numbers[:, side]].tolist() for side, name in enumerate(pair)]
@@ -61,7 +61,27 @@ def test_two_measurements_of_one_point_are_a_match_of_their_images():
         measured("b", "c", [1], [[750.0, 600.0]]),
     )
     # Of the second the model of the pair b, c says otherwise: 20 px off its line.
-    assert places(found, ("b", "c")) == [[[600.0, 600.0], [250.0, 100.0]], [[750.0, 600.0], [400.0, 100.5]]]
+    assert places_of(found, ("b", "c")) == [[[600.0, 600.0], [250.0, 100.0]], [[750.0, 600.0], [400.0, 100.5]]]
+
+
+def test_points_of_either_image_are_measured_in_the_other():
+    item = measured("a", "b", [0, 2], [[250.0, 100.0], [650.0, 700.0]])
+    raw = item.raw
+    indices = np.concatenate([raw.indices, [[-1, 1]]]).astype(np.int32)
+    places = [np.concatenate([raw.points0_px, [[450.0, 600.0]]]), np.concatenate([raw.points1_px, LATTICE["b"][1:]])]
+    both = Matches(indices, np.ones(3, np.float32), np.zeros((3, 2), np.int16), *places)
+    verified = VerifiedEntry("b", "", 3, both, Verdict(np.ones(3, bool), "verified", model_kind="F", model=ALONG_X))
+    found = tracks(MatchedPair(item.pair, both, verified))
+    joined = [[[100.0, 100.0], [500.0, 700.0], [450.0, 600.0]], [[250.0, 100.0], [650.0, 700.0], [600.0, 600.0]]]
+    assert places_of(found, ("a", "b")) == joined
+    # b's point is seen in a and in c: one track, which makes a match of a and c too.
+    more = tracks(
+        MatchedPair(item.pair, both, verified),
+        measured("b", "c", [1], [[30.0, 600.0]]),
+        measured("a", "c", [0], [[70.0, 100.0]]),
+    )
+    assert [[600.0, 600.0], [30.0, 600.0]] in [list(both) for both in zip(*places_of(more, ("b", "c")), strict=True)]
+    assert [[450.0, 600.0], [30.0, 600.0]] in [list(both) for both in zip(*places_of(more, ("a", "c")), strict=True)]
 
 
 def test_a_measurement_on_a_lattice_point_is_that_point():
@@ -70,7 +90,7 @@ def test_a_measurement_on_a_lattice_point_is_that_point():
         measured("b", "c", [0], [[30.0, 100.0]]),
     )
     assert found.verified["a", "b"].tolist() == [[0, 0]]
-    assert places(found, ("b", "c")) == [[LATTICE["b"].astype(np.float32)[0].tolist()], [[30.0, 100.0]]]
+    assert places_of(found, ("b", "c")) == [[LATTICE["b"].astype(np.float32)[0].tolist()], [[30.0, 100.0]]]
 
 
 def test_tracks_that_disagree_elsewhere_stay_apart():

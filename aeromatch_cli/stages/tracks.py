@@ -1,6 +1,6 @@
 """Multi-view tracks of points that were measured without a detector.
 
-A lattice point of one image and its measurements in others are one track. Exporters want keypoints: those of an image
+A lattice point of an image and its measurements in others are one track. Exporters want keypoints: those of an image
 become its lattice and then what others measured in it. Where a measurement falls on a lattice point, or on another
 image's measurement, both are one keypoint if all that is known of their tracks agrees; and what two images measured of
 the same track is a match of theirs too, where the pair's model says so.
@@ -35,7 +35,9 @@ class MatchedPair:
     @property
     def kept(self) -> BoolArray:
         """(M,) which of the raw matches the filters kept: a lattice point is measured once in a pair."""
-        return np.isin(self.raw.indices[:, 0], self.verified.matches.indices[:, 0])
+        raw, kept = self.raw.indices, self.verified.matches.indices
+        forward = np.isin(raw[:, 0], kept[kept[:, 1] < 0, 0])
+        return np.where(raw[:, 1] < 0, forward, np.isin(raw[:, 1], kept[kept[:, 0] < 0, 1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class Tracks:
 def tracks_of(
     pairs: Sequence[MatchedPair], lattice_px: Callable[[str], FloatArray], camera_of: Callable[[str], Camera]
 ) -> Tracks:
-    """Of pairs whose matches lead from a keypoint of image 0 to a place in image 1."""
+    """Of pairs whose matches lead from a keypoint of one image to a place in the other."""
     table = _Table()
     for item in pairs:
         table.add_image(item.pair.image_id0, lattice_px)
@@ -62,9 +64,7 @@ def tracks_of(
         for item, own in zip(pairs, numbered, strict=True)
     }
     raw = {
-        (item.pair.image_id0, item.pair.image_id1): np.unique(
-            np.column_stack([item.raw.indices[:, 0], table.standing(item.pair.image_id1, own)]), axis=0
-        ).astype(np.int32)
+        (item.pair.image_id0, item.pair.image_id1): np.unique(table.standing_pairs(item, own), axis=0).astype(np.int32)
         for item, own in zip(pairs, numbered, strict=True)
     }
     return Tracks({name: table.places(name).astype(np.float32) for name in table.sizes}, raw, verified)
@@ -93,15 +93,18 @@ class _Table:
         self._count += len(points)
 
     def number(self, item: MatchedPair) -> IntArray:
-        """Keypoint numbers (M,) of image 1 for the raw matches; those that are not verified belong to no track."""
-        id0, id1 = item.pair.image_id0, item.pair.image_id1
-        raw = item.raw
-        assert raw.points1_px is not None
-        numbers = self.sizes[id1] + np.arange(len(raw.indices))
-        tracks = np.where(item.kept, self._first[id0] + raw.indices[:, 0], -1)
-        self._places[id1].append(raw.points1_px)
-        self._tracks[id1].append(tracks)
-        self.sizes[id1] += len(numbers)
+        """Keypoint numbers (M, 2) for the raw matches; measurements that are not verified belong to no track."""
+        ids = item.pair.image_id0, item.pair.image_id1
+        numbers = item.raw.indices.astype(np.int64)
+        for side, measured in enumerate((item.raw.points0_px, item.raw.points1_px)):
+            assert measured is not None
+            image_id, other = ids[side], ids[1 - side]
+            new = np.flatnonzero(item.raw.indices[:, side] < 0)
+            numbers[new, side] = self.sizes[image_id] + np.arange(len(new))
+            tracks = np.where(item.kept[new], self._first[other] + item.raw.indices[new, 1 - side], -1)
+            self._places[image_id].append(measured[new])
+            self._tracks[image_id].append(tracks)
+            self.sizes[image_id] += len(new)
         return numbers
 
     def places(self, image_id: str) -> FloatArray:
@@ -144,14 +147,18 @@ class _Table:
         """The keypoint that stands for each."""
         return np.asarray(self._standing[image_id][numbers])
 
+    def standing_pairs(self, item: MatchedPair, numbers: IntArray) -> IntArray:
+        """(M, 2) of keypoint numbers (M, 2) of a pair."""
+        ids = item.pair.image_id0, item.pair.image_id1
+        return np.column_stack([self.standing(image_id, numbers[:, side]) for side, image_id in enumerate(ids)])
+
     def matches_of(self, item: MatchedPair, own: IntArray, camera_of: Callable[[str], Camera]) -> IntArray:
         """(M, 2) of a verified pair: what was measured, and what both images share of other tracks."""
         id0, id1 = item.pair.image_id0, item.pair.image_id1
         verdict = item.verified.verdict
         if verdict.state != "verified":
             return np.zeros((0, 2), np.int32)
-        direct = np.column_stack([item.raw.indices[item.kept, 0], own[item.kept]])
-        direct = np.column_stack([self.standing(id0, direct[:, 0]), self.standing(id1, direct[:, 1])])
+        direct = self.standing_pairs(item, own[item.kept])
         side0, side1 = self._joined[id0], self._joined[id1]
         shared = np.intersect1d(side0[side0 >= 0], side1[side1 >= 0])
         found = [self._first_of(side, shared) for side in (side0, side1)]

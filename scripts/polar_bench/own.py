@@ -80,19 +80,21 @@ def registered(
     started = time.perf_counter()
     found = polar.registered(*shots, geometry)
     seconds = time.perf_counter() - started
-    points0 = np.zeros((0, 2))
+    lattices = [np.zeros((0, 2)), np.zeros((0, 2))]
     shared0, shared1 = _shared(found)
     if tie_points and found.registration.accepted:
-        cells = int(np.ceil(tie_points * _PROBES**2 / max(len(shared0), 1)))
-        view = ViewPixels(source_view(geometry.camera0), first, None)
-        points0 = Lattice(points=cells)(geometry.camera0, [view]).keypoints_px.astype(np.float64)
-    points = polar.measured(found, points0)
+        # Half of them are measured either way, on lattices that are as dense on the ground.
+        cells = int(np.ceil(0.5 * tie_points * _PROBES**2 / max(len(shared0), 1)))
+        for side, (camera, picture) in enumerate(((geometry.camera0, first), (geometry.camera1, second))):
+            found_points = Lattice(points=cells)(camera, [ViewPixels(source_view(camera), picture, None)])
+            lattices[side] = found_points.keypoints_px.astype(np.float64)
+    points = polar.measured(found, *lattices)
     total = time.perf_counter() - started
     # Of frames that look from above, the similarity of stored pixels that is closest.
     straight = found.registration.matrix if found.side0.camera is None else np.eye(3)
     if found.side0.camera is not None and len(shared0) >= 2:
         straight = closest_similarity(shared0, shared1)
-    return PolarResult(straight, found, points0[points.rows], points.points1_px, seconds, total)
+    return PolarResult(straight, found, points.points0_px, points.points1_px, seconds, total)
 
 
 def _shared(found: Registered) -> tuple[FloatArray, FloatArray]:

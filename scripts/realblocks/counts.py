@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.evaluate.metrics import thin
+from aeromatch_cli.evaluate.metrics import GRID_CELLS, thin
 from aeromatch_cli.evaluate.reference import load_reference
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX
 from realblocks.steps import MIN_INLIERS
@@ -25,11 +25,13 @@ def count_matches(database: Path, reference: Path, only: Collection[NamePair] | 
     matches: rows. unique_matches: each pair of places once (COLMAP counts a place with two orientations twice).
     within_3px, within_5px: unique ones by symmetric epipolar distance from the reference poses, on undistorted pixels.
     thinned*: of the unique ones, those left one-to-one at 2 px spacing in both images, as in every other table.
+    filled_cells: share of the 16 x 16 cells of all images that hold one within 3 px.
     """
     truth = load_reference(reference)
     sums = dict.fromkeys(
         ("pairs", "matches", "unique_matches", "within_3px", "within_5px", "thinned", "thinned_3px", "thinned_5px"), 0
     )
+    filled = {name: np.zeros((GRID_CELLS, GRID_CELLS), bool) for name in truth.cameras}
     with sqlite3.connect(database) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         points_px = {image_id: _stored_px(*rest) for image_id, *rest in connection.execute(_KEYPOINTS)}
@@ -43,11 +45,18 @@ def count_matches(database: Path, reference: Path, only: Collection[NamePair] | 
             sides = points_px[id0][idx[:, 0]], points_px[id1][idx[:, 1]]
             places = np.unique(np.hstack(sides), axis=0)
             errors_px = np.nan_to_num(truth.errors(*pair, places[:, :2], places[:, 2:]), nan=np.inf)
+            for name, side in zip(pair, (places[:, :2], places[:, 2:]), strict=True):
+                camera = truth.cameras[name]
+                cells = (side[errors_px <= CORRECT_PX] + 0.5) / [camera.width_px, camera.height_px] * GRID_CELLS
+                filled[name][tuple(np.clip(cells.astype(int), 0, GRID_CELLS - 1).T)] = True
             kept = errors_px[thin(places[:, :2], places[:, 2:], np.zeros(len(places)))]
             found = (1, rows, len(places), *_within(errors_px), len(kept), *_within(kept))
             sums = {key: total + value for (key, total), value in zip(sums.items(), found, strict=True)}
     counts = [len(places_px) for places_px in points_px.values()]
-    return sums | {"keypoints_mean": float(np.mean(counts)), "keypoints_max": max(counts)}
+    shares = [filled[name].mean() for name in names.values()]
+    return sums | {
+        "keypoints_mean": float(np.mean(counts)), "keypoints_max": max(counts), "filled_cells": float(np.mean(shares)),
+    }  # fmt: skip
 
 
 _KEYPOINTS = "SELECT image_id, rows, cols, data FROM keypoints"

@@ -43,11 +43,13 @@ def preset(task: Task) -> dict[str, Any]:
     from aeromatch_cli.stages import export, extract, filter, match, pairs  # noqa: A004
 
     work, reference = Path(task["work"]), Path(task["reference"])
-    own = [f"extract.keypoints={task['keypoints']}"] if task["keypoints"] else []
-    own += ["pairs=file", f"pairs.path={task['pairs']}"] if task["pairs"] else []
     block = {"images": task["images"], "poses": str(reference / "poses.csv"), "cameras": str(reference / "block.json")}
-    run = {"jobs": task["jobs"]}
-    settings = load(task["preset"], [*own, *task["set"]], block, workspace=str(work / "workspace"), run=run)
+    top: dict[str, Any] = {"workspace": str(work / "workspace"), "run": {"jobs": task["jobs"]}}
+    # A lattice has points of its own number, no keypoints.
+    limited = task["keypoints"] and hasattr(load(task["preset"], task["set"], block, **top).extract, "keypoints")
+    own = [f"extract.keypoints={task['keypoints']}"] if limited else []
+    own += ["pairs=file", f"pairs.path={task['pairs']}"] if task["pairs"] else []
+    settings = load(task["preset"], [*own, *task["set"]], block, **top)
     with Executor("processes", task["jobs"]) as executor:
         context, _ = pairs.prepare(settings, executor)
         started = time.perf_counter()

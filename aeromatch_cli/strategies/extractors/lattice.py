@@ -38,7 +38,7 @@ class Lattice(Strategy):
     follows_north: ClassVar[bool] = False
     colours: ClassVar[bool] = False
     name: Literal["lattice"] = "lattice"
-    points: int = Field(2000, ge=1, description="Cells over the image, about, and so points at most.")
+    points: int = Field(1200, ge=1, description="Cells over the image, about, and so points at most.")
 
     def with_room_for(self, views: int) -> Lattice:
         """The same: a lattice is of the source alone."""

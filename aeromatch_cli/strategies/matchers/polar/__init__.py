@@ -16,7 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import Features, FloatArray, Matches, PairGeometry, Raster
+from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry, Raster
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
@@ -32,6 +32,23 @@ class Registered:
     side1: Side
     levels: Pyramid
     registration: Registration
+
+    def turned(self) -> Registered:
+        """The same seen from image 1."""
+        return Registered(self.side1, self.side0, self.levels.turned(), self.registration.turned())
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Tie points of a pair. indices: (M, 2) int32, the lattice point of one image, -1 for the other. points0_px,
+    points1_px: (M, 2) stored pixels. correlations: (M,). sigmas_px: (M,) in the image where it was measured.
+    """
+
+    indices: IntArray
+    points0_px: FloatArray
+    points1_px: FloatArray
+    correlations: FloatArray
+    sigmas_px: FloatArray
 
 
 class Polar(Strategy):
@@ -57,19 +74,16 @@ class Polar(Strategy):
         geometry: PairGeometry,
         rasters: tuple[Raster, Raster] | None = None,
     ) -> Matches:
-        """features0.keypoints_px are measured in image 1; features1 is not read. Scores are correlations."""
-        del features1
+        """Each image's keypoints_px are measured in the other. Scores are correlations."""
         if rasters is None:
             raise ValueError("polar compares pixels: it needs both rasters")
         found = self.registered(rasters[0], rasters[1], geometry)
-        points = self.measured(found, features0.keypoints_px)
-        indices = np.full((len(points.rows), 2), -1, np.int32)
-        indices[:, 0] = points.rows
+        points = self.measured(found, features0.keypoints_px, features1.keypoints_px)
         return Matches(
-            indices=indices,
+            indices=points.indices,
             scores=np.clip(points.correlations, 0.0, 1.0).astype(np.float32),
-            view_pairs=np.zeros((len(indices), 2), np.int16),
-            points0_px=features0.keypoints_px[points.rows].astype(np.float64),
+            view_pairs=np.zeros((len(points.indices), 2), np.int16),
+            points0_px=points.points0_px,
             points1_px=points.points1_px,
             remark=found.registration.reason,
         )
@@ -85,8 +99,20 @@ class Polar(Strategy):
         )
         return Registered(side0, side1, levels, registration)
 
-    def measured(self, found: Registered, points_px: FloatArray) -> TiePoints:
-        """Points (K, 2), stored pixels of image 0, measured in image 1; none where the registration is not accepted."""
+    def measured(self, found: Registered, lattice0_px: FloatArray, lattice1_px: FloatArray) -> Measured:
+        """Points (K, 2) of either image, stored pixels, measured in the other: so that every image's points are seen in
+        all that overlap it, whichever comes first. None where the registration is not accepted.
+        """
+        ways = [self._one_way(found, lattice0_px), self._one_way(found.turned(), lattice1_px)]
+        columns = []
+        for side, (lattice_px, points) in enumerate(zip((lattice0_px, lattice1_px), ways, strict=True)):
+            indices = np.full((len(points.rows), 2), -1, np.int32)
+            indices[:, side] = points.rows
+            places = [lattice_px[points.rows].astype(np.float64), points.places_px]
+            columns.append((indices, places[side], places[1 - side], points.correlations, points.sigmas_px))
+        return Measured(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+
+    def _one_way(self, found: Registered, points_px: FloatArray) -> TiePoints:
         points = points_px.astype(np.float64) if found.registration.accepted else np.zeros((0, 2))
         limits = Limits(self.window // 2, self.least_correlation, self.largest_sigma_px)
         return tie_points(found.side0, found.side1, found.levels, found.registration, points, limits)

@@ -33,12 +33,12 @@ _STEP_PX = 8.0  # over which shapes are taken from one frame to another
 
 @dataclass(frozen=True, eq=False)
 class TiePoints:
-    """rows: (M,) int32 of the lattice. points1_px: (M, 2) stored pixels of image 1. correlations: (M,). sigmas_px:
+    """rows: (M,) int32 of the lattice. places_px: (M, 2) stored pixels of image 1. correlations: (M,). sigmas_px:
     (M,) in stored pixels of image 1.
     """
 
     rows: IntArray
-    points1_px: FloatArray
+    places_px: FloatArray
     correlations: FloatArray
     sigmas_px: FloatArray
 

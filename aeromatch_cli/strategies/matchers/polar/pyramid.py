@@ -27,6 +27,13 @@ class Pyramid:
         self._finest: list[Picture] = []
         self._made: dict[tuple[float, bool], tuple[Level, Level]] = {}
 
+    def turned(self) -> Pyramid:
+        """The same with the sides exchanged, what is made already included."""
+        other = Pyramid(self._readers[1], self._readers[0], self.longest_px)
+        other._finest = self._finest[::-1]
+        other._made = {key: (second, first) for key, (first, second) in self._made.items()}
+        return other
+
     def scale(self, size_px: float) -> float:
         return min(1.0, size_px / self.longest_px)
 

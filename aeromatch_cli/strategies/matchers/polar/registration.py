@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from aeromatch_cli.strategies.matchers.polar.evidence import Evidence, cell_size
 from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit, shared_places
 from aeromatch_cli.strategies.matchers.polar.level import Level
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid, rescaled
-from aeromatch_cli.strategies.matchers.polar.start import Search, candidates, everywhere
+from aeromatch_cli.strategies.matchers.polar.start import LEAST_EXPECTED_OVERLAP, Search, candidates, everywhere
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ _CREDIBLE = 0.4
 _STRETCH, _ROUGH = 1.25, 0.01
 # On the finest level: a similarity that is off by more, in the mean, holds in a part of the overlap only.
 _BENT_PX = 0.5
+_ASTRAY_PX = 5.0  # on the finest level, from what the one before says
 _APART, _APART_RAD = 0.035, np.deg2rad(5.0)
 _LOST = "the overlap was lost on the way to finer pictures"
 
@@ -70,6 +71,11 @@ class Registration:
     @property
     def accepted(self) -> bool:
         return not self.reason
+
+    def turned(self) -> Registration:
+        """The same from frame 1; the fit and its evidence stay as they were found."""
+        matrices = [np.linalg.inv(matrix) for matrix in (self.matrix, self.warp)]
+        return replace(self, matrix=matrices[0], warp=matrices[1] / matrices[1][2, 2])
 
     @property
     def clear(self) -> bool:
@@ -97,6 +103,7 @@ class Prior:
             opposites=False,
             expected=rescaled(self.expected, 1.0, scale),
             reach_px=self.reach_px * scale + 3.0,
+            least_overlap=LEAST_EXPECTED_OVERLAP,
         )
 
     def allows(self, item: Fit, scale: float, longest_px: float) -> bool:
@@ -161,14 +168,29 @@ def _finished(levels: Pyramid, best: Fit, scale: float, proof: Evidence, preferr
     if doubt:
         return Registration(similar, warp, None, proof, scale, doubt, preferred)
     finest, finer = levels.at(FINEST_PX, even=False), levels.scale(FINEST_PX)
-    tilted = fit(*finest, rescaled(warp, 1.0, finer), samples=15_000, still_px=0.01, tilted=True)
-    found = fit(*finest, rescaled(similar, 1.0, finer), samples=40_000)
+    start = rescaled(warp, 1.0, finer)
+    tilted = _finest(levels, start)
     if tilted is None:
-        return Registration(similar, warp, found, proof, finer, _LOST, preferred)
+        return Registration(similar, warp, None, proof, finer, _LOST, preferred)
+    found = fit(*finest, rescaled(similar, 1.0, finer), samples=40_000)
     matrix, warp = _straight(*finest, found, tilted), rescaled(tilted.matrix, finer, 1.0)
-    return Registration(
-        rescaled(matrix, finer, 1.0), warp, found, proof, finer, _doubt(tilted, proof, preferred), preferred
-    )
+    doubt = _doubt(tilted, proof, preferred)
+    return Registration(rescaled(matrix, finer, 1.0), warp, found, proof, finer, doubt, preferred)
+
+
+def _finest(levels: Pyramid, start: FloatArray) -> Fit | None:
+    """A homography (3, 3) fitted on the finest level. On gray values, which say most; where light differs too much for
+    that to converge near where it began, on contrast made even. None where neither does.
+    """
+    for even in (False, True):
+        finest = levels.at(FINEST_PX, even=even)
+        found = fit(*finest, start, samples=15_000, still_px=0.01, tilted=True)
+        if found is not None and found.converged:
+            places = shared_places(*finest, start)
+            off = np.linalg.norm(apply_homography(found.matrix, places) - apply_homography(start, places), axis=1)
+            if float(np.median(off)) < _ASTRAY_PX:
+                return found
+    return None
 
 
 def _straight(level0: Level, level1: Level, found: Fit | None, tilted: Fit) -> FloatArray:

@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.strategies.matchers.polar.level import normalised
 
-_LEAST_OVERLAP = 0.22  # of the smaller picture; shares below 0.3 come out of the similarity's own inexactness
+# Of the smaller picture. Where anything is possible less is a lottery; 0.3 may look like this by the similarity's own
+# inexactness. Where a prior leaves little choice, half of it is enough.
+_LEAST_OVERLAP, LEAST_EXPECTED_OVERLAP = 0.22, 0.1
 _SPREAD = 12.0  # pictures are normalised over the longer side by this
 _SAME_PX, _SAME_RAD = 3.0, np.deg2rad(12.0)
 # Whitening: a spectrum is divided by itself, smoothed by so many of its samples; what holds less than this share of the
@@ -45,6 +47,7 @@ class Candidate:
 class Search:
     """turns_rad: (T,) and scales: (S,) to try, px1 per px0. opposites: also every turn and 180 degrees more.
     expected: (3, 3) px1 from px0, of small pictures, and reach_px: how far off it may be at the middle, or None.
+    least_overlap: of the smaller picture.
     """
 
     turns_rad: FloatArray
@@ -52,6 +55,7 @@ class Search:
     opposites: bool
     expected: FloatArray | None = None
     reach_px: float = np.inf
+    least_overlap: float = _LEAST_OVERLAP
 
 
 def everywhere(turn_step_deg: float, scale_count: int, smallest: float, largest: float) -> Search:
@@ -76,7 +80,7 @@ def candidates(
     for scale in search.scales:
         turned = _Turned.of(flat[1], ones[1], search.turns_rad, float(scale), canvas, still.size)
         for spectra in (turned, turned.opposite())[: 2 if search.opposites else 1]:
-            scores = still.scores(spectra)
+            scores = still.scores(spectra, search.least_overlap)
             spreads.append(float(scores.std()))
             found += list(_best(scores, spectra, canvas, search, flat[0].shape))
     spread = float(np.median(spreads)) or 1.0
@@ -124,14 +128,14 @@ class _Still:
         half = np.conj(fft.rfft2(_halved(mask)))
         return cls(np.conj(fft.rfft2(flat, (size, size))), half, size, float(known.sum()))
 
-    def scores(self, turned: _Turned) -> NDArray[np.float32]:
+    def scores(self, turned: _Turned, least_overlap: float) -> NDArray[np.float32]:
         """(T, size, size) correlation over the root of the overlap's area; 0 where the overlap is small."""
         from scipy import fft
 
         half = self.size // 2
         products = fft.irfft2(turned.pictures * self.picture, (self.size, self.size))
         areas = 4.0 * fft.irfft2(turned.masks * self.mask, (half, half))
-        least = _LEAST_OVERLAP * min(self.area, turned.area)
+        least = least_overlap * min(self.area, turned.area)
         weights = np.where(areas >= least, 1.0 / np.sqrt(np.maximum(areas, 1.0)), 0.0).astype(np.float32)
         blocks = products.reshape(-1, half, 2, half, 2) * weights[:, :, None, :, None]
         return np.asarray(blocks.reshape(products.shape))
