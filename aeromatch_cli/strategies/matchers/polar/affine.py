@@ -56,6 +56,11 @@ def offsets(half: int) -> FloatArray:
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
 
+def carried(shapes: FloatArray, steps: FloatArray) -> FloatArray:
+    """(N, P, 2): steps (P, 2) of side 0 as they go on in side 1, by shapes (N, 2, 2)."""
+    return np.matmul(steps, shapes.transpose(0, 2, 1))
+
+
 def adjusted(level0: Level, level1: Level, start: Windows, half: int) -> Windows:
     """Windows of 2 half + 1 pixels after least squares; those that are not matched any more stay where they were."""
     parts = [
@@ -81,7 +86,7 @@ def _adjusted(level0: Level, level1: Level, start: Windows, half: int) -> Window
         rows = np.flatnonzero(live & ~done)
         if not len(rows):
             break
-        where = places[rows, None] + np.einsum("nij,pj->npi", shapes[rows], steps)
+        where = places[rows, None] + carried(shapes[rows], steps)
         planes, known = level1.sample(where.reshape(-1, 2))
         planes = planes.reshape(len(rows), -1, 3)
         change, correlations[rows], sigmas[rows] = _solved(template[rows], planes, steps)

@@ -51,8 +51,9 @@ class Level:
     def knows(self, places_px: FloatArray) -> BoolArray:
         """Which places (N, 2) are known (N,); NaN is not."""
         width, height = self.size_px
-        low, high = _BORDER_PX, np.array([width, height]) - 1.0 - _BORDER_PX
-        inside = np.asarray(((places_px >= low) & (places_px <= high)).all(axis=1))
+        x, y = places_px.T
+        low = _BORDER_PX
+        inside = (x >= low) & (x <= width - 1.0 - low) & (y >= low) & (y <= height - 1.0 - low)
         if self.known is not None:
             inside &= bilinear_at(self.known, places_px) > 0.99
         return inside

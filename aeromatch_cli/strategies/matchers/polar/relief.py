@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.strategies.matchers.polar.affine import Windows, offsets
+from aeromatch_cli.strategies.matchers.polar.affine import Windows, carried, offsets
 from aeromatch_cli.strategies.matchers.polar.level import Level
 
 _NEIGHBOURS = 10
@@ -24,12 +24,10 @@ def searched(level0: Level, level1: Level, start: Windows, half: int, reach: int
     """
     count, wide = len(start.matched), 2 * (half + reach) + 1
     template, known0 = level0.sample((start.places0_px[:, None] + offsets(half)).reshape(-1, 2))
-    there = start.places1_px[:, None] + np.einsum("nij,pj->npi", start.shapes, offsets(half + reach))
+    there = start.places1_px[:, None] + carried(start.shapes, offsets(half + reach))
     planes, known1 = level1.sample(there.reshape(-1, 2))
     size = 2 * half + 1
-    values0 = template[:, 0].reshape(count, size, size)
-    values0 = values0 - values0.mean(axis=(1, 2), keepdims=True)
-    scores = _correlations(values0, planes[:, 0].reshape(count, wide, wide), reach)
+    scores = _correlations(template[:, 0].reshape(count, size, size), planes[:, 0].reshape(count, wide, wide))
     known = known0.reshape(count, -1).all(axis=1) & known1.reshape(count, -1).all(axis=1)
     best = scores.reshape(count, -1).argmax(axis=1)
     row, column = np.divmod(best, 2 * reach + 1)
@@ -42,18 +40,14 @@ def searched(level0: Level, level1: Level, start: Windows, half: int, reach: int
                    matched=matched)  # fmt: skip
 
 
-def _correlations(values0: NDArray[np.float32], values1: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
-    """(N, 2 reach + 1, 2 reach + 1) of windows (N, S, S) of mean 0 with those of (N, S + 2 reach, S + 2 reach)."""
-    count, size = values0.shape[:2]
-    scores = np.empty((count, 2 * reach + 1, 2 * reach + 1), np.float32)
-    own = np.sqrt((values0 * values0).sum(axis=(1, 2)))
-    for row in range(2 * reach + 1):
-        for column in range(2 * reach + 1):
-            part = values1[:, row : row + size, column : column + size]
-            mean = part.mean(axis=(1, 2))
-            square = np.einsum("nij,nij->n", part, part) - size * size * mean * mean
-            cross = np.einsum("nij,nij->n", values0, part)
-            scores[:, row, column] = cross / np.maximum(own * np.sqrt(np.maximum(square, 0.0)), 1e-6)
+def _correlations(values0: NDArray[np.float32], values1: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, 2 R + 1, 2 R + 1) of windows (N, S, S) with those of (N, S + 2 R, S + 2 R) at every shift."""
+    import cv2
+
+    shifts = values1.shape[1] - values0.shape[1] + 1
+    scores = np.empty((len(values0), shifts, shifts), np.float32)
+    for wide, window, found in zip(values1, values0, scores, strict=True):
+        cv2.matchTemplate(wide, window, cv2.TM_CCOEFF_NORMED, result=found)
     return scores
 
 
