@@ -65,7 +65,7 @@ class Polar(Strategy):
     largest_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
     window: int = Field(21, ge=7, le=101, description="Side of the windows that tie points are measured with, pixels.")
     least_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
-    largest_sigma_px: float = Field(0.3, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
+    largest_sigma_px: float = Field(0.5, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
 
     def __call__(
         self,
