@@ -6,6 +6,7 @@ The only file that knows OpenCV's BGR.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ _COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 _GRID_ERROR_PX = 0.015
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
+_STRIP_PX = 4_000_000  # that are held as float32 at once while a large picture is reduced
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
 # announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
 _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
@@ -228,6 +230,27 @@ def shrink(pixels: NDArray[Any], scale: float) -> NDArray[Any]:
         size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
     return np.asarray(cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+def shrink_in_strips(
+    read: Callable[[int, int], NDArray[Any]], size_px: tuple[int, int], scale: float
+) -> NDArray[np.float32]:
+    """What `shrink` makes of float32, of a picture that is read by rows: read(top, count) gives (count, W).
+
+    size_px: width, height. Rows and columns that are left over at the far edges may be left out.
+    """
+    import cv2
+
+    width, height = size_px
+    whole = max(1, min(int(1.0 / scale + 1e-9), width, height))
+    count = max(1, _STRIP_PX // (width * whole)) * whole
+    strips = []
+    for top in range(0, height // whole * whole, count):
+        rows = min(count, height // whole * whole - top)
+        strip = np.ascontiguousarray(read(top, rows)[:, : width // whole * whole], np.float32)
+        size = width // whole, rows // whole
+        strips.append(strip if whole == 1 else cv2.resize(strip, size, interpolation=cv2.INTER_AREA))
+    return np.asarray(shrink(np.concatenate(strips), min(1.0, scale * whole)), np.float32)
 
 
 def shrink_camera(camera: Camera, scale: float) -> Camera:

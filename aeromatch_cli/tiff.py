@@ -23,17 +23,19 @@ def tiff_size(path: Path) -> tuple[int, int]:
         return int(source.width), int(source.height)
 
 
-def read_tiff(path: Path) -> tuple[NDArray[Any], BoolArray | None]:
+def read_tiff(path: Path, part: tuple[int, int, int, int] | None = None) -> tuple[NDArray[Any], BoolArray | None]:
     """(H, W) or (H, W, 3) of whole or floating numbers as stored, and where the file has values (None = everywhere).
 
-    The first three bands of four or more, the first of two; a band of transparency is none of them. Raises ItemError.
+    part: left, top, width, height of what is read, None for everything. The first three bands of four or more, the
+    first of two; a band of transparency is none of them. Raises ItemError.
     """
     with _opened(path) as source:
+        window = None if part is None else ((part[1], part[1] + part[3]), (part[0], part[0] + part[2]))
         extra = _transparency(source)
         shown = [index for index in source.indexes if index != extra]
         shown = shown[:3] if len(shown) >= 3 else shown[:1]
         # One call: in most files the bands of a pixel lie together, and a second call would decode them again.
-        bands = source.read([*shown, extra] if extra else shown)
+        bands = source.read([*shown, extra] if extra else shown, window=window)
         planes, alpha = bands[: len(shown)], bands[len(shown) :]
         if bands.dtype.kind not in "iuf":
             raise ItemError(f"image {path} holds {bands.dtype} numbers: write their magnitudes, as uint16 or float32")
@@ -43,7 +45,7 @@ def read_tiff(path: Path) -> tuple[NDArray[Any], BoolArray | None]:
             masks.append(alpha[0] > 0 if named or _is_mask(alpha[0]) else None)
         flags = {flag.name for flag in source.mask_flag_enums[0]}
         if "per_dataset" in flags and "alpha" not in flags:
-            masks.append(source.read_masks(1) > 0)
+            masks.append(source.read_masks(1, window=window) > 0)
     known = [mask for mask in masks if mask is not None]
     valid = np.logical_and.reduce(known) if known else None
     return np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.asarray(planes[0]), valid

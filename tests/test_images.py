@@ -217,13 +217,13 @@ def test_masks_of_another_size_are_fitted(tmp_path: Path) -> None:
 
 
 def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:
-    from aeromatch_cli.stages.enhance import _without_frames
+    from aeromatch_cli.stages.enhance import without_frames
 
     pixels = np.full((60, 80), 100, np.uint8)
     pixels[20:30, 20:30] = 0
-    assert _without_frames(pixels) is None
+    assert without_frames(pixels) is None
     pixels[:, :10] = 0
-    valid = _without_frames(pixels)
+    valid = without_frames(pixels)
     assert valid is not None
     expected = np.ones((60, 80), bool)
     expected[:, :10] = False

@@ -109,7 +109,7 @@ def load_source(task: EnhanceTask, *, colour: bool) -> tuple[NDArray[Any], BoolA
             f"{task.camera.width_px}x{task.camera.height_px}; give the right --cameras"
         )
     valid = read_mask(task.mask, width, height) if task.mask else None
-    valid = _combine(_combine(valid, recorded), _without_frames(pixels))
+    valid = _combine(_combine(valid, recorded), without_frames(pixels))
     pixels = shrink(pixels, task.scale)
     if valid is not None:
         valid = shrink(valid.astype(np.uint8) * 255, task.scale) > 254
@@ -124,7 +124,7 @@ def _combine(first: BoolArray | None, second: BoolArray | None) -> BoolArray | N
     return first & second
 
 
-def _without_frames(pixels: NDArray[Any]) -> BoolArray | None:
+def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
     """False in frames of exact zeros that touch the border, as orthorectified or rotated pictures have them.
 
     Black objects inside the picture stay valid; None when less than half of any border line is zero.

@@ -1,24 +1,39 @@
-"""Stored pictures for matchers that compare pixels: read once per worker, gray, with every mask that applies."""
+"""Stored pictures for matchers that compare pixels: gray in full depth, with every mask that applies.
+
+TIFFs are read by parts where nothing asks for all of them at once. Other formats can only be decoded whole, which is
+done once per worker, as it is with what has a mask, a frame or sky.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli import tiff
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.images import shrink
-from aeromatch_cli.stages.enhance import EnhanceTask, load_source
+from aeromatch_cli.images import shrink_in_strips
+from aeromatch_cli.stages.enhance import EnhanceTask, load_source, without_frames
 
-# Pictures that a worker keeps, by the fingerprint of all that they depend on: a row compares one image with a handful
-# of others.
-_KEPT = 4
-_pictures: OrderedDict[str, tuple[NDArray[np.uint8], BoolArray | None]] = OrderedDict()
+Picture = tuple[NDArray[Any], BoolArray | None]
+T = TypeVar("T")
+
+# What a worker keeps, by the fingerprint of all that it depends on: a row compares one image with a handful of others.
+_KEPT, _KEPT_REDUCED, _KEPT_UNITS = 4, 8, 4096
+_wholes: OrderedDict[str, Picture] = OrderedDict()
+_units: OrderedDict[str, float | None] = OrderedDict()
+_reduced: OrderedDict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = OrderedDict()
+# Of a TIFF, whether it has a frame is seen at this scale, and its largest value, which becomes _TOP: reflectances below
+# 1 are as good as gray values up to 65535.
+_GLANCE, _TOP = 0.0625, 255.0
+_KNOWN = 0.999  # of the area of a reduced pixel
 
 
 class StoredRaster:
-    """`data.Raster` of an image as it was taken, decoded when it is first read."""
+    """`data.Raster` of an image as it was taken, read when it is needed."""
 
     def __init__(self, task: EnhanceTask) -> None:
         self._task = task
@@ -26,24 +41,92 @@ class StoredRaster:
         self.finest = task.scale
 
     def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
-        pixels, valid = self._picture()
-        relative = min(1.0, scale / self.finest)
-        small = shrink(pixels.astype(np.float32), relative)
-        if valid is None or relative == 1.0:
-            return small, valid
-        return small, np.asarray(shrink(valid.astype(np.uint8) * 255, relative) > 254)
+        return _kept(_reduced, (self._task.fingerprint, scale), _KEPT_REDUCED, lambda: self._made(scale))
 
     def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
-        pixels, valid = self._picture()
+        unit = self._unit()
+        if unit is not None:
+            return self._part((left, top, width, height), unit)
+        pixels, valid = self._whole()
         part = (slice(top, top + height), slice(left, left + width))
         return pixels[part].astype(np.float32), None if valid is None else valid[part]
 
-    def _picture(self) -> tuple[NDArray[np.uint8], BoolArray | None]:
+    def _made(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
+        unit = self._unit()
+        if unit is not None:
+            return self._of_parts(scale, unit)
+        pixels, valid = self._whole()
+        relative = min(1.0, scale / self.finest)
+        size = pixels.shape[1], pixels.shape[0]
+        small = shrink_in_strips(lambda top, count: pixels[top : top + count], size, relative)
+        if valid is None:
+            return small, None
+        share = shrink_in_strips(lambda top, count: valid[top : top + count], size, relative)
+        return small, np.asarray(share > _KNOWN)
+
+    def _unit(self) -> float | None:
+        """What values of a TIFF that is read by parts are multiplied with; None where it is decoded whole."""
+        return _kept(_units, self._task.fingerprint, _KEPT_UNITS, self._glanced)
+
+    def _glanced(self) -> float | None:
+        task = self._task
+        if task.path.suffix.lower() not in tiff.SUFFIXES or task.mask is not None or task.sky_rotation is not None:
+            return None
+        if tiff.tiff_size(task.path) != (self.width_px, self.height_px):
+            return None  # says so where all is decoded
+        small, valid = self._of_parts(_GLANCE, 1.0)
+        if without_frames(small) is not None or (valid is not None and not valid.any()):
+            return None
+        return _TOP / max(float(np.abs(small).max()), 1e-30)
+
+    def _of_parts(self, scale: float, unit: float) -> tuple[FloatArray, BoolArray | None]:
+        shares: list[NDArray[np.float32]] = []
+
+        def read(top: int, count: int) -> NDArray[Any]:
+            pixels, valid = self._part((0, top, self.width_px, count), unit)
+            shares.append(np.ones(pixels.shape, np.float32) if valid is None else valid.astype(np.float32))
+            return pixels
+
+        size = self.width_px, self.height_px
+        small = shrink_in_strips(read, size, scale)
+        if all(share.all() for share in shares):
+            return small, None
+        return small, np.asarray(shrink_in_strips(lambda *_: shares.pop(0), size, scale) > _KNOWN)
+
+    def _part(self, part: tuple[int, int, int, int], unit: float) -> tuple[NDArray[np.float32], BoolArray | None]:
+        pixels, valid = tiff.read_tiff(self._task.path, part)
+        gray = _gray(pixels).astype(np.float32) * np.float32(unit)
+        if valid is None or valid.all():
+            return gray, None
+        gray[~valid] = 0.0
+        return gray, valid
+
+    def _whole(self) -> Picture:
         """(H, W) gray at the working scale and where it is valid."""
-        key = self._task.fingerprint
-        if key not in _pictures:
-            _pictures[key] = load_source(self._task, colour=False)
-            if len(_pictures) > _KEPT:
-                _pictures.popitem(last=False)
-        _pictures.move_to_end(key)
-        return _pictures[key]
+        return _kept(_wholes, self._task.fingerprint, _KEPT, self._decoded)
+
+    def _decoded(self) -> Picture:
+        # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
+        straight = self._task.path.suffix.lower() in (".jpg", ".jpeg")
+        pixels, valid = load_source(self._task, colour=not straight)
+        return _gray(pixels), valid
+
+
+def _gray(pixels: NDArray[Any]) -> NDArray[Any]:
+    """(H, W) of the same depth, or of float32 where that has no gray of its own."""
+    import cv2
+
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.dtype not in (np.uint8, np.uint16, np.float32):
+        pixels = pixels.astype(np.float32)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+
+
+def _kept(cache: OrderedDict[Any, T], key: Any, most: int, make: Callable[[], T]) -> T:
+    if key not in cache:
+        cache[key] = make()
+        if len(cache) > most:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]
