@@ -1,0 +1,71 @@
+"""Preset polar on a small rendered block of grass, from the shell's point of view, with poses as they are in flight."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import invoke
+
+from aeromatch_cli import formats
+from aeromatch_cli.synthetic import render_block
+
+MAX_IMAGE_ID = 2147483647
+
+
+@pytest.fixture(scope="module")
+def grass(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("grass")
+    render_block(folder, "grass", seed=11, width_px=480, height_px=360, images=5)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def work(grass: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("run")
+    block = ["--images", grass / "images", "--poses", grass / "poses_noisy.csv", "--cameras", grass / "block.json"]
+    outcome = invoke("run", "polar", *block, "--workspace", root / "work", "--jobs", 1, "--json")
+    assert outcome.code == 0, outcome.stderr
+    return root / "work"
+
+
+def test_every_pair_that_shares_enough_is_verified(work: Path, grass: Path) -> None:
+    outcome = invoke("evaluate", work, "--truth", grass, "--no-mapping", "--json")
+    assert outcome.code == 0, outcome.stderr
+    figures = json.loads(outcome.stdout.strip().splitlines()[-1])["totals"]
+    assert figures["correctness"] > 0.995
+    assert figures["median_error_px"] < 0.15
+    assert figures["coverage"] > 0.8
+    pairs = {(pair.image_id0, pair.image_id1): pair.overlap for pair in formats.read_pairs(work / "pairs.csv")}
+    states = {}
+    for path in (work / "verified").iterdir():
+        for image_id1, entry in formats.read_verified_row(path).items():
+            states[path.stem, image_id1] = entry.verdict
+    assert len(states) == len(pairs) >= 4
+    assert all(states[pair].state == "verified" for pair, overlap in pairs.items() if overlap >= 0.3)
+    assert all(verdict.reason for verdict in states.values() if verdict.state != "verified")
+
+
+def test_the_export_joins_what_several_images_see(work: Path) -> None:
+    """A keypoint of one image stands in the pairs with two others: points of three views and more."""
+    with sqlite3.connect(work / "export" / "colmap" / "database.db") as connection:
+        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0").fetchall()
+    seen: dict[tuple[int, int], set[int]] = {}
+    for pair_id, count, data in rows:
+        ids = divmod(pair_id, MAX_IMAGE_ID)
+        for match in np.frombuffer(data, np.uint32).reshape(count, 2).tolist():
+            for side in (0, 1):
+                seen.setdefault((ids[side], match[side]), set()).add(ids[1 - side])
+    shares = np.array([len(others) for others in seen.values()])
+    assert len(rows) >= 4
+    assert (shares >= 2).mean() > 0.3
+
+
+def test_a_second_run_makes_nothing(work: Path, grass: Path) -> None:
+    block = ["--images", grass / "images", "--poses", grass / "poses_noisy.csv", "--cameras", grass / "block.json"]
+    outcome = invoke("run", "polar", *block, "--workspace", work, "--jobs", 1, "--json")
+    assert outcome.code == 0
+    assert not {"extract", "match", "filter"} & outcome.done().keys()
