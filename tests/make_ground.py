@@ -47,15 +47,22 @@ def shot(
 
 
 def pair(
-    turn_deg: float, scale: float, shift: tuple[float, float], *, seed: int = 0, gain: float = 1.0, offset: float = 0.0
+    turn_deg: float,
+    scale: float,
+    shift: tuple[float, float],
+    *,
+    seed: int = 0,
+    gain: float = 1.0,
+    offset: float = 0.0,
+    noise: float = 2.0,
 ) -> tuple[Shot, Shot, FloatArray]:
     """Two shots of one ground and the (3, 3) similarity between their pixels. shift: of the middle, ground px."""
     source, middle = ground(seed), np.array([359.5, 269.5])
     center = np.array([700.0, 550.0])
     source_from0 = similarity(20.0, 0.9, tuple(middle), tuple(center - np.array(shift) / 2.0))
     source_from1 = similarity(20.0 - turn_deg, 0.9 / scale, tuple(middle), tuple(center + np.array(shift) / 2.0))
-    second = shot(source, source_from1, gain=gain, offset=offset, seed=seed + 1)
-    return shot(source, source_from0, seed=seed + 2), second, np.linalg.inv(source_from1) @ source_from0
+    second = shot(source, source_from1, gain=gain, offset=offset, noise=noise, seed=seed + 1)
+    return shot(source, source_from0, noise=noise, seed=seed + 2), second, np.linalg.inv(source_from1) @ source_from0
 
 
 def errors(found: FloatArray, truth: FloatArray, place: FloatArray) -> tuple[float, float, float]:

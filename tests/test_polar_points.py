@@ -57,6 +57,17 @@ def test_the_order_of_the_images_makes_no_difference_to_where_points_lie():
     assert np.percentile(off, 95) < 0.02
 
 
+@pytest.mark.parametrize(("noise", "blur_px"), [(2.0, 0.0), (8.0, 0.0), (4.0, 1.5)])
+def test_sigmas_are_as_large_as_errors(noise, blur_px):
+    first, second, truth = pair(15.0, 1.02, (60.0, 30.0), seed=19, noise=noise)
+    if blur_px:
+        first, second = (Shot(cv2.GaussianBlur(side.pixels, (0, 0), blur_px)) for side in (first, second))
+    found = Polar().registered(first, second, GEOMETRY)
+    points = Polar().measured(found, lattice(first).keypoints_px, np.zeros((0, 2)))
+    off = np.linalg.norm(points.points1_px - apply_homography(truth, points.points0_px), axis=1)
+    assert 0.5 < np.sqrt(np.mean((off / points.sigmas_px) ** 2)) < 1.6
+
+
 def test_relief_is_followed_point_by_point():
     first, second, truth = pair(10.0, 1.0, (60.0, 0.0), seed=13)
     # Hills move the ground along x by up to 6 px.

@@ -38,6 +38,7 @@ _COARSE_PX, _FIRST_PX = 90.0, 180.0
 SECOND_PX = 400.0
 SCALES = (0.78, 1.28)  # of side 1 over side 0, without a prior: the asked 0.8 to 1.25, and what a search is off
 _LEAST_CORRELATION = 0.1
+_LARGEST_CONDITION = 1e3  # right ones have 4 to 17
 _LEAST_CELLS = 12
 _LEAST_AGREEING = 0.4
 _LEAST_PREFERRED = 0.8
@@ -282,6 +283,8 @@ def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
     """Why not to believe it, "" for nothing."""
     if not found.converged:
         return f"least squares did not converge: still moving {found.moved_px:.2g} px"
+    if found.condition > _LARGEST_CONDITION:
+        return f"the overlap tells shift, turn and scale badly apart (condition number {found.condition:.1g})"
     if proof.cells < _LEAST_CELLS:
         return f"only {proof.cells} parts of the overlap can be compared"
     if proof.correlation < _LEAST_CORRELATION:
