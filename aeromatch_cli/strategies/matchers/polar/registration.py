@@ -18,21 +18,23 @@ from aeromatch_cli.strategies.matchers.polar.start import LEAST_EXPECTED_OVERLAP
 
 @dataclass(frozen=True)
 class _Effort:
-    """size_px: longer side of the pictures searched. turn_step_deg, scales: tried. followed: candidates. ways: to
-    follow each. rivals: most that are looked at closely. samples: of the fits, a third of them on the coarse level.
+    """size_px: longer side of the pictures searched. turn_step_deg, scales: tried. followed: candidates, at most.
+    hopeless: share of the best's score below which none is followed. ways: to follow each. rivals: most that are looked
+    at closely. samples: of the fits, a third of them on the coarse level.
     """
 
     size_px: float
     turn_step_deg: float
     scales: int
     followed: int
+    hopeless: float
     ways: int
     rivals: int
     samples: int
 
 
 # Most pairs are clear at once. The rest is searched as if time did not matter.
-_EFFORTS = (_Effort(64.0, 6.0, 7, 3, 1, 2, 6000), _Effort(96.0, 4.0, 9, 8, 2, 6, 9000))
+_EFFORTS = (_Effort(48.0, 8.0, 5, 3, 0.75, 1, 2, 6000), _Effort(96.0, 4.0, 9, 8, 0.0, 2, 6, 9000))
 # Longer side of the pictures at each step of refinement, px.
 _COARSE_PX, _FIRST_PX = 90.0, 180.0
 SECOND_PX = 400.0
@@ -125,7 +127,7 @@ def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, f
             search = prior.search(levels.scale(effort.size_px), effort.turn_step_deg, ratio)
         else:
             search = everywhere(effort.turn_step_deg, effort.scales, *scales)
-        warps = _ranked(levels, effort, _searched(levels, effort.size_px, search)[: effort.followed], warps, prior)
+        warps = _ranked(levels, effort, _searched(levels, effort, search), warps, prior)
         best = _refined(levels, warps, prior)
         if best.clear:
             break
@@ -133,12 +135,12 @@ def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, f
     return best
 
 
-def _searched(levels: Pyramid, size_px: float, search: Search) -> Sequence[FloatArray]:
-    """Similarities (3, 3) between frames, best first."""
-    scale = levels.scale(size_px)
+def _searched(levels: Pyramid, effort: _Effort, search: Search) -> list[FloatArray]:
+    """Similarities (3, 3) between frames that are worth following, best first."""
+    scale = levels.scale(effort.size_px)
     (first, valid0), (second, valid1) = levels.pictures(scale)
-    found = candidates((first, second), (valid0, valid1), search)
-    return [rescaled(item.matrix, scale, 1.0) for item in found]
+    found = candidates((first, second), (valid0, valid1), search)[: effort.followed]
+    return [rescaled(item.matrix, scale, 1.0) for item in found if item.score >= effort.hopeless * found[0].score]
 
 
 def _refined(levels: Pyramid, ranked: Sequence[FloatArray], prior: Prior | None) -> Registration:
@@ -173,7 +175,7 @@ def _finished(levels: Pyramid, best: Fit, scale: float, proof: Evidence, preferr
     tilted = _finest(levels, start)
     if tilted is None:
         return Registration(similar, warp, None, proof, finer, _LOST, preferred)
-    found = fit(*finest, rescaled(similar, 1.0, finer), samples=40_000)
+    found = fit(*finest, rescaled(similar, 1.0, finer), samples=20_000)
     matrix, warp = _straight(*finest, found, tilted), rescaled(tilted.matrix, finer, 1.0)
     doubt = _doubt(tilted, proof, preferred)
     return Registration(rescaled(matrix, finer, 1.0), warp, found, proof, finer, doubt, preferred)
