@@ -31,6 +31,7 @@ _COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 _GRID_ERROR_PX = 0.015
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
+_WHOLE_ERROR = 1e-6
 _STRIP_PX = 4_000_000  # that are held as float32 at once while a large picture is reduced
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
 # announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
@@ -242,7 +243,11 @@ def shrink_in_strips(
     import cv2
 
     width, height = size_px
-    whole = max(1, min(int(1.0 / scale + 1e-9), width, height))
+    # A whole factor first. Where another follows that is to reduce to half at least: of pixels hardly smaller than its
+    # own, an area filter makes averages of two.
+    factor = 1.0 / scale
+    whole = round(factor) if abs(factor - round(factor)) < _WHOLE_ERROR else int(factor / 2.0)
+    whole = max(1, min(whole, width, height))
     count = max(1, _STRIP_PX // (width * whole)) * whole
     strips = []
     for top in range(0, height // whole * whole, count):

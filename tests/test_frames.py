@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO, apply_homography, resize_matrix
+from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO, apply_homography, closest_similarity, resize_matrix
 
 
 def test_halving_keeps_centre_and_corners() -> None:
@@ -47,3 +47,12 @@ def test_photo_axes_turn_into_camera_axes() -> None:
     assert (CAM_FROM_PHOTO @ up_in_photo == [0, -1, 0]).all()
     assert (CAM_FROM_PHOTO @ back_in_photo == [0, 0, -1]).all()
     assert np.linalg.det(CAM_FROM_PHOTO) == pytest.approx(1.0)
+
+
+@given(st.floats(-3.1, 3.1), st.floats(0.2, 5.0), st.integers(0, 1000))
+def test_the_closest_similarity_of_moved_points_is_their_motion(turn: float, scale: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
+    motion = np.array([[cosine, -sine, 40.0], [sine, cosine, -7.0], [0.0, 0.0, 1.0]])
+    points = rng.uniform(0.0, 1000.0, (6, 2))
+    assert np.allclose(closest_similarity(points, apply_homography(motion, points)), motion, atol=1e-6)

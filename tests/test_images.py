@@ -406,3 +406,22 @@ def test_colours_are_averages_around_the_points_in_eight_bits() -> None:
     deep = sample_colours(picture.astype(np.uint16) * 100, points, np.ones(3))
     assert deep.dtype == np.uint8
     assert (deep[0, 0], deep[1, 0]) == (255, 0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.8, 0.5, 0.3, 0.125, 0.07])
+def test_strips_make_the_same_reduced_picture(scale, monkeypatch):
+    import cv2
+
+    from aeromatch_cli import images
+
+    monkeypatch.setattr(images, "_STRIP_PX", 20_000)
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (403, 605)).astype(np.float32), (0, 0), 4.0)
+    found = images.shrink_in_strips(lambda top, count: picture[top : top + count], (605, 403), scale)
+    wanted = images.shrink(picture, scale)
+    height, width = found.shape
+    assert 0 <= wanted.shape[0] - height <= 1
+    assert 0 <= wanted.shape[1] - width <= 1
+    # An area filter in two steps is a little wider than one in one.
+    off = (found - wanted[:height, :width])[1:-1, 1:-1]
+    assert off.std() < (0.2 * wanted.std() if scale == 0.07 else 1e-3)

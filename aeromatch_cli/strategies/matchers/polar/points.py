@@ -121,9 +121,12 @@ def _stored(side0: Side, side1: Side, windows: Windows, lattice_px: FloatArray) 
 
 
 def _scales(reached: float, finest: float) -> list[float]:
-    """Of the levels from the registration's up to the finest, none more than four times the one before."""
-    steps = max(1, int(np.ceil(np.log(finest / reached) / np.log(_LARGEST_STEP) - 1e-9)))
-    return [float(reached * (finest / reached) ** (step / steps)) for step in range(1, steps + 1)]
+    """Of the levels from the registration's up to the finest: halves of it, none more than four times the last."""
+    found = [reached]
+    while len(found) == 1 or found[-1] < finest:
+        halvings = np.ceil(np.log2(finest / (_LARGEST_STEP * found[-1])) - 1e-9)
+        found.append(float(finest / 2.0 ** max(0.0, halvings)))
+    return found[1:]
 
 
 def _measured(raster0: Raster, raster1: Raster, windows: Windows, scale: float, half: int) -> Windows:
