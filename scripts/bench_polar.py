@@ -8,7 +8,8 @@ as in methods: displacement at the overlap's middle in px of picture 1, degrees,
 differences to SIFT at ratio 0.8, where that is right. seconds: decoding excluded on both sides; seconds_tie_points:
 lattice and about 1,000 tie points included.
 
-Writes OUT/results.json (a row for every method and pair) and OUT/polar.md. Grounds and blocks are kept in OUT/grounds.
+Writes OUT/results.json (a row for every method and pair) and OUT/polar.md. A section of no pairs keeps its rows of an
+earlier run into OUT. Grounds and blocks are kept in OUT/grounds.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     kinds = tuple(args.kinds.split(","))
     task = Task(kinds, (width, height), args.images, args.seed, args.data, args.out / "grounds")
-    rows: list[Row] = []
+    made = {"known": args.pairs, "unknown": args.unknown, "honesty": args.negatives}
+    path = args.out / "results.json"
+    old: list[Row] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    rows = [row for row in old if not made[row["section"]]]
     parts = (
         known_rows(task, args.pairs, args.sift),
         unknown_rows(task, args.unknown),
@@ -62,7 +66,7 @@ def main() -> None:
     for row in chain(*parts):
         rows.append(row)
         print(json.dumps(row), flush=True)
-    write_text(args.out / "results.json", json.dumps(rows, indent=1) + "\n")
+    write_text(path, json.dumps(rows, indent=1) + "\n")
     write_text(args.out / "polar.md", tables(rows))
     if args.readme:
         write_readme(tables(rows), f"bench_polar-{args.size}")

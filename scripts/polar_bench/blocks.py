@@ -20,7 +20,6 @@ from aeromatch_cli.data import FloatArray, Pair, PairGeometry
 from aeromatch_cli.evaluate import BlockTruth, open_truth
 from aeromatch_cli.evaluate.scores import PairScore
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
 from aeromatch_cli.images import read_pixels
 from aeromatch_cli.stages.common import Context
@@ -30,8 +29,8 @@ from polar_bench.grounds import RENDERED
 
 _LEAST_OVERLAP = 0.3
 _NO_SCORES = np.zeros((0, 2))
-# Of the longer side: how far the middle of the overlap may be off where a registration is called right. The ground is
-# no plane, and reference poses are good to some pixels.
+# Of the longer side: how far most matches may be off the plane of the ground where a registration is called right. The
+# ground is no plane, and reference poses are good to some pixels.
 _RIGHT = 0.03
 Poses = tuple[Path, Path]  # told, and right
 
@@ -39,7 +38,7 @@ Poses = tuple[Path, Path]  # told, and right
 @dataclass(frozen=True, eq=False)
 class BlockPair:
     """first, second: (H, W) uint8 gray. names: of the images. geometry: with what is known of the poses. overlap: share
-    of the larger part. plane: (P, 2) places of picture 0 over the overlap and where the plane of the ground puts them.
+    of the larger part. true: the geometry with the poses that say what is right.
     """
 
     kind: str
@@ -48,7 +47,7 @@ class BlockPair:
     second: NDArray[np.uint8]
     geometry: PairGeometry
     overlap: float
-    plane: tuple[FloatArray, FloatArray]
+    true: PairGeometry
     truth: BlockTruth
 
     def judged(self, points0_px: FloatArray, points1_px: FloatArray) -> PairScore:
@@ -56,10 +55,12 @@ class BlockPair:
         equal = np.ones(len(points0_px))
         return self.truth.judge(*self.names, _NO_SCORES, _NO_SCORES, points0_px, points1_px, equal)
 
-    def right(self, matrix: FloatArray) -> bool:
-        """Whether a similarity (3, 3), px1 from px0, puts the overlap about where it lies."""
-        off = np.linalg.norm(apply_homography(matrix, self.plane[0]) - self.plane[1], axis=1)
-        return bool(np.median(off) <= _RIGHT * max(self.first.shape))
+    def right(self, points0_px: FloatArray, points1_px: FloatArray) -> bool:
+        """Whether matches (M, 2) lie about where the plane of the ground puts them."""
+        if not len(points0_px):
+            return False
+        off = np.linalg.norm(points1_px - on_plane(self.true, points0_px), axis=1)
+        return bool(np.nanmedian(off) <= _RIGHT * max(self.first.shape))
 
 
 def block_pairs(
@@ -106,8 +107,8 @@ def _pair(
     images = [told.image_by_id[ids[name]] for name in names]
     pair = Pair(ids[names[0]], ids[names[1]], overlap, float("nan"), "bench")
     first, second = (read_pixels(told.image_path(image), colour=False) for image in images)
-    plane = _plane(right.geometry(pair))
-    return BlockPair(kind, names, _eight(first), _eight(second), told.geometry(pair), overlap, plane, truth)
+    geometries = told.geometry(pair), right.geometry(pair)
+    return BlockPair(kind, names, _eight(first), _eight(second), geometries[0], overlap, geometries[1], truth)
 
 
 def _eight(gray: NDArray[np.generic]) -> NDArray[np.uint8]:
@@ -116,15 +117,11 @@ def _eight(gray: NDArray[np.generic]) -> NDArray[np.uint8]:
     return np.asarray(cv2.normalize(np.asarray(gray), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
 
 
-def _plane(geometry: PairGeometry) -> tuple[FloatArray, FloatArray]:
-    """Places (P, 2) of picture 0 on an even grid which the plane of the ground puts into picture 1, and where."""
+def on_plane(geometry: PairGeometry, places_px: FloatArray) -> FloatArray:
+    """Where the plane of the ground puts stored pixels (N, 2) of image 0 in image 1."""
     camera0, camera1 = geometry.camera0, geometry.camera1
     if geometry.pose0 is None or geometry.pose1 is None or geometry.ground_z_m is None:
         raise ValueError("both poses and the ground must be known")
-    xs, ys = np.linspace(0, camera0.width_px - 1, 40), np.linspace(0, camera0.height_px - 1, 30)
-    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    ground = view_from_source(camera0, undistorted_from_ground(camera0, geometry.pose0, geometry.ground_z_m), places)
-    there = source_from_view(camera1, undistorted_from_ground(camera1, geometry.pose1, geometry.ground_z_m), ground)
-    with np.errstate(invalid="ignore"):
-        inside = ((there >= 0.0) & (there <= [camera1.width_px - 1.0, camera1.height_px - 1.0])).all(axis=1)
-    return places[inside], there[inside]
+    seen_from = undistorted_from_ground(camera0, geometry.pose0, geometry.ground_z_m)
+    ground = view_from_source(camera0, seen_from, places_px)
+    return source_from_view(camera1, undistorted_from_ground(camera1, geometry.pose1, geometry.ground_z_m), ground)

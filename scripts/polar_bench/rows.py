@@ -115,16 +115,20 @@ def unknown_rows(task: Task, pairs: int) -> Iterator[Row]:
                     "size": _size(pair.first), "overlap": round(pair.overlap, 3), "valid": True}  # fmt: skip
             sift = SiftPair(pair.first, pair.second)
             reference = sift.matched(RATIO)
-            usable = reference.accepted and pair.right(reference.matrix) and int(reference.verified.sum()) >= _VERIFIED
+            usable = _registered(reference, pair) and int(reference.verified.sum()) >= _VERIFIED
             for ratio in RATIOS:
                 found = sift.matched(ratio)
-                right = found.accepted and pair.right(found.matrix)
-                yield head | {"method": f"sift {ratio}"} | _of_sift(found) | _judged(found, pair) | {"right": right}
+                right = {"right": _registered(found, pair)}
+                yield head | {"method": f"sift {ratio}"} | _of_sift(found) | _judged(found, pair) | right
             for method, geometry in (("polar", None), ("polar, poses", pair.geometry)):
                 mine = own.registered(pair.first, pair.second, TIE_POINTS, geometry)
                 row = head | {"method": method} | _of_polar(mine) | _judged(mine, pair)
-                right = mine.registration.accepted and pair.right(mine.matrix)
+                right = mine.registration.accepted and pair.right(mine.points0, mine.points1)
                 yield row | {"right": right} | (_against(mine, reference) if usable else {})
+
+
+def _registered(found: SiftResult, pair: BlockPair) -> bool:
+    return found.accepted and pair.right(found.points0[found.agree], found.points1[found.agree])
 
 
 def _judged(found: own.PolarResult | SiftResult, pair: BlockPair) -> Row:
