@@ -221,6 +221,7 @@ class Matches:
     indices: (M, 2) int32 into both images' keypoints, -1 for a point measured without a detector.
     scores: (M,) float32 in 0-1, larger is better. view_pairs: (M, 2) int16, the views that found each.
     points0_px, points1_px: (M, 2) float64 measured places in source pixels, or None where indices say it all.
+    sigmas_px: (M,) float32 standard deviation of the measured place, source pixels, or None where none was measured.
     remark: why a matcher that judges the pair as a whole found nothing, else "".
     """
 
@@ -229,6 +230,7 @@ class Matches:
     view_pairs: IntArray
     points0_px: FloatArray | None = None
     points1_px: FloatArray | None = None
+    sigmas_px: FloatArray | None = None
     remark: str = ""
 
 

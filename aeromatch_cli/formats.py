@@ -43,10 +43,11 @@ matches/<id0>.npz            one row: all pairs of id0, concatenated; pair p own
   indices (M,2) int32 into both keypoint lists, -1 for a point measured without a detector
   scores (M,) float32 in 0-1; view_pairs (M,2) int16; strategy (P,) str
   points0_px, points1_px (M,2) float64, present only where some index is -1
+  sigmas_px (M,) float32 standard deviation of a measured place, present only where a matcher states it
   remark (P,) str: why a matcher that judges pairs as a whole found nothing; present only where one did
 
 verified/<id0>.npz           the same row layout, only kept matches
-  image_id1, fingerprint, offsets, indices, scores, [points0_px, points1_px] as above
+  image_id1, fingerprint, offsets, indices, scores, [points0_px, points1_px, sigmas_px] as above
   errors_px (M,) float32 error to the model; state (P,) str verified | rejected | not verifiable; reason (P,) str
   model_kind (P,) str E | F | H | ""; models (P,3,3) float64 (E on normalised rays, F and H on undistorted px)
   rotations (P,3,3) float64 cam1_from_cam0 of the model, NaN where it has none; matches_in (P,) int64
@@ -391,6 +392,7 @@ class _Row:
             np.zeros((len(indices), 2), np.int16) if view_pairs is None else view_pairs[span],
             self["points0_px"][span] if measured else None,
             self["points1_px"][span] if measured else None,
+            self["sigmas_px"][span] if "sigmas_px" in self._arrays else None,
             str(self["remark"][p]) if "remark" in self._arrays else "",
         )
 
@@ -411,6 +413,9 @@ def _row_arrays(entries: Sequence[MatchEntry] | Sequence[VerifiedEntry]) -> dict
                 np.full((len(m.indices), 2), np.nan) if x is None else x for m, x in zip(matches, parts, strict=True)
             ]
             arrays[name] = _joined(filled, (0, 2), np.float64)
+    if any(m.sigmas_px is not None for m in matches):
+        sigmas = [np.full(len(m.indices), np.nan) if m.sigmas_px is None else m.sigmas_px for m in matches]
+        arrays["sigmas_px"] = _joined(sigmas, (0,), np.float32)
     return arrays
 
 

@@ -51,6 +51,13 @@ def read_tiff(path: Path, part: tuple[int, int, int, int] | None = None) -> tupl
     return np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.asarray(planes[0]), valid
 
 
+def may_have_a_mask(path: Path) -> bool:
+    """Whether only all values of the last band say if it is one of transparency. Raises ItemError."""
+    with _opened(path) as source:
+        extra = _transparency(source)
+        return bool(extra) and source.colorinterp[extra - 1].name != "alpha"
+
+
 def _transparency(source: Any) -> int:
     """Number of the alpha band, or of the last of two or four bands that may be one without the name; 0 for none."""
     kinds = [kind.name for kind in source.colorinterp]

@@ -52,3 +52,8 @@ def test_a_large_picture_is_judged_reduced_and_its_points_lie_in_stored_pixels()
     features = Lattice(points=500)(camera, [ViewPixels(source_view(camera), gray, None)])
     assert features.keypoints_px[:, 0].max() > 3900
     assert len(features.keypoints_px) == pytest.approx(500, abs=25)
+
+
+def test_more_cells_than_pixels_are_as_many_as_fit():
+    features = found(picture(), points=3_000_000)
+    assert 20_000 < len(features.keypoints_px) <= 300 * 200

@@ -44,6 +44,8 @@ def test_every_pair_that_shares_enough_is_verified(work: Path, grass: Path) -> N
     for path in (work / "verified").iterdir():
         for image_id1, entry in formats.read_verified_row(path).items():
             states[path.stem, image_id1] = entry.verdict
+            assert entry.matches.sigmas_px is not None
+            assert ((entry.matches.sigmas_px > 0.0) & (entry.matches.sigmas_px <= 0.5)).all()
     assert len(states) == len(pairs) >= 4
     assert all(states[pair].state == "verified" for pair, overlap in pairs.items() if overlap >= 0.3)
     assert all(verdict.reason for verdict in states.values() if verdict.state != "verified")

@@ -99,6 +99,28 @@ def test_nothing_is_measured_where_one_side_is_masked():
     assert off.max() < 0.5
 
 
+def test_a_smaller_working_size_measures_as_well_as_its_pixels_allow():
+    first, second, truth = pair(12.0, 1.05, (60.0, 30.0), seed=17)
+    half = tuple(replace(side, finest=0.5) for side in (first, second))
+    matches = Polar()(lattice(first, 400), lattice(second, 400), GEOMETRY, half)
+    off = np.linalg.norm(matches.points1_px - apply_homography(truth, matches.points0_px), axis=1)
+    assert len(off) > 300
+    assert np.median(off) < 0.15
+
+
+@pytest.mark.parametrize(("settings", "said"), [
+    ({"smallest_scale": 1.3, "largest_scale": 0.8}, "larger than largest_scale"), ({"window": 30}, "give 31"),
+])  # fmt: skip
+def test_settings_that_cannot_be_are_refused(settings, said):
+    with pytest.raises(ValueError, match=said):
+        Polar(**settings)
+
+
+def test_one_scale_alone_may_be_asked_for():
+    first, second, _ = pair(10.0, 1.0, (40.0, 0.0), seed=3)
+    assert Polar(smallest_scale=1.0, largest_scale=1.0).registered(first, second, GEOMETRY).registration.accepted
+
+
 def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():
     first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
     _, second, _ = pair(0.0, 1.0, (0.0, 0.0), seed=16)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from make_ground import Shot, errors, ground, pair, shot, similarity
 
+from aeromatch_cli.strategies.matchers.polar.evidence import cell_size_px, evidence
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
-from aeromatch_cli.strategies.matchers.polar.registration import Prior, register
+from aeromatch_cli.strategies.matchers.polar.registration import SECOND_PX, Prior, register
 
 MIDDLE = np.array([359.5, 269.5])
 
@@ -39,7 +40,7 @@ def test_known_similarity_is_found_to_a_hundredth_of_a_pixel(turn_deg, scale, sh
 
 
 def test_covariance_says_how_exact_it_is():
-    """Errors of many noises, in standard deviations: within a factor of two, the neighbours' likeness left out."""
+    """Errors of many noises, in standard deviations: a few, for neighbours are alike and are taken for themselves."""
     source = ground(5)
     truth = similarity(12.0, 1.05, (359.5, 269.5), (410.0, 250.0))
     of_first = similarity(0.0, 1.0, (359.5, 269.5), (650.0, 500.0))
@@ -120,7 +121,44 @@ def test_rows_that_nothing_tells_apart_are_refused():
     of_first = similarity(0.0, 1.0, (359.5, 269.5), (650.0, 500.0))
     truth = similarity(4.0, 1.02, (359.5, 269.5), (395.0, 262.0))
     first, second = shot(source, of_first), shot(source, of_first @ np.linalg.inv(truth), seed=1)
-    assert not registered(first, second).accepted
+    found = registered(first, second)
+    assert not found.accepted
+    assert "overlap" in found.reason or "correlate" in found.reason
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 17.0, 45.0, 90.0, 143.0])
+@pytest.mark.parametrize("period_px", [20.0, 45.0])
+def test_no_evidence_of_a_place_comes_from_rows_alone(turn_deg, period_px):
+    """Rows in step, everything else different: a lottery among the places along and across the rows."""
+    y, x = np.mgrid[0:1000, 0:1000]
+    along = np.deg2rad(turn_deg)
+    rows = 120.0 + 25.0 * np.sin(2.0 * np.pi * (x * np.cos(along) + y * np.sin(along)) / period_px)
+    place = similarity(0.0, 1.0, (359.5, 269.5), (500.0, 500.0))
+    sides = [shot(rows.astype(np.float32), place, noise=6.0, seed=seed) for seed in (1, 2)]
+    level0, level1 = Pyramid(sides[0].reduced, sides[1].reduced, 720).at(SECOND_PX, even=True)
+    proof = evidence(level0, level1, np.eye(3), cell_size_px(level0, 1.0))
+    assert proof.cells >= 40
+    assert proof.share < 0.4
+
+
+def test_rows_of_places_apart_are_not_the_same_place():
+    source = ground(300, (2600, 2600))
+    source = (source - 120.0) * 0.12 + 25.0 * np.sin(2.0 * np.pi * np.arange(2600) / 30.0)[None] + 120.0
+    for number in (4, 8):
+        first = similarity(0.0, 1.0, (359.5, 269.5), (600.0, 1300.0))
+        second = similarity(5.0 * number, 1.0, (359.5, 269.5), (2000.0, 1300.0 + 20.0 * number))
+        sides = shot(source, first, noise=4.0, seed=number), shot(source, second, noise=4.0, seed=number + 9)
+        assert not registered(*sides).accepted
+
+
+@pytest.mark.parametrize(("turn_deg", "scale"), [(30.0, 1.0), (0.0, 1.2)])
+def test_a_prior_rules_out_turns_and_scales_as_well_as_shifts(turn_deg, scale):
+    first, second, truth = pair(turn_deg, scale, (0.0, 0.0), seed=3)
+    there = truth @ np.append(MIDDLE, 1.0)
+    expected = similarity(0.0, 1.0, tuple(MIDDLE), tuple(there[:2]))
+    levels = Pyramid(first.reduced, second.reduced, 720)
+    assert register(levels, Prior(expected, np.deg2rad(35.0), 0.25, 20.0)).accepted
+    assert not register(levels, Prior(expected, np.deg2rad(3.0), 0.03, 20.0)).accepted
 
 
 def test_tilt_is_followed_by_the_homography_beside_the_similarity():

@@ -117,6 +117,14 @@ def test_nodata_a_frame_and_a_mask_are_known_at_every_scale(tmp_path, images):
     assert valid[20:].all()
 
 
+def test_infrared_without_a_name_is_no_mask_over_water(tmp_path, images):
+    stored = np.repeat(np.rint(PICTURE * 100.0)[None], 4, axis=0).astype(np.uint16)
+    stored[3, :250] = 0
+    write_tiff(images / "a.tif", stored, photometric="minisblack")
+    _, valid = raster(tmp_path).window(0, 0, 200, 200)
+    assert valid is None
+
+
 def test_a_smaller_working_size_is_the_finest_scale(tmp_path, images):
     cv2.imwrite(str(images / "a.png"), np.rint(PICTURE).astype(np.uint8))
     found = raster(tmp_path, "block.max_size_px=350")

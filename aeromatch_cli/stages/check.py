@@ -15,6 +15,7 @@ from aeromatch_cli.images import shrink_camera
 from aeromatch_cli.stages import enhance, extract, simulate
 from aeromatch_cli.stages.common import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
+from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
@@ -57,6 +58,7 @@ class _PairTrial:
     pair: PairTask
     matcher: Matcher
     chain: tuple[Filter, ...]
+    sources: tuple[enhance.EnhanceTask, enhance.EnhanceTask] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ def _try_pair(trial: _PairTrial) -> _Tried:
 
 def _match(trial: _PairTrial) -> int:
     """How many matches there are before they are judged."""
-    matches = trial.matcher(*trial.features, trial.pair.geometry)
+    matches = compared(trial.matcher, trial.features, trial.pair.geometry, trial.sources)
     sides = [(features.keypoints_px, features.colours) for features in trial.features]
     apply_chain(trial.chain, candidates(matches, *sides), trial.pair.geometry, trial.pair.seed)
     return len(matches.indices)
@@ -152,7 +154,10 @@ def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _
         if features0 is not None and features1 is not None:
             task = PairTask(context.geometry(pair), "", pair_seed(context, pair))
             settings = context.settings
-            trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter))
+            ids = pair.image_id0, pair.image_id1
+            sources = [extract.task_of(context, image_id).views.source for image_id in ids]
+            shown = (sources[0], sources[1]) if settings.match.reads_pixels else None
+            trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter, shown))
     return [o.value for o in context.executor.run(_try_pair, trials, "check") if o.value is not None]
 
 

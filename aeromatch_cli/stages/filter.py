@@ -143,6 +143,7 @@ def select(matches: Matches, keep: Any) -> Matches:
         matches.view_pairs[keep],
         None if matches.points0_px is None else matches.points0_px[keep],
         None if matches.points1_px is None else matches.points1_px[keep],
+        None if matches.sigmas_px is None else matches.sigmas_px[keep],
     )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-from aeromatch_cli.data import Features, Pair
+from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage
@@ -84,12 +84,22 @@ def run_task(task: MatchTask) -> RowResult:
 def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
     path1 = task.workspace.features(pair.image_id1)
     ids = (task.image_id0, pair.image_id1)
-    asked = features0, _features(path1, _stamp(path1)), pair.geometry
-    if task.matcher.reads_pixels:
-        matches = task.matcher(*asked, (StoredRaster(task.sources[ids[0]]), StoredRaster(task.sources[ids[1]])))
-    else:
-        matches = task.matcher(*asked)
+    features1 = _features(path1, _stamp(path1))
+    sources = (task.sources[ids[0]], task.sources[ids[1]]) if task.matcher.reads_pixels else None
+    matches = compared(task.matcher, (features0, features1), pair.geometry, sources)
     return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
+
+
+def compared(
+    matcher: Matcher,
+    features: tuple[Features, Features],
+    geometry: PairGeometry,
+    sources: tuple[EnhanceTask, EnhanceTask] | None,
+) -> Matches:
+    """Matches of one pair. sources: of both images, for a matcher that reads pixels."""
+    if sources is None:
+        return matcher(*features, geometry)
+    return matcher(*features, geometry, (StoredRaster(sources[0]), StoredRaster(sources[1])))
 
 
 def _stamp(path: Path) -> int:

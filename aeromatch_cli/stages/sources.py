@@ -26,8 +26,8 @@ _KEPT, _KEPT_REDUCED, _KEPT_UNITS = 4, 8, 4096
 _wholes: OrderedDict[str, Picture] = OrderedDict()
 _units: OrderedDict[str, float | None] = OrderedDict()
 _reduced: OrderedDict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = OrderedDict()
-# Of a TIFF, whether it has a frame is seen at this scale, and its largest value, which becomes _TOP: reflectances below
-# 1 are as good as gray values up to 65535.
+# A TIFF is looked at on this scale first: for a frame, and for its largest value, which becomes _TOP, so that it makes
+# no difference whether reflectances up to 1 are stored or gray values up to 65535.
 _GLANCE, _TOP = 0.0625, 255.0
 _KNOWN = 0.999  # of the area of a reduced pixel
 
@@ -72,26 +72,31 @@ class StoredRaster:
         task = self._task
         if task.path.suffix.lower() not in tiff.SUFFIXES or task.mask is not None or task.sky_rotation is not None:
             return None
-        if tiff.tiff_size(task.path) != (self.width_px, self.height_px):
-            return None  # says so where all is decoded
+        if tiff.tiff_size(task.path) != (self.width_px, self.height_px) or tiff.may_have_a_mask(task.path):
+            return None  # where all is decoded the size is judged, and whether the last band is a mask
         small, valid = self._of_parts(_GLANCE, 1.0)
         if without_frames(small) is not None or (valid is not None and not valid.any()):
             return None
         return _TOP / max(float(np.abs(small).max()), 1e-30)
 
     def _of_parts(self, scale: float, unit: float) -> tuple[FloatArray, BoolArray | None]:
-        shares: list[NDArray[np.float32]] = []
+        known: list[BoolArray | None] = []
 
         def read(top: int, count: int) -> NDArray[Any]:
             pixels, valid = self._part((0, top, self.width_px, count), unit)
-            shares.append(np.ones(pixels.shape, np.float32) if valid is None else valid.astype(np.float32))
+            known.append(valid)
             return pixels
+
+        def read_known(top: int, count: int) -> NDArray[Any]:
+            del top  # strips come in the same order
+            valid = known.pop(0)
+            return np.ones((count, self.width_px), bool) if valid is None else valid
 
         size = self.width_px, self.height_px
         small = shrink_in_strips(read, size, scale)
-        if all(share.all() for share in shares):
+        if all(valid is None for valid in known):
             return small, None
-        return small, np.asarray(shrink_in_strips(lambda *_: shares.pop(0), size, scale) > _KNOWN)
+        return small, np.asarray(shrink_in_strips(read_known, size, scale) > _KNOWN)
 
     def _part(self, part: tuple[int, int, int, int], unit: float) -> tuple[NDArray[np.float32], BoolArray | None]:
         pixels, valid = tiff.read_tiff(self._task.path, part)

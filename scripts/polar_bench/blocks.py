@@ -25,7 +25,7 @@ from aeromatch_cli.images import read_pixels
 from aeromatch_cli.stages.common import Context
 from aeromatch_cli.stages.pairs import prepare
 from aeromatch_cli.synthetic import render_block
-from polar_bench.grounds import RENDERED
+from polar_bench.grounds import RENDERED, block
 
 _LEAST_OVERLAP = 0.3
 _NO_SCORES = np.zeros((0, 2))
@@ -64,10 +64,10 @@ class BlockPair:
 
 
 def block_pairs(
-    kind: str, size: tuple[int, int], images: int, count: int, seed: int, data: Path, out: Path
+    kind: str, size: tuple[int, int], images: int, count: int, seed: int, data: Path | None, out: Path
 ) -> Iterator[BlockPair]:
     """Up to `count` pairs, at random, of overlap 0.3 at least. size, images: of rendered blocks."""
-    folder, poses = _rendered(kind, size, images, seed, out) if kind in RENDERED else _real(data / kind)
+    folder, poses = _rendered(kind, size, images, seed, out) if kind in RENDERED else _real(block(kind, data))
     truth = open_truth(folder)
     with tempfile.TemporaryDirectory() as scratch:
         told, right = (_context(folder, path, Path(scratch)) for path in poses)

@@ -38,14 +38,20 @@ class KnownPair:
     overlap: float
 
 
-def ground(kind: str, size: tuple[int, int], seed: int, data: Path, out: Path) -> NDArray[np.uint8]:
+def ground(kind: str, size: tuple[int, int], seed: int, data: Path | None, out: Path) -> NDArray[np.uint8]:
     """(H, W) of about `size` (W, H), from the cache in `out` where it is there."""
     path = out / f"{kind}-{size[0]}x{size[1]}-{seed}.png"
     if not path.is_file():
         out.mkdir(parents=True, exist_ok=True)
-        tiles = _rendered(kind, size, seed, out) if kind in RENDERED else _real(data / kind, size, seed)
+        tiles = _rendered(kind, size, seed, out) if kind in RENDERED else _real(block(kind, data), size, seed)
         cv2.imwrite(str(path), _joined(tiles, size))
     return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+def block(kind: str, data: Path | None) -> Path:
+    if data is None:
+        raise SystemExit(f"{kind} is a real block: it needs --data")
+    return data / kind
 
 
 def _rendered(kind: str, size: tuple[int, int], seed: int, out: Path) -> list[list[NDArray[np.uint8]]]:
@@ -124,6 +130,20 @@ def known_pair(source: NDArray[np.uint8], size: tuple[int, int], rng: np.random.
         raise SystemExit(f"a ground of {source.shape[1]}x{source.shape[0]} is too small for pairs of {width}x{height}")
     first, second = (_shot(source, matrix, size, rng) for matrix in (from0, from1))
     return KnownPair(first, second, truth, share)
+
+
+def apart(
+    source: NDArray[np.uint8], size: tuple[int, int], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two pictures of a ground that share nothing, as those of a pair otherwise."""
+    for _ in range(20_000):
+        turns, scale = rng.uniform(-np.pi, np.pi, 2), float(np.exp(rng.uniform(*np.log(_SCALES))))
+        middles = np.array([source.shape[1], source.shape[0]]) * rng.uniform(0.2, 0.8, (2, 2))
+        from0, from1 = _cut(turns[0], 1.0, middles[0], size), _cut(turns[1], 1.0 / scale, middles[1], size)
+        inside = _inside(from0, size, source) and _inside(from1, size, source)
+        if inside and overlap(np.linalg.inv(from1) @ from0, size) == 0.0:
+            return _shot(source, from0, size, rng), _shot(source, from1, size, rng)
+    raise SystemExit(f"a ground of {source.shape[1]}x{source.shape[0]} is too small for pairs of {size} that lie apart")
 
 
 def _cut(turn: float, scale: float, middle: FloatArray, size: tuple[int, int]) -> FloatArray:

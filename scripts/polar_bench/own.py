@@ -38,6 +38,8 @@ class Shot:
         return self.pixels.shape[0]
 
     def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
+        if scale > self.finest:
+            raise ValueError(f"asked for scale {scale:g}, nothing is finer than {self.finest:g}")
         small = shrink(self.pixels, scale).astype(np.float32)
         if self.valid is None:
             return small, None

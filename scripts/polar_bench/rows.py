@@ -14,12 +14,13 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from polar_bench import own
 from polar_bench.blocks import BlockPair, block_pairs
-from polar_bench.grounds import KnownPair, errors, ground, known_pair
+from polar_bench.grounds import KnownPair, apart, errors, ground, known_pair
 from polar_bench.sift import RATIO, SiftPair, SiftResult
 
 Row = dict[str, Any]
 TIE_POINTS = 1000
 RATIOS = (0.6, 0.7, 0.8, 0.9)
+NEGATIVES = ("apart", "other ground", "apart", "saturated", "featureless")
 RIGHT_PX = 3.0
 _VERIFIED = 30  # matches of SIFT's that a comparison with it rests on
 _GRID = 16  # cells along either side of the overlap that coverage counts
@@ -35,7 +36,7 @@ class Task:
     size: tuple[int, int]
     images: int
     seed: int
-    data: Path
+    data: Path | None
     out: Path
 
     def ground(self, kind: str) -> NDArray[np.uint8]:
@@ -52,7 +53,7 @@ def known_rows(task: Task, pairs: int, with_sift: int) -> Iterator[Row]:
             continue
         source = task.ground(kind)
         for number in range(wanted):
-            pair = known_pair(source, task.size, np.random.default_rng([task.seed, index, number]))
+            pair = known_pair(source, task.size, np.random.default_rng([task.seed, _number(kind), number]))
             head = {"section": "known", "kind": kind, "pair": number, "size": _size(pair.first),
                     "overlap": pair.overlap, "valid": True}  # fmt: skip
             found = own.registered(pair.first, pair.second, TIE_POINTS)
@@ -162,17 +163,25 @@ def _against(mine: own.PolarResult, reference: SiftResult) -> Row:
 
 
 def honesty_rows(task: Task, negatives: int) -> Iterator[Row]:
-    """Pairs of which none can be right: other grounds, saturated and featureless pictures."""
+    """Pairs of which none can be right: apart on one ground, of two grounds, saturated or featureless pictures."""
     grounds = {kind: task.ground(kind) for kind in task.kinds if negatives}
     for number in range(negatives):
         rng = np.random.default_rng([task.seed, 77, number])
-        names = rng.choice(task.kinds, 2, replace=False)
-        first, second = (known_pair(grounds[str(name)], task.size, rng).first for name in names)
-        what = ("other ground", "other ground", "saturated", "featureless")[number % 4]
+        what = NEGATIVES[number % len(NEGATIVES)]
+        kind = str(rng.choice(task.kinds))
+        first, second = apart(grounds[kind], task.size, rng)
+        if what != "apart":
+            others = [other for other in task.kinds if other != kind] or [kind]
+            second = apart(grounds[str(rng.choice(others))], task.size, rng)[1]
         if what == "saturated":
             first, second = (np.where(picture > 40, 255, picture).astype(np.uint8) for picture in (first, second))
         elif what == "featureless":
             second = np.clip(128 + 2.0 * rng.standard_normal(second.shape), 0, 255).astype(np.uint8)
         found = own.registered(first, second, 0)
         head = {"section": "honesty", "method": "polar", "kind": what, "pair": number, "size": _size(first)}
-        yield head | {"valid": False} | _of_polar(found)
+        yield head | {"ground": kind, "valid": False, "tie_points": len(found.points0)} | _of_polar(found)
+
+
+def _number(kind: str) -> int:
+    """The same wherever a kind stands in a list."""
+    return int.from_bytes(kind.encode()[:4], "big")

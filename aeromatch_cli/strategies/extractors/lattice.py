@@ -28,6 +28,7 @@ _BLUR_PX = 0.8
 _LEAST_TEXTURE = 0.02
 # Of a cell, left free along its sides: points of neighbouring cells do not meet.
 _RIM = 0.15
+_LEAST_CELL_PX = 3
 
 
 class Lattice(Strategy):
@@ -79,7 +80,7 @@ def _chosen(texture: NDArray[np.float32], points: int) -> tuple[FloatArray, Floa
     """Places (K, 2), their texture (K,) and the side of a cell, px."""
     height, width = texture.shape
     side = float(np.sqrt(height * width / points))
-    rows, columns = max(1, round(height / side)), max(1, round(width / side))
+    rows, columns = (max(1, min(round(length / side), length // _LEAST_CELL_PX)) for length in (height, width))
     tops, lefts = (np.linspace(0, length, count + 1) for length, count in ((height, rows), (width, columns)))
     places, values = [], []
     for row in range(rows):

@@ -10,18 +10,21 @@ Source: dynamic polar parameterisation of least-squares registration for nadir i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry, Raster
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
-from aeromatch_cli.strategies.matchers.polar.registration import SCALES, Registration, register
+from aeromatch_cli.strategies.matchers.polar.registration import SCALES, Prior, Registration, register
 from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
+
+# What poses must promise for a pair to be compared without them, where nothing was found with them.
+_LEAST_UNPOSED_OVERLAP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +66,21 @@ class Polar(Strategy):
         SCALES[0], gt=0.0, description="Without poses: scale of image 1 over image 0, at least."
     )
     largest_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
-    window: int = Field(21, ge=7, le=101, description="Side of the windows that tie points are measured with, pixels.")
+    window: int = Field(
+        21, ge=7, le=101, description="Side of the windows that tie points are measured with, odd, pixels."
+    )
     least_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
     largest_sigma_px: float = Field(0.5, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
+
+    @model_validator(mode="after")
+    def _possible(self) -> Polar:
+        if self.smallest_scale > self.largest_scale:
+            raise ValueError(
+                f"smallest_scale {self.smallest_scale:g} is larger than largest_scale {self.largest_scale:g}"
+            )
+        if self.window % 2 == 0:
+            raise ValueError(f"window {self.window} is even: give {self.window + 1}, which has a middle")
+        return self
 
     def __call__(
         self,
@@ -85,18 +100,27 @@ class Polar(Strategy):
             view_pairs=np.zeros((len(points.indices), 2), np.int16),
             points0_px=points.points0_px,
             points1_px=points.points1_px,
+            sigmas_px=points.sigmas_px.astype(np.float32),
             remark=found.registration.reason,
         )
 
     def registered(self, raster0: Raster, raster1: Raster, geometry: PairGeometry) -> Registered:
         """Registration of one pair, in the frames of its sides, with what tie points need afterwards."""
         posed = grounded(raster0, raster1, geometry, self.sigmas)
-        side0, side1 = (Side.stored(raster0), Side.stored(raster1)) if posed is None else (posed.side0, posed.side1)
+        if posed is not None:
+            found = self._compared(posed.side0, posed.side1, posed.prior)
+            if found.registration.accepted or geometry.pair.overlap < _LEAST_UNPOSED_OVERLAP:
+                return found
+            reason = f"{found.registration.reason}, within {self.sigmas:g} sigma of the poses"
+            found = replace(found, registration=replace(found.registration, reason=reason))
+        # An attitude may be wrong altogether, which is told from what the pictures say.
+        free = self._compared(Side.stored(raster0), Side.stored(raster1), None)
+        return free if posed is None or free.registration.accepted else found
+
+    def _compared(self, side0: Side, side1: Side, prior: Prior | None) -> Registered:
         longest = max(side0.width_px, side0.height_px, side1.width_px, side1.height_px)
-        levels = Pyramid(side0.read, side1.read, longest)
-        registration = register(
-            levels, None if posed is None else posed.prior, (self.smallest_scale, self.largest_scale)
-        )
+        levels = Pyramid(side0.read, side1.read, longest, min(side0.finest, side1.finest))
+        registration = register(levels, prior, (self.smallest_scale, self.largest_scale))
         return Registered(side0, side1, levels, registration)
 
     def measured(self, found: Registered, lattice0_px: FloatArray, lattice1_px: FloatArray) -> Measured:

@@ -17,8 +17,7 @@ _ITERATIONS = 10
 _CONVERGED_PX = 0.02
 _FAR = 0.6  # of the half window: a match that moves on by more has lost its way
 _AT_ONCE = 256  # windows: more do not fit into the cache
-# Of the window's half width, and in pixels at its edge: what holds the affine parameters of a window that says nothing
-# of them where they are.
+# Of every parameter's own weight: what keeps a window solvable that says nothing of some of them.
 _DAMPING = 1e-4
 
 

@@ -19,23 +19,25 @@ FINEST_PX = 920.0
 
 
 class Pyramid:
-    """Both sides of a pair at the scales asked for, each made once. longest_px: longer side of both frames."""
+    """Both sides of a pair at the scales asked for, each made once. longest_px: longer side of both frames. finest: the
+    largest scale that both may be read at.
+    """
 
-    def __init__(self, read0: Reader, read1: Reader, longest_px: int) -> None:
-        self.longest_px = longest_px
+    def __init__(self, read0: Reader, read1: Reader, longest_px: int, finest: float = 1.0) -> None:
+        self.longest_px, self.finest = longest_px, finest
         self._readers = (read0, read1)
         self._finest: list[Picture] = []
         self._made: dict[tuple[float, bool], tuple[Level, Level]] = {}
 
     def turned(self) -> Pyramid:
         """The same with the sides exchanged, what is made already included."""
-        other = Pyramid(self._readers[1], self._readers[0], self.longest_px)
+        other = Pyramid(self._readers[1], self._readers[0], self.longest_px, self.finest)
         other._finest = self._finest[::-1]
         other._made = {key: (second, first) for key, (first, second) in self._made.items()}
         return other
 
     def scale(self, size_px: float) -> float:
-        return min(1.0, size_px / self.longest_px)
+        return min(self.finest, size_px / self.longest_px)
 
     def pictures(self, scale: float) -> tuple[Picture, Picture]:
         """The finest is read, the others are made of it."""

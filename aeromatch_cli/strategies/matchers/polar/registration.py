@@ -42,12 +42,13 @@ SCALES = (0.78, 1.28)  # of side 1 over side 0, without a prior: the asked 0.8 t
 _LEAST_CORRELATION = 0.1
 _LARGEST_CONDITION = 1e3  # right ones have 4 to 17
 _LEAST_CELLS = 12
-_LEAST_AGREEING = 0.4
+_LEAST_AGREEING = 0.5  # over rows alone up to 0.35 do by chance
 _LEAST_PREFERRED = 0.8
-_CLEAR, _CLEARLY_PREFERRED = 0.85, 0.95
+_CLEAR, _CLEARLY_PREFERRED = 0.75, 0.95
 _CREDIBLE = 0.4
-# What a prior allows in the end: so much more than its reach, and a share of the longer side.
+# What a prior allows in the end: so much more than its reach, a share of the longer side, and what relief makes.
 _STRETCH, _ROUGH = 1.25, 0.01
+_ROUGH_TURN_RAD, _ROUGH_LOG_SCALE = np.deg2rad(5.0), 0.1
 # On the finest level: a similarity that is off by more, in the mean, holds in a part of the overlap only.
 _BENT_PX = 0.5
 _ASTRAY_PX = 5.0  # on the finest level, from what the one before says
@@ -111,10 +112,15 @@ class Prior:
 
     def allows(self, item: Fit, scale: float, longest_px: float) -> bool:
         """Whether a fit of pictures at `scale` says what may be: least squares may slide along rows, out of reach."""
-        middle = item.middle_px[None]
-        places = [apply_homography(m, middle)[0] for m in (rescaled(self.expected, 1.0, scale), item.matrix)]
+        expected = rescaled(self.expected, 1.0, scale)
+        places = [apply_homography(matrix, item.middle_px[None])[0] for matrix in (expected, item.matrix)]
         off_px = float(np.linalg.norm(places[0] - places[1])) / scale
-        return off_px <= _STRETCH * self.reach_px + _ROUGH * longest_px
+        change = np.log(_factor(item.matrix, item.middle_px) / _factor(expected, item.middle_px))
+        return (
+            off_px <= _STRETCH * self.reach_px + _ROUGH * longest_px
+            and abs(change.imag) <= _STRETCH * self.turn_rad + _ROUGH_TURN_RAD
+            and abs(change.real) <= _STRETCH * self.log_scale + _ROUGH_LOG_SCALE
+        )
 
 
 def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, float] = SCALES) -> Registration:
@@ -122,8 +128,8 @@ def register(levels: Pyramid, prior: Prior | None = None, scales: tuple[float, f
     best: Registration | None = None
     warps: list[FloatArray] = []
     for effort in _EFFORTS:
-        ratio = (scales[1] / scales[0]) ** (1.0 / (effort.scales - 1))
         if prior is not None:
+            ratio = (SCALES[1] / SCALES[0]) ** (1.0 / (effort.scales - 1))
             search = prior.search(levels.scale(effort.size_px), effort.turn_step_deg, ratio)
         else:
             search = everywhere(effort.turn_step_deg, effort.scales, *scales)
@@ -274,11 +280,16 @@ def _differs(first: Fit, second: Fit, side_px: float) -> bool:
 
 def _similar(warp: FloatArray, middle_px: FloatArray) -> FloatArray:
     """The similarity (3, 3) that a homography is at a place of side 0."""
-    there = apply_homography(warp, middle_px[None])[0]
-    linear = homography_jacobians(warp, middle_px[None], there[None])[0]
-    cosine, sine = (linear[0, 0] + linear[1, 1]) / 2.0, (linear[1, 0] - linear[0, 1]) / 2.0
-    linear = np.array([[cosine, -sine], [sine, cosine]])
+    there, factor = apply_homography(warp, middle_px[None])[0], _factor(warp, middle_px)
+    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
     return np.vstack([np.column_stack([linear, there - linear @ middle_px]), [0.0, 0.0, 1.0]])
+
+
+def _factor(warp: FloatArray, middle_px: FloatArray) -> complex:
+    """Turn and scale of a homography at a place of side 0: what it multiplies x + iy with."""
+    places = middle_px[None]
+    linear = homography_jacobians(warp, places, apply_homography(warp, places))[0]
+    return complex(linear[0, 0] + linear[1, 1], linear[1, 0] - linear[0, 1]) / 2.0
 
 
 def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
@@ -286,7 +297,7 @@ def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
     if not found.converged:
         return f"least squares did not converge: still moving {found.moved_px:.2g} px"
     if found.condition > _LARGEST_CONDITION:
-        return f"the overlap tells shift, turn and scale badly apart (condition number {found.condition:.1g})"
+        return f"the overlap tells shift, turn and scale badly apart (condition number {found.condition:.0f})"
     if proof.cells < _LEAST_CELLS:
         return f"only {proof.cells} parts of the overlap can be compared"
     if proof.correlation < _LEAST_CORRELATION:

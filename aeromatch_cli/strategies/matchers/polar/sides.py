@@ -41,6 +41,11 @@ class Side:
         """The stored picture as it is."""
         return cls(raster, raster.width_px, raster.height_px)
 
+    @property
+    def finest(self) -> float:
+        """The largest scale that it may be read at."""
+        return min(1.0, self.raster.finest * (1.0 if self.camera is None else self.source_scale))
+
     def source_from_frame(self, points_px: FloatArray) -> FloatArray:
         """Stored pixels (N, 2) of frame pixels (N, 2); NaN where nothing is seen."""
         if self.camera is None or self.undistorted_from_frame is None:
@@ -59,7 +64,7 @@ class Side:
             return self.raster.reduced(scale)
         import cv2
 
-        stored_scale = min(1.0, scale / self.source_scale)
+        stored_scale = min(self.raster.finest, scale / self.source_scale)
         pixels, valid = self.raster.reduced(stored_scale)
         maps = self._maps(scale, stored_scale)
         x, y = maps[..., 0], maps[..., 1]
