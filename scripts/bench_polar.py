@@ -8,8 +8,8 @@ saturated or featureless content. Errors as in methods: displacement at the over
 degrees, relative scale; of unknown pairs the differences to SIFT at ratio 0.8, where that is right. seconds: decoding
 excluded on both sides; seconds_tie_points: lattice and about 1,000 tie points included.
 
-Writes OUT/results.json (a row for every method and pair) and OUT/polar.md. A section of no pairs keeps its rows of an
-earlier run into OUT. Grounds and blocks are kept in OUT/grounds.
+Writes OUT/results.json (a row for every method and pair) and OUT/polar.md. A section of no pairs, and kinds not asked
+for, keep their rows of an earlier run into OUT. Grounds and blocks are kept in OUT/grounds.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def main() -> None:
     made = {"known": args.pairs, "unknown": args.unknown, "honesty": args.negatives}
     path = args.out / "results.json"
     old: list[Row] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    rows = [row for row in old if not made[row["section"]]]
+    rows = [
+        row for row in old if not made[row["section"]] or (row["section"] != "honesty" and row["kind"] not in kinds)
+    ]
     parts = (
         known_rows(task, args.pairs, args.sift),
         unknown_rows(task, args.unknown),

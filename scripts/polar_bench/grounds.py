@@ -1,7 +1,8 @@
 """Large pictures of flat ground, and pairs cut out of them of which everything is known.
 
-A ground is a mosaic: of pictures of a real block, or of rendered pictures of as many seeds, joined over a soft border.
-Where there are too few they come again mirrored, which no turn makes the same; real ones enlarged, if need be.
+A ground is a mosaic: of pictures of a real block that share next to nothing, or of rendered pictures of as many seeds,
+joined over a soft border. Where there are too few they come again mirrored, which no turn makes the same; real ones are
+enlarged, if need be.
 Both pictures of a pair are cut out by a similarity, with cubic interpolation; then gain, offset and noise are drawn
 for each, and gray values rounded.
 """
@@ -17,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.images import read_pixels
 from aeromatch_cli.synthetic import render_block
 
 RENDERED, REAL = ("grass", "desert", "farmland"), ("seneca", "caliterra")
 _TILE = (3000, 2250)
 _MOST_RENDERED = 18
+_TWICE = 0.02  # of a picture, that another of the same mosaic shows too
 _SOFT = 0.06  # of a tile's side, where it is joined with the next
 _LEAST_OVERLAP = 0.3
 _SCALES = (0.8, 1.25)
@@ -66,10 +69,8 @@ def _rendered(kind: str, size: tuple[int, int], seed: int, out: Path) -> list[li
     return _laid(pictures, rows, columns)
 
 
-def _real(block: Path, size: tuple[int, int], seed: int) -> list[list[NDArray[np.uint8]]]:
-    paths = sorted((block / "images").iterdir())
-    chosen = np.random.default_rng([seed, 3]).permutation(len(paths))
-    pictures = [read_pixels(paths[number], colour=False) for number in chosen]
+def _real(folder: Path, size: tuple[int, int], seed: int) -> list[list[NDArray[np.uint8]]]:
+    pictures = [read_pixels(folder / "images" / name, colour=False) for name in _apart(folder, seed)]
     height, width = pictures[0].shape
     scale = 1.0
     while _count(size[1], int(height * scale)) * _count(size[0], int(width * scale)) > 2 * len(pictures):
@@ -79,6 +80,17 @@ def _real(block: Path, size: tuple[int, int], seed: int) -> list[list[NDArray[np
     if scale > 1.0:
         pictures = [np.asarray(cv2.resize(p, wide, interpolation=cv2.INTER_CUBIC), np.uint8) for p in pictures]
     return _laid(pictures, rows, columns)
+
+
+def _apart(folder: Path, seed: int) -> list[str]:
+    """Pictures of a block that show next to no ground twice: another place could be right as well else."""
+    truth = open_truth(folder)
+    names = sorted(truth.cameras)
+    kept: list[str] = []
+    for number in np.random.default_rng([seed, 3]).permutation(len(names)):
+        if all(truth.conditions(*sorted((names[number], other))).overlap <= _TWICE for other in kept):
+            kept.append(names[number])
+    return kept
 
 
 def _laid(pictures: Sequence[NDArray[np.uint8]], rows: int, columns: int) -> list[list[NDArray[np.uint8]]]:
