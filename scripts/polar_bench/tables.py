@@ -124,7 +124,7 @@ def agreement_table(rows: Sequence[Row]) -> str:
     """How polar agrees with SIFT where that works."""
     lines = []
     for kind, method, some in _groups(rows, "unknown"):
-        both = [row for row in some if "translation_error_px" in row]
+        both = [row for row in some if row.get("translation_px") is not None]
         good = [row for row in both if row["accepted"]]
         if not both:
             continue
