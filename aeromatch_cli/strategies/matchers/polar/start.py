@@ -1,7 +1,7 @@
 """Where to start: correlation of small pictures over all shifts, for every turn and scale that is possible.
 
 Fourier-Mellin looks at magnitude spectra, which show both pictures whole; where they share a third, two thirds of
-either spectrum are noise. Trying 45 turns and 5 scales of pictures 48 px long costs as much as a few dozen small
+either spectrum are noise. Trying 46 turns and 5 scales of pictures 48 px long costs as much as a few dozen small
 transforms, and each compares the shared part alone. Half of the turns are free: a turn by 180 degrees more is the
 conjugate spectrum.
 
