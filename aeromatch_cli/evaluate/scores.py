@@ -105,11 +105,8 @@ class PairScore:
 
     @property
     def recall(self) -> float:
-        """Below 1 even for a perfect matcher: correct matches are thinned to 2 px, possible ones are not.
-
-        NaN where more is correct than keypoints allow: points that were measured without a detector.
-        """
-        return ratio(self.correct, self.possible) if not self.correct > self.possible else math.nan
+        """Below 1 even for a perfect matcher: correct matches are thinned to 2 px, possible ones are not."""
+        return recall_of(self.correct, self.possible)
 
     @property
     def mean_error_px(self) -> float:
@@ -130,6 +127,11 @@ class PairScore:
         stored = [f.name for f in fields(self) if f.name not in ("errors_px", "kept_idx", "correct_idx")]
         derived = ("wrong", "correctness", "recall", "mean_error_px", "median_error_px", "pose_error_deg")
         return {name: getattr(self, name) for name in (*stored, *derived)}
+
+
+def recall_of(correct: float, possible: float) -> float:
+    """NaN where more is correct than keypoints allow: points that were measured without a detector."""
+    return ratio(correct, possible) if not correct > possible else math.nan
 
 
 def ratio(part: float, whole: float) -> float:

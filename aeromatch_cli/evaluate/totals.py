@@ -19,6 +19,7 @@ from aeromatch_cli.evaluate.scores import (
     mean_of,
     median_of,
     ratio,
+    recall_of,
 )
 
 # A pair that a consumer can build on.
@@ -70,8 +71,7 @@ def total(rows: Sequence[PairRow]) -> dict[str, float]:
         **sums,
         "correctness": ratio(sums["correct"], sums["kept"]),
         "within_5px_share": ratio(sums["within_5px"], sums["kept"]),
-        # Points that were measured without a detector may be more than keypoints allow.
-        "recall": ratio(sums["correct"], sums["possible"]) if sums["correct"] <= sums["possible"] else math.nan,
+        "recall": recall_of(sums["correct"], sums["possible"]),
         "mean_error_px": mean_of(errors_px),
         "median_error_px": median_of(errors_px),
         "coverage": median_of(np.array([score.coverage for score in scores])),

@@ -154,9 +154,10 @@ def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _
         if features0 is not None and features1 is not None:
             task = PairTask(context.geometry(pair), "", pair_seed(context, pair))
             settings = context.settings
-            ids = pair.image_id0, pair.image_id1
-            sources = [extract.task_of(context, image_id).views.source for image_id in ids]
-            shown = (sources[0], sources[1]) if settings.match.reads_pixels else None
+            shown = None
+            if settings.match.reads_pixels:
+                tasks = [extract.task_of(context, image_id) for image_id in (pair.image_id0, pair.image_id1)]
+                shown = tasks[0].views.source, tasks[1].views.source
             trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter, shown))
     return [o.value for o in context.executor.run(_try_pair, trials, "check") if o.value is not None]
 

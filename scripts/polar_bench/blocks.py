@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -108,13 +107,7 @@ def _pair(
     pair = Pair(ids[names[0]], ids[names[1]], overlap, float("nan"), "bench")
     first, second = (read_pixels(told.image_path(image), colour=False) for image in images)
     geometries = told.geometry(pair), right.geometry(pair)
-    return BlockPair(kind, names, _eight(first), _eight(second), geometries[0], overlap, geometries[1], truth)
-
-
-def _eight(gray: NDArray[np.generic]) -> NDArray[np.uint8]:
-    if gray.dtype == np.uint8:
-        return np.asarray(gray, np.uint8)
-    return np.asarray(cv2.normalize(np.asarray(gray), None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
+    return BlockPair(kind, names, first, second, geometries[0], overlap, geometries[1], truth)
 
 
 def on_plane(geometry: PairGeometry, places_px: FloatArray) -> FloatArray:

@@ -202,11 +202,20 @@ def _shot(
 def errors(found: FloatArray, truth: FloatArray, size: tuple[int, int]) -> tuple[float, float, float]:
     """Displacement at the overlap's middle (px of picture 1), turn (degrees), scale (relative)."""
     places, shared = shared_places(truth, size)
-    middle = np.append(places[shared].mean(axis=0), 1.0)
-    turns = [np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])) for matrix in (found, truth)]
-    scales = [np.hypot(matrix[0, 0], matrix[1, 0]) for matrix in (found, truth)]
+    return differences(found, truth, places[shared].mean(axis=0))
+
+
+def differences(found: FloatArray, other: FloatArray, place: FloatArray) -> tuple[float, float, float]:
+    """Of two similarities (3, 3): how far apart they take a place (2,), px, turn (degrees), scale (relative)."""
+    turns = [turn_deg(matrix) for matrix in (found, other)]
+    scales = [np.hypot(matrix[0, 0], matrix[1, 0]) for matrix in (found, other)]
     return (
-        float(np.linalg.norm((found - truth)[:2] @ middle)),
+        float(np.linalg.norm((found - other)[:2] @ np.append(place, 1.0))),
         float(abs((turns[0] - turns[1] + 180.0) % 360.0 - 180.0)),
         float(abs(scales[0] / scales[1] - 1.0)),
     )
+
+
+def turn_deg(matrix: FloatArray) -> float:
+    """Of a similarity (3, 3), -180 to 180."""
+    return float(np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])))

@@ -14,7 +14,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from polar_bench import own
 from polar_bench.blocks import BlockPair, block_pairs
-from polar_bench.grounds import KnownPair, apart, errors, ground, known_pair
+from polar_bench.grounds import KnownPair, apart, differences, errors, ground, known_pair, turn_deg
 from polar_bench.sift import RATIO, SiftPair, SiftResult
 
 Row = dict[str, Any]
@@ -149,17 +149,13 @@ def _against(mine: own.PolarResult, reference: SiftResult) -> Row:
     good = reference.verified
     places = reference.points0[good]
     found, other = (closest_similarity(places, there) for there in (mine.places1(places), reference.points1[good]))
-    middle = places.mean(axis=0)[None]
-    ends = [apply_homography(matrix, middle)[0] for matrix in (found, other)]
-    turns = [np.rad2deg(np.arctan2(matrix[1, 0], matrix[0, 0])) for matrix in (found, other)]
-    scales = [np.hypot(matrix[0, 0], matrix[1, 0]) for matrix in (found, other)]
+    middle = places.mean(axis=0)
+    translation, rotation, scale = differences(found, other, middle)
     return {
-        "translation_error_px": float(np.linalg.norm(ends[0] - ends[1])),
-        "translation_px": float(np.linalg.norm(ends[1] - middle[0])),
-        "rotation_error_deg": float(abs((turns[0] - turns[1] + 180.0) % 360.0 - 180.0)),
-        "rotation_deg": float(abs((turns[1] + 180.0) % 360.0 - 180.0)),
-        "scale_error": float(abs(scales[0] / scales[1] - 1.0)),
-    }
+        "translation_error_px": translation,
+        "translation_px": float(np.linalg.norm(apply_homography(other, middle[None])[0] - middle)),
+        "rotation_error_deg": rotation, "rotation_deg": abs(turn_deg(other)), "scale_error": scale,
+    }  # fmt: skip
 
 
 def honesty_rows(task: Task, negatives: int) -> Iterator[Row]:
