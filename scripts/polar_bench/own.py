@@ -18,6 +18,7 @@ from aeromatch_cli.strategies.matchers.polar import Polar, Registered
 from aeromatch_cli.strategies.matchers.polar.registration import Registration
 from aeromatch_cli.strategies.simulators.none import source_view
 
+_NEIGHBOURS = 4
 _PROBES = 40  # places across a picture that its overlap is found from
 
 
@@ -68,7 +69,21 @@ class PolarResult:
         return self.found.registration
 
     def places1(self, places0: FloatArray) -> FloatArray:
-        """Where stored pixels (N, 2) of picture 0 lie in picture 1, as far as a homography can say."""
+        """Where stored pixels (N, 2) of picture 0 lie in picture 1: the homography, and what the nearest tie points
+        of each place lie off it, which is relief.
+        """
+        from scipy.spatial import cKDTree
+
+        there = self._by_homography(places0)
+        count = min(_NEIGHBOURS, len(self.points0))
+        if not count:
+            return there
+        off = self.points1 - self._by_homography(self.points0)
+        apart, near = (found.reshape(len(places0), count) for found in cKDTree(self.points0).query(places0, k=count))
+        weights = 1.0 / np.maximum(apart, 1.0)
+        return there + (weights[..., None] * off[near]).sum(axis=1) / weights.sum(axis=1, keepdims=True)
+
+    def _by_homography(self, places0: FloatArray) -> FloatArray:
         there = apply_homography(self.registration.warp, self.found.side0.frame_from_source(places0))
         return self.found.side1.source_from_frame(there)
 

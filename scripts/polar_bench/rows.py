@@ -144,7 +144,8 @@ def _against(mine: own.PolarResult, reference: SiftResult) -> Row:
     """Differences between both similarities over SIFT's verified matches; `translation_px` is how far it moves them.
 
     A similarity of tilted pictures depends on where they are looked at. Those of a RANSAC for similarities gather where
-    one fits by chance, so all that a fundamental matrix explains are taken, and polar is asked at the same places.
+    one fits by chance, so all that a fundamental matrix explains are taken, and polar is asked at the same places, by
+    its tie points around them: relief moves single places by more than the limits of the comparison.
     """
     good = reference.verified
     places = reference.points0[good]
