@@ -83,7 +83,8 @@ def cut_patches(
                 axis=-1,
             )
             there = level.from_picture(places).astype(np.float32).reshape(-1, side, 2)
-            cut = cv2.remap(level.gray, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            there_x, there_y = np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
+            cut = cv2.remap(level.gray, there_x, there_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             out[chunk] = cut.reshape(-1, side, side)
     return out
 
