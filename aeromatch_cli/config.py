@@ -140,6 +140,14 @@ class Settings(_Section):
                 f"extract {self.extract.name} describes nothing that match {self.match.name} could compare; "
                 f"use match {' or '.join(readers)}, or another extract"
             )
+        wanted = self.match.reads_descriptors
+        if wanted and wanted != self.extract.descriptors:
+            makers = [name for name, strategy in EXTRACTORS.items() if getattr(strategy, "descriptors", "") == wanted]
+            readers = [name for name, s in MATCHERS.items() if not s.reads_descriptors and not s.reads_pixels]
+            raise ValueError(
+                f"match {self.match.name} was made for {wanted} descriptors, extract {self.extract.name} makes "
+                f"{self.extract.descriptors or 'none'}; use match {' or '.join(readers)}, or extract {'/'.join(makers)}"
+            )
         return self
 
     @model_validator(mode="after")

@@ -20,6 +20,7 @@ from aeromatch_cli.errors import ConfigError, WorkspaceError
 
 if TYPE_CHECKING:
     from torch import Tensor
+    from torch.nn import Module
 
 # Weights that come with the package, each beside its model card.
 SHIPPED_FOLDER = Path(__file__).parent / "trained"
@@ -94,6 +95,20 @@ def list_weights() -> tuple[WeightsEntry, ...]:
         return tuple(WeightsEntry(name=name, **record) for name, record in sorted(records.items()))
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(f"{index} cannot be read ({error}); delete it and add the weights again") from error
+
+
+def shipped_path(name: str) -> Path:
+    """The file of a network that ships. Raises ConfigError where it is missing."""
+    path = SHIPPED_FOLDER / f"{name}.safetensors"
+    if not path.is_file():
+        raise ConfigError(f"{path} is missing: install aeromatch again (`aeromatch weights verify` lists what ships)")
+    return path
+
+
+def load_shipped(network: Module, name: str) -> None:
+    """Fill a network with the weights that ship for it, strictly, in float32, and make it ready for use."""
+    network.load_state_dict({key: value.float() for key, value in read_tensors(shipped_path(name)).items()})
+    network.eval().requires_grad_(False)
 
 
 def shipped_weights() -> tuple[WeightsEntry, ...]:

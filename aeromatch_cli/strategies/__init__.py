@@ -32,6 +32,7 @@ class Strategy(BaseModel):
     "neighbours" (cameras, poses and ground of the images it is paired with); only that enters the fingerprint, so that
     a change re-does exactly the stages that depend on it. A filter that reads "colour" needs extract.colours.
     reads_pixels: True for a matcher that is also given both images' rasters.
+    reads_descriptors: the descriptors that a matcher was made for, "" where any will do.
     verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
     """
 
@@ -39,6 +40,7 @@ class Strategy(BaseModel):
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
     reads_pixels: ClassVar[bool] = False
+    reads_descriptors: ClassVar[str] = ""
     verifies: ClassVar[bool] = True
 
     def reads(self) -> frozenset[str]:
@@ -105,13 +107,14 @@ class Simulator(Protocol):
 
 
 class Extractor(Protocol):
-    """descriptor_length: of every descriptor.
+    """descriptor_length: of every descriptor. descriptors: what they are called, "" where there are none.
     colours: whether the stage adds the colour around every keypoint to the features.
     follows_north: whether what it makes of a view that has north up is only comparable with such views.
     with_room_for: the same for images that get further views only because other images have no attitude.
     """
 
     descriptor_length: ClassVar[int]
+    descriptors: ClassVar[str]
 
     @property
     def colours(self) -> bool: ...
@@ -127,6 +130,7 @@ class Extractor(Protocol):
 class Matcher(Protocol):
     name: str
     reads_pixels: ClassVar[bool]
+    reads_descriptors: ClassVar[str]
 
     def __call__(
         self, features0: Features, features1: Features, geometry: PairGeometry, *rasters: tuple[Raster, Raster]

@@ -42,6 +42,7 @@ class LightGlue(Search):
     """
 
     version: ClassVar[int] = 5
+    reads_descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["lightglue"] = "lightglue"
     enough: int = Field(
         250,
@@ -231,23 +232,16 @@ def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _M
     import torch
 
     from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
+    from aeromatch_cli.nets.precision import has_bfloat16
 
     device = "cuda" if recipe.device == "auto" and torch.cuda.is_available() else "cpu"
     network = load_lightglue(Path(path), device=device)
-    native = torch.cuda.is_bf16_supported() if device == "cuda" else _has_bfloat16()
-    if recipe.precision == "bfloat16" or (recipe.precision == "auto" and native):
+    if recipe.precision == "bfloat16" or (recipe.precision == "auto" and has_bfloat16(device)):
         network = network.with_layers_in(torch.bfloat16)
     calibration = read_calibration(Path(path))
     options = {name: getattr(recipe, name) for name in ("depth_confidence", "width_confidence")}
     options["threshold"] = calibration.score_of(recipe.threshold)
     return _Matcher(network, calibration, device, options)
-
-
-def _has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 itself; emulated it is slower than float32."""
-    import torch
-
-    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
 
 
 def wrapped_rad(angles_deg: FloatArray) -> FloatArray:

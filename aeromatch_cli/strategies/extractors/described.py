@@ -1,0 +1,127 @@
+"""What extractors of described keypoints share: every view's features, a budget that is exact and spread evenly."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import Camera, Features, FloatArray, IntArray
+from aeromatch_cli.strategies import Strategy, ViewPixels
+from aeromatch_cli.strategies.extractors.detection import Raw, concatenate, in_source
+from aeromatch_cli.strategies.extractors.merging import merge_keypoints
+from aeromatch_cli.strategies.extractors.selection import distinct, even_selection
+
+# Answers this close, at sizes within a factor of two, are one blob.
+_SAME_BLOB_PX = 2.0
+
+
+class Described(Strategy):
+    """Keypoints and descriptors of all views of one image: detect, select, describe.
+
+    Describing every point of a forest costs more than detecting it.
+    """
+
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
+    descriptor_length: ClassVar[int] = 128
+    descriptors: ClassVar[str] = ""
+    name: str  # a strategy's own, first in every listing
+    keypoints: int = Field(
+        4000,
+        ge=1,
+        description="Descriptors per image over all its views: exactly so many, fewer only where fewer exist. "
+        "As in OpenCV and COLMAP, a point with two orientations counts twice. Where an enhancement "
+        "works beside the source, so many in each.",
+    )
+    budget: Literal["image", "view"] = Field(
+        "image", description="What `keypoints` is for: the whole image over all its views, or each view by itself."
+    )
+    per_cell: int = Field(200, ge=1, description="Keypoints per cell of the even spread; larger is less even.")
+    colours: bool = Field(False, description="Keep the colour around every keypoint; the filter `colour` reads it.")
+
+    @abstractmethod
+    def detected(self, view: ViewPixels, view_idx: int) -> Raw:
+        """All features of one view, away from its mask, those of one point side by side; places in the view's frame."""
+
+    def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
+        """With orientations, where detection left them to be found for the chosen ones alone."""
+        del views
+        return raw
+
+    @abstractmethod
+    def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
+        """Descriptors (N, descriptor_length) of the features."""
+
+    @abstractmethod
+    def strengths(self, raw: Raw) -> FloatArray:
+        """What a cell of the even spread gives first, (N,)."""
+
+    @property
+    @abstractmethod
+    def follows_north(self) -> bool:
+        """Whether descriptors of views with north up match no others."""
+
+    def with_room_for(self, views: int) -> Described:
+        """With as many descriptors more for further views of an image."""
+        return self.model_copy(update={"keypoints": self.keypoints * (1 + views)}) if self.budget == "image" else self
+
+    def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
+        """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
+        found = [in_source(camera, view, self._found(view, index)) for index, view in enumerate(views)]
+        raw = self.turned(concatenate([self._cut(found, views, group) for group in self._groups(views)]), views)
+        keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
+        points = raw.take(standing)
+        order = np.argsort(keypoint_idx, kind="stable")  # descriptors of one keypoint side by side
+        raw, numbers = raw.take(order), keypoint_idx[order].astype(np.int32)
+        return _features(points, raw, numbers, self.described(raw, views), views)
+
+    def _found(self, view: ViewPixels, view_idx: int) -> Raw:
+        """All features of one view, each blob once."""
+        raw = self.detected(view, view_idx)
+        starts = raw.starts()
+        points = raw.take(starts)
+        keep = distinct(points.points_px, points.sizes_px, self.strengths(points), _SAME_BLOB_PX)
+        return raw.take(keep[np.cumsum(starts) - 1])
+
+    def _groups(self, views: Sequence[ViewPixels]) -> list[list[int]]:
+        """Indices of the views that share a budget: those of the picture as taken, and of the enhanced one, if any."""
+        if self.budget == "view":
+            return [[index] for index in range(len(views))]
+        groups = [[i for i, item in enumerate(views) if item.view.enhanced is enhanced] for enhanced in (False, True)]
+        return [group for group in groups if group]
+
+    def _cut(self, found: Sequence[Raw], views: Sequence[ViewPixels], group: Sequence[int]) -> Raw:
+        """The features of a group of views that the budget buys."""
+        raw = concatenate([found[index] for index in group])
+        within = np.searchsorted(group, raw.view_idx)
+        shown, strengths = [views[index] for index in group], self.strengths(raw)
+        return raw.take(even_selection(shown, within, raw.points_px, strengths, self.keypoints, self.per_cell))
+
+
+def _features(
+    points: Raw, described: Raw, numbers: IntArray, descriptors: NDArray[np.uint8], views: Sequence[ViewPixels]
+) -> Features:
+    return Features(
+        keypoints_px=points.source_px.astype(np.float32),
+        sizes_px=points.source_sizes_px,
+        responses=points.responses,
+        descriptors=descriptors,
+        descriptor_keypoint_idx=numbers,
+        view_idx=described.view_idx,
+        view_keypoints_px=described.points_px,
+        view_size_px=described.sizes_px,
+        view_orientation_deg=described.orientations_deg,
+        view_sizes_px=np.array([(v.view.width_px, v.view.height_px) for v in views], np.int32).reshape(-1, 2),
+        view_angles_deg=np.array([v.view.angle_deg for v in views], np.float32),
+        view_directions=np.array([_or_nan(v.view.world_direction, 3) for v in views], np.float32).reshape(-1, 3),
+        view_gsd_m=np.array([_or_nan(v.view.gsd_m) for v in views], np.float32).reshape(-1),
+        view_enhanced=np.array([v.view.enhanced for v in views], bool),
+    )
+
+
+def _or_nan(value: FloatArray | float | None, length: int = 1) -> FloatArray:
+    return np.full(length, np.nan) if value is None else np.asarray(value, np.float64).reshape(length)
