@@ -99,9 +99,9 @@ def judged(answers: Iterable[tuple[Pair, Array, Array]]) -> Found:
 
 def by_ratio(pair: Pair) -> tuple[Array, Array]:
     """The mutual ratio test: matches (M, 2) and 1 - d1/d2."""
-    ids = [np.arange(len(side.points_px)) for side in (pair.side0, pair.side1)]
+    side0, side1 = pair.side0, pair.side1
     rows, columns, ratios = mutual_nearest(
-        pair.side0.descriptors, pair.side1.descriptors, *ids, ratio=RATIO, ratio_both=False, limits=None
+        side0.descriptors, side1.descriptors, np.arange(len(side1.points_px)), ratio=RATIO
     )
     return np.stack([rows, columns], axis=1), 1.0 - ratios
 

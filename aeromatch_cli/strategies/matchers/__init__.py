@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 from aeromatch_cli.strategies.matchers.polar import Polar
 
-MATCHERS: Mapping[str, type[Strategy]] = {"nearest": Nearest, "lightglue": LightGlue, "polar": Polar}
+MATCHERS: Mapping[str, type[Strategy]] = {
+    "nearest": Nearest,
+    "bidirectional": Bidirectional,
+    "lightglue": LightGlue,
+    "polar": Polar,
+}

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.geometry.prediction import Windows
+from aeromatch_cli.strategies.matchers.scan import Limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,21 @@ class Where:
 
 
 @dataclass(frozen=True, eq=False)
+class ViewPair:
+    """What one view of either image describes: descriptors (D, C), their numbers of0 (D0,), of1 (D1,) in the image,
+    and their keypoints. limits: which of image 1 those of image 0 may take, None for all.
+    """
+
+    of0: IntArray
+    of1: IntArray
+    descriptors0: NDArray[Any]
+    descriptors1: NDArray[Any]
+    keypoint_idx0: IntArray
+    keypoint_idx1: IntArray
+    limits: Limits | None
+
+
+@dataclass(frozen=True, eq=False)
 class Comparison:
     """Two images, and which of their views are compared.
 
@@ -55,6 +73,23 @@ class Comparison:
     geometry: PairGeometry
     alike: BoolArray
     where: Where | None = None
+
+    def view_pairs(self) -> Iterator[ViewPair]:
+        """Those that are alike, in the order of their numbers."""
+        features0, features1 = self.features0, self.features1
+        limits = None if self.where is None else Limits(self.where.windows.forms(), self.where.places_px)
+        for view0, view1 in np.argwhere(self.alike):
+            of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
+            keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
+            yield ViewPair(
+                of0=of0,
+                of1=of1,
+                descriptors0=features0.descriptors[of0],
+                descriptors1=features1.descriptors[of1],
+                keypoint_idx0=keypoints0,
+                keypoint_idx1=keypoints1,
+                limits=None if limits is None else Limits(limits.forms[keypoints0], limits.places[keypoints1]),
+            )
 
     def keypoints(self, found: Found) -> tuple[IntArray, IntArray]:
         """Matches as keypoints (N,) of either image."""

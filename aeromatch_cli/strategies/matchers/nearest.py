@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.scan import mutual_nearest
 from aeromatch_cli.strategies.matchers.search import Search
 
 
@@ -20,24 +19,13 @@ class Nearest(Search):
     ratio: float = Field(
         0.8, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
     )
-    ratio_both: bool = Field(False, description="The ratio must hold from image 1's side as well, over all of image 0.")
 
     def scan(self, asked: Comparison) -> Found:
         """Matches of all view pairs that are alike, costs d1/d2."""
-        features0, features1, where = asked.features0, asked.features1, asked.where
-        limits = None if where is None else Limits(where.windows.forms(), where.places_px)
         parts = []
-        for view0, view1 in np.argwhere(asked.alike):
-            of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
-            keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
+        for views in asked.view_pairs():
             rows, columns, ratios = mutual_nearest(
-                features0.descriptors[of0],
-                features1.descriptors[of1],
-                keypoints0,
-                keypoints1,
-                ratio=self.ratio,
-                ratio_both=self.ratio_both,
-                limits=None if limits is None else Limits(limits.forms[keypoints0], limits.places[keypoints1]),
+                views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=self.ratio, limits=views.limits
             )
-            parts.append(Found(of0[rows], of1[columns], ratios))
+            parts.append(Found(views.of0[rows], views.of1[columns], ratios))
         return joined(parts)

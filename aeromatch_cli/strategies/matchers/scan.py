@@ -28,20 +28,32 @@ Multiply = Callable[[int, int, NDArray[Any]], NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Which targets a query may take. forms: (Q, 2, 3) linear forms; places: (T, 2): both |form . (x, y, 1)| <= 1."""
+    """Which targets a query may take. forms: (Q, 2, 3) linear forms; places: (T, 2): both |form . (x, y, 1)| <= 1.
+
+    turned: whether queries and targets are the other way round: places (Q, 2), forms (T, 2, 3).
+    """
 
     forms: FloatArray
     places: FloatArray
+    turned: bool = False
+
+    def seen_from(self, which: IntArray) -> Limits:
+        """Which queries each of the targets (N,) may take: those that may take it."""
+        return Limits(self.forms, self.places[which], turned=True)
+
+    def factors(self) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+        """Matrices (Q, 3), (3, T) of either form, whose product must not leave -1 to 1."""
+        places = np.column_stack([self.places, np.ones(len(self.places))]).astype(np.float32)
+        forms = [np.ascontiguousarray(self.forms[:, k], np.float32) for k in range(2)]
+        return [(places, form.T) if self.turned else (form, places.T) for form in forms]
 
 
 def mutual_nearest(
     descriptors0: NDArray[Any],
     descriptors1: NDArray[Any],
-    keypoint_idx0: IntArray,
     keypoint_idx1: IntArray,
     *,
     ratio: float,
-    ratio_both: bool = False,
     limits: Limits | None = None,
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Descriptor rows, columns (int64) and ratios d1/d2 (float64) of mutual nearest neighbours that pass the ratio.
@@ -58,12 +70,17 @@ def mutual_nearest(
     # Two rows may be equally near to one column: the first keeps it.
     _, first = np.unique(nearest[rows], return_index=True)
     rows = rows[np.sort(first)]
-    if ratio_both and len(rows):
-        back = _scan(descriptors1[nearest[rows]], descriptors0, keypoint_idx0)
-        ratios_back = _ratios(back[1], back[2])
-        ratios[rows] = np.maximum(ratios[rows], ratios_back)
-        rows = rows[ratios_back < ratio]
     return rows, nearest[rows], ratios[rows]
+
+
+def ratios_of(
+    queries: NDArray[Any], targets: NDArray[Any], target_keypoint_idx: IntArray, *, limits: Limits | None = None
+) -> FloatArray:
+    """Ratio d1/d2 (Q,) of each query (Q, C) among targets (T, C), as in `mutual_nearest`."""
+    if len(queries) == 0 or len(targets) == 0:
+        return np.zeros(len(queries))
+    _, best, second, _ = _scan(queries, targets, target_keypoint_idx, limits)
+    return _ratios(best, second)
 
 
 def _ratios(best: NDArray[Any], second: NDArray[Any]) -> FloatArray:
@@ -112,15 +129,14 @@ def _scan(
 
 def _outside(limits: Limits) -> Callable[[int, int], BoolArray]:
     """Which targets (rows, T) the queries of a block must not take; what is not finite fits nowhere."""
-    places = np.concatenate([limits.places.T, np.ones((1, len(limits.places)))]).astype(np.float32)
-    forms = [np.ascontiguousarray(limits.forms[:, k], np.float32) for k in range(2)]
-    shape = (min(_BLOCK_ROWS, len(limits.forms)), len(limits.places))
+    factors = limits.factors()
+    shape = (min(_BLOCK_ROWS, len(factors[0][0])), factors[0][1].shape[1])
     value, flags, other = np.empty(shape, np.float32), np.empty(shape, bool), np.empty(shape, bool)
 
     def outside(start: int, stop: int) -> BoolArray:
         values, mask, second = value[: stop - start], flags[: stop - start], other[: stop - start]
-        for form, answer in zip(forms, (mask, second), strict=True):
-            np.matmul(form[start:stop], places, out=values)
+        for (of_queries, of_targets), answer in zip(factors, (mask, second), strict=True):
+            np.matmul(of_queries[start:stop], of_targets, out=values)
             np.abs(values, out=values)
             np.less_equal(values, 1.0, out=answer)
         np.logical_and(mask, second, out=mask)
