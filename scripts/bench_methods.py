@@ -2,7 +2,7 @@
 
 A method is a peer or a preset, with settings in brackets as in `--set`, and a short label before it where the name gets
 long: 'opencv-sift,baseline,plain=fusion[enhance=none,simulate=none]'.
-Rendered scenes (one block with the `mixed` flight each) are judged by their exact geometry, real blocks
+Rendered scenes (one block of --flight each) are judged by their exact geometry, real blocks
 (DATA/BLOCK/images, DATA/BLOCK/reference) by the epipolar lines of their reference poses. A pair is hard where the
 shadow share is 20 % or more or the view angle 30 degrees or more (in a real block also where one image is 1.6 times as
 bright as the other), and overlaps by a fifth at least.
@@ -33,15 +33,16 @@ from methods import worker
 from methods.base import Options
 from methods.goals import Comparison, Row
 from methods.results import PARTS, make_row, tables, write_rows
-from methods.scenes import MIN_OVERLAP, Judged, JudgedPair, Selection, real, rendered, with_noisy_poses
-from methods.sources import OUR_CODE, PEER_CODE, code_digest, versions
+from methods.scenes import CONDITIONS, MIN_OVERLAP, Judged, JudgedPair, Selection, real, rendered, with_noisy_poses
+from methods.sources import GROUND_CODE, OUR_CODE, PEER_CODE, code_digest, versions
 from methods.store import read_measured, write_measured
-from methods.table import NEED_WEIGHTS, PEERS, Named, method, named_methods, split_methods
+from methods.table import CLASSICAL, NEED_WEIGHTS, PEERS, Named, method, named_methods, reads_poses, split_methods
 from methods.worker import Measured
 
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import AeromatchError, ConfigError
 from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.synthetic.flights import FLIGHTS
 from aeromatch_cli.workspace import fingerprint, write_text
 
 THREADS = 2
@@ -59,17 +60,19 @@ def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
     code = code_digest("synthetic")
     for preset in filter(None, args.scenes.split(",")):
         size = int(width), int(height)
-        yield rendered(folder, preset, selection, size_px=size, images=args.images, jobs=THREADS, code=code)
+        asked = {"size_px": size, "images": args.images, "flight": args.flight}
+        yield rendered(folder, preset, selection, jobs=THREADS, code=code, **asked)
     for block in filter(None, args.blocks.split(",")):
         yield real(folder, args.data, block, selection, max_size_px=args.max_size)
 
 
 def measure(spec: str, judged: Judged, options: Options, store: Path) -> Iterator[tuple[str, Measured]]:
     """Key and answer of one method for every pair of a scene, in order; what the store has is not made again."""
-    # What an answer depends on, the judge left out. Peers read nothing of stages, strategies and presets.
-    code, settings = (
-        (PEER_CODE, None) if spec in PEERS else (OUR_CODE, load(*parse_method(spec)).model_dump(mode="json"))
-    )
+    # What an answer depends on, the judge left out. Most peers read nothing of stages, strategies and presets.
+    if spec in PEERS:
+        code, settings = (GROUND_CODE if reads_poses(spec) else PEER_CODE), None
+    else:
+        code, settings = OUR_CODE, load(*parse_method(spec)).model_dump(mode="json")
     basis = [spec, settings, judged.key, vars(options) | {"weights": None}, code_digest(*code), versions()]
     keys = [fingerprint(basis, pair.images)[:16] for pair in judged.pairs]
     if all((store / f"{key}.npz").is_file() for key in keys):
@@ -97,8 +100,9 @@ def judged_row(name: Named, judged: Judged, pair: JudgedPair, options: Options, 
 
 
 def poses_of(name: Named, judged: Judged, asked: str) -> list[Judged]:
-    """The scene with the poses that a method is to be measured with: peers read none, real blocks have one set."""
-    noisy = None if name.spec in PEERS or asked == "exact" else with_noisy_poses(judged)
+    """The scene with the poses that a method is to be measured with: peers on pictures read none, real blocks have one
+    set."""
+    noisy = None if not reads_poses(name.spec) or asked == "exact" else with_noisy_poses(judged)
     if noisy is None:
         return [judged]
     return [noisy] if asked == "noisy" else [judged, noisy]
@@ -141,6 +145,8 @@ def command(args: argparse.Namespace) -> str:
     parts = [f"scripts/bench_methods --methods '{args.methods}' --scenes {args.scenes or repr('')}"]
     parts += [f"--condition {args.condition} --pairs {args.pairs} --seed {args.seed} --keypoints {args.keypoints}"]
     parts += [f"--budget {args.budget} --size {args.size} --images {args.images}"]
+    if args.flight != "mixed":
+        parts.append(f"--flight {args.flight}")
     if args.blocks:
         parts.append(f"--data DIR --blocks {args.blocks} --max-size {args.max_size}")
     if args.reference_weights:
@@ -161,7 +167,9 @@ def parse() -> argparse.Namespace:
     add = parser.add_argument
     add("--methods", help=f"comma-separated: {', '.join(PEERS)}, or presets; default: all classical peers and baseline")
     add("--scenes", help=f"comma-separated presets of rendered blocks: {', '.join(PRESETS)}; '' for none")
-    add("--condition", choices=("hard", "easy", "all"), default="all", help="all: half hard, half easy")
+    add("--flight", choices=tuple(FLIGHTS), default="mixed", help="of rendered blocks")
+    about = "all: half hard, half easy; angles: a quarter of each class of view angle"
+    add("--condition", choices=tuple(CONDITIONS), default="all", help=about)
     add("--pairs", type=int, help="judged pairs of each scene")
     add("--seed", type=int, default=0, help="another seed gives other scenes, pairs and samples")
     add("--keypoints", type=int, help="descriptors per image (or view), exactly")
@@ -185,7 +193,7 @@ def parse() -> argparse.Namespace:
         if getattr(args, key) is None:
             setattr(args, key, value)
     if args.methods is None:
-        args.methods = ",".join(name for name in (*PEERS, "baseline") if name not in NEED_WEIGHTS)
+        args.methods = ",".join((*CLASSICAL, "baseline"))
     if args.blocks and args.data is None:
         parser.error("--blocks needs --data: the folder that holds BLOCK/images and BLOCK/reference")
     if unknown := set(args.tables.split(",")) - set(PARTS):

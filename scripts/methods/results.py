@@ -17,6 +17,7 @@ from aeromatch_cli.workspace import write_text
 from methods.base import Options
 from methods.goal_tables import goals_table, markdown, noise_table, shadow_table, strategies_table
 from methods.goals import ENOUGH_CORRECT, EXACT, NOISY, Comparison, Row, noisy_label
+from methods.oblique import oblique_table
 from methods.scenes import NOISY_POSES, Judged, JudgedPair
 from methods.table import Named
 from methods.worker import Measured
@@ -28,7 +29,7 @@ FIELDS = (
     "translation_error_deg", "seconds", "peak_mb",
 )  # fmt: skip
 EXTRAS = ("within_5px", "hidden", "unseen", "kept_in_shadow", "correct_in_shadow", "wrong_at_border")
-PARTS = ("goals", "shadow", "strategies", "noise", "condition", "scene", "angle")
+PARTS = ("goals", "oblique", "shadow", "strategies", "noise", "condition", "scene", "angle")
 
 
 def make_row(
@@ -83,6 +84,7 @@ def tables(rows: Sequence[Row], comparison: Comparison, parts: Sequence[str] = P
     ]
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "goals": ("Goals", lambda: goals_table(rows, comparison)),
+        "oblique": ("Goals above 40 degrees", lambda: oblique_table(rows)),
         "shadow": ("Shadow", lambda: shadow_table(rows, comparison)),
         "strategies": ("Single strategies and combinations", lambda: strategies_table(rows, comparison)),
         "noise": ("Pose noise", lambda: noise_table(rows)),

@@ -13,6 +13,7 @@ import numpy as np
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.cameras import colmap_params, from_colmap
 from aeromatch_cli.images import read_pixels, shrink, shrink_camera
 from aeromatch_cli.synthetic import render_block
@@ -23,12 +24,20 @@ MIN_OVERLAP = 0.2
 # Mean grey level of one image over that of the other from which a pair of real images is hard.
 HARD_BRIGHTNESS_RATIO = 1.6
 HARD, EASY = "hard", "easy"
+# What pairs are chosen by: equal numbers of these kinds, the first ones more where others lack.
+CONDITIONS = {
+    HARD: (HARD,),
+    EASY: (EASY,),
+    "all": (HARD, EASY),
+    "angles": tuple(name for name, _ in reversed(VIEW_ANGLE_CLASSES)),
+}
 EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
 
 
 @dataclass(frozen=True)
 class Selection:
-    """condition: "hard", "easy" or "all" (half of each). pairs: of each scene."""
+    """condition: "hard", "easy", "all" (half of each) or "angles" (a quarter of each view angle class, the larger ones
+    first where some are short). pairs: of each scene."""
 
     condition: str
     pairs: int
@@ -55,16 +64,25 @@ class Judged:
 
 
 def rendered(
-    folder: Path, preset: str, selection: Selection, *, size_px: tuple[int, int], images: int, jobs: int, code: str
+    folder: Path,
+    preset: str,
+    selection: Selection,
+    *,
+    size_px: tuple[int, int],
+    images: int,
+    jobs: int,
+    code: str,
+    flight: str = "mixed",
 ) -> Judged:
-    """A block of this preset with the `mixed` flight, rendered below `folder` unless it is there already.
+    """A block of this preset with this flight, rendered below `folder` unless it is there already.
 
     code: digest of the renderer, so that pictures of an older one are not taken for its own.
     """
     asked = {"seed": selection.seed, "width_px": size_px[0], "height_px": size_px[1], "images": images}
-    out = folder / f"{preset}-{fingerprint(preset, asked, code)[:12]}"
+    flown = () if flight == "mixed" else (flight,)  # blocks rendered before there was a choice keep their names
+    out = folder / f"{preset}-{fingerprint(preset, asked, code, *flown)[:12]}"
     if not (out / "truth.json").is_file():
-        render_block(out, preset, flight="mixed", jobs=jobs, **asked)  # type: ignore[arg-type]
+        render_block(out, preset, flight=flight, jobs=jobs, **asked)  # type: ignore[arg-type]
     truth = open_truth(out)
     return _judged(preset, out, truth, selection, set())
 
@@ -113,12 +131,15 @@ def with_noisy_poses(judged: Judged) -> Judged | None:
 def chosen(candidates: list[JudgedPair], selection: Selection, rng: np.random.Generator) -> tuple[JudgedPair, ...]:
     """As many pairs as asked, seeded, spread over the classes of view angle and of shadow, in the order of names.
 
-    For "all" half of them are hard; where a scene has too few of one kind the other fills up.
+    For "all" half of them are hard, for "angles" a quarter is of each class; where a scene has too few of one kind the
+    others fill up.
     """
-    kinds = (HARD, EASY) if selection.condition == "all" else (selection.condition,)
-    orders = [_spread([c for c in candidates if c.condition == kind], rng) for kind in kinds]
+    kinds = CONDITIONS[selection.condition]
+    of_kind = [[c for c in candidates if kind in (c.condition, c.conditions.view_angle_class)] for kind in kinds]
+    orders = [_spread(members, rng) for members in of_kind]
     wanted = [selection.pairs // len(kinds)] * len(kinds)
-    wanted[0] += selection.pairs - sum(wanted)
+    for k in range(selection.pairs - sum(wanted)):
+        wanted[k] += 1
     taken = [order[:count] for order, count in zip(orders, wanted, strict=True)]
     rest = [pair for order, count in zip(orders, wanted, strict=True) for pair in order[count:]]
     pairs = [pair for part in taken for pair in part]

@@ -24,6 +24,19 @@ OUR_CODE = (
     "tiff.py",
     "methods/ours.py",
 )
+# Peers on rectified views read what makes these, too.
+GROUND_CODE = (
+    *PEER_CODE,
+    "blocks",
+    "geometry",
+    "stages",
+    "strategies/simulators",
+    "strategies/pairings",
+    "data.py",
+    "images.py",
+    "tiff.py",
+    "methods/ground.py",
+)
 LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")
 
 

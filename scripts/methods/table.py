@@ -12,6 +12,7 @@ from aeromatch_cli.errors import ConfigError
 from methods.aliked import Aliked
 from methods.base import Method, Options, Scene
 from methods.colmap import Colmap
+from methods.ground import OnGround
 from methods.keynet import KeyNet
 from methods.opencv_asift import OpenCvAsift
 from methods.opencv_sift import OpenCvSift
@@ -19,16 +20,29 @@ from methods.ours import Preset
 
 Make = Callable[[Scene, Options], Method]
 
-PEERS: Mapping[str, Make] = {
+_FROM_PICTURES: Mapping[str, Make] = {
     "opencv-sift": OpenCvSift,
     "opencv-asift": OpenCvAsift,
-    "pycolmap": Colmap,
-    "pycolmap-guided": partial(Colmap, guided=True),
     "aliked": Aliked,
     "keynet": KeyNet,
     "keynet-tfeat": partial(KeyNet, descriptor="tfeat-liberty.params"),
 }
-NEED_WEIGHTS = ("aliked", "keynet", "keynet-tfeat")
+ON_GROUND = "@ground"
+PEERS: Mapping[str, Make] = {
+    **_FROM_PICTURES,
+    "pycolmap": Colmap,
+    "pycolmap-guided": partial(Colmap, guided=True),
+    **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in _FROM_PICTURES.items()},
+}
+_NETWORKS = ("aliked", "keynet", "keynet-tfeat")
+NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _NETWORKS)
+# What --methods stands for where it is not given: whatever needs no weights, on the pictures as they are.
+CLASSICAL = tuple(name for name in PEERS if name not in NEED_WEIGHTS and not name.endswith(ON_GROUND))
+
+
+def reads_poses(spec: str) -> bool:
+    """Whether a method's answers depend on the poses: presets, and peers on rectified views."""
+    return spec not in PEERS or spec.endswith(ON_GROUND)
 
 
 @dataclass(frozen=True)
