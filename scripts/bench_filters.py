@@ -7,8 +7,8 @@ keeps as many correct matches in all, with the same filters before and after it.
 
 Plane error: distance (larger of both directions) of every correct input match to the nearest plane of its cluster, for
 direct RANSAC to the one homography, median over all. Sums over pairs; ms: median pair, one thread. A pair that a filter
-does not verify keeps nothing. Writes OUT/filters/results.json and OUT/filters/table.md; OUT/scenes keeps the rendered
-blocks, the same as those of scripts/bench_methods.
+does not verify keeps nothing, unless verifying is not its business (the graph alone). Writes OUT/filters/results.json
+and OUT/filters/table.md; OUT/scenes keeps the rendered blocks, the same as those of scripts/bench_methods.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.colour import Colour
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
+from aeromatch_cli.strategies.filters.graph import Graph
 from aeromatch_cli.strategies.filters.homography import Homography
 from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
@@ -83,7 +84,7 @@ class Variant:
 
 
 def variants(threshold_px: float) -> list[Variant]:
-    """Clustered RANSAC and the sweep of direct RANSAC, with and without colour and epipolar; peers."""
+    """Clustered RANSAC and the sweep of direct RANSAC, with and without colour and epipolar; peers; the graph."""
     found = []
     for before in ((), (Colour(),)):
         for after in ((), (Epipolar(),)):
@@ -97,7 +98,11 @@ def variants(threshold_px: float) -> list[Variant]:
                 found.append(Variant(pattern.format("homography"), (*before, direct, *after), words, swept_px))
     found.append(Variant("epipolar", (Epipolar(),)))
     found.append(Variant("magsac", (Magsac(threshold_px=threshold_px, false_alarms=EVERYTHING),)))
-    found.append(Variant("poselib", (Poselib(threshold_px=threshold_px, false_alarms=EVERYTHING),)))
+    poselib = Poselib(threshold_px=threshold_px, false_alarms=EVERYTHING)
+    found.append(Variant("poselib", (poselib,)))
+    graph = Graph(threshold_px=threshold_px)
+    found += [Variant("graph", (graph,)), Variant("graph + poselib", (graph, poselib))]
+    found.append(Variant("poselib + graph", (poselib, graph)))
     return found
 
 
@@ -128,7 +133,8 @@ def row(variant: Variant, given: Input, threshold_px: float) -> Row:
     started = time.perf_counter()
     verdict = apply_chain(variant.chain, given.candidates, given.geometry, given.seed)
     seconds = time.perf_counter() - started
-    keep = verdict.keep & (verdict.state == "verified")
+    judges = any(one.verifies for one in variant.chain)
+    keep = verdict.keep & (verdict.state == "verified" or not judges)
     # Of the sweep they are asked for at one threshold only.
     errors_px = plane_errors_px(variant, given) if variant.threshold_px in (0, threshold_px) else ()
     return {

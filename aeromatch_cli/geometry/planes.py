@@ -13,11 +13,11 @@ Stival, IJCV 2004; DLT after Hartley and Zisserman, 2nd ed., algorithm 4.2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.affinities import fit_affinities, joint_places, local_support, nearest_matches
 
 NEIGHBOURS = 8
 # A cluster holds this many matches on average at least: fewer do not tell a plane from chance.
@@ -27,10 +27,6 @@ _FALSE_ALARMS = 0.1
 _SMALLEST_PLANE = 6
 _PROPOSALS = 48  # of a cluster, the best supported
 _REFINEMENTS = 2
-# Area of a triangle of neighbours over the square of its longer side at the match: flatter ones give no affinity.
-_FLATTEST = 0.1
-# Neighbours closer than float32 tells apart span no affinity; its terms would overflow.
-_LEAST_AREA_PX = 1e-6
 _NEARBY_CLUSTERS = 4
 _KMEANS_STEPS = 8
 _TINY = 1e-12
@@ -73,9 +69,11 @@ def fit_planes(
     inliers at least and more than chance gives. The same for the same seed, which starts K-means.
     """
     points0, points1 = (np.ascontiguousarray(p, dtype=np.float64).reshape(-1, 2) for p in (points0_px, points1_px))
-    places = np.concatenate([_scaled(points0), _scaled(points1)], axis=1)
+    places = joint_places(points0, points1)
     cluster_idx = cluster_places(places, max(1, min(clusters, len(places) // SMALLEST_CLUSTER)), seed)
-    support, affinities = _local_affinities(points0, points1, places, threshold_px)
+    around = nearest_matches(places, NEIGHBOURS)
+    support, weights = local_support(points0, points1, around, threshold_px)
+    affinities = fit_affinities(points0, points1, around, weights)
     members = _padded(cluster_idx)
     found = _search(points0, points1, members, support, affinities, planes_per_cluster, threshold_px)
     homographies, plane_cluster_idx, inliers = found
@@ -106,13 +104,6 @@ def _spread_start(places: FloatArray, clusters: int, rng: np.random.Generator) -
     return places[chosen]
 
 
-def _scaled(points: FloatArray) -> FloatArray:
-    """Points (M, 2) over their spread, so that both images count alike whatever their scale."""
-    if not len(points):
-        return points
-    return (points - points.mean(axis=0)) / max(float(np.sqrt(points.var(axis=0).mean())), _TINY)
-
-
 def _padded(groups: IntArray) -> IntArray:
     """(G, largest) positions of the members of every group, in order, -1 where a group has fewer."""
     sizes = np.bincount(groups)
@@ -135,55 +126,6 @@ def _nearby(centres: FloatArray) -> BoolArray:
     near = np.zeros(apart.shape, dtype=bool)
     np.put_along_axis(near, np.argsort(apart, axis=1, kind="stable")[:, :_NEARBY_CLUSTERS], True, axis=1)
     return near
-
-
-def _local_affinities(
-    points0: FloatArray, points1: FloatArray, places: FloatArray, threshold_px: float
-) -> tuple[FloatArray, FloatArray]:
-    """Support (M,) as in Planes and the affinity (M, 2, 3) of each match, x1 = A (x0, 1), fitted to its supporters."""
-    from scipy.spatial import cKDTree
-
-    count = min(NEIGHBOURS, len(places) - 1)
-    if count < 2:
-        return np.zeros(len(places)), np.zeros((len(places), 2, 3))
-    around = np.asarray(cKDTree(places).query(places, k=count + 1)[1])
-    # A match at the very place of another may not be its own first neighbour.
-    around = np.where(around[:, 1:] == np.arange(len(places))[:, None], around[:, :1], around[:, 1:])
-    # Float32 is exact to 1e-4 px here and twice as fast; matches run along the last axis.
-    move0 = np.ascontiguousarray((points0[around] - points0[:, None]).transpose(2, 1, 0), np.float32)
-    move1 = np.ascontiguousarray((points1[around] - points1[:, None]).transpose(2, 1, 0), np.float32)
-    pairs = np.array(list(combinations(range(count), 2)))
-    a, b = move0[:, pairs[:, 0]], move0[:, pairs[:, 1]]
-    area = a[0] * b[1] - a[1] * b[0]
-    usable = np.abs(area) > np.maximum(_FLATTEST * np.maximum((a**2).sum(axis=0), (b**2).sum(axis=0)), _LEAST_AREA_PX)
-    over = np.divide(1.0, area, out=np.zeros_like(area), where=usable)
-    # Rows of the affinity that maps the moves a, b of a pair to theirs in image 1.
-    of_a, of_b = move1[:, pairs[:, 0]] * over, move1[:, pairs[:, 1]] * over
-    along_x, along_y = of_a * b[1] - of_b * a[1], of_b * a[0] - of_a * b[0]
-    votes = np.empty((count, len(pairs), len(places)), np.float32)
-    for n in range(count):
-        apart = along_x * move0[0, n] + along_y * move0[1, n] - move1[:, n][:, None]
-        squared = apart[0] * apart[0] + apart[1] * apart[1]
-        np.maximum(1.0 - squared / np.float32(threshold_px**2), 0.0, out=votes[n])
-    score = np.where(usable, votes.sum(axis=0) - 2.0, 0.0)
-    best, rows = score.argmax(axis=0), np.arange(len(places))
-    weights = votes[:, best, rows].T * usable[best, rows][:, None]
-    affinities = _fit_affinities(points0, points1, np.column_stack([rows, around]), weights)
-    return np.maximum(score[best, rows], 0.0).astype(np.float64), affinities
-
-
-def _fit_affinities(points0: FloatArray, points1: FloatArray, which: IntArray, weights: FloatArray) -> FloatArray:
-    """(M, 2, 3) affinities fitted by least squares to matches which (M, 1 + n), the first one and weights (M, n)."""
-    weights = np.concatenate([np.ones((len(which), 1)), weights], axis=1)
-    origin0, origin1 = points0[which[:, 0]], points1[which[:, 0]]
-    x, y = points0[which] - origin0[:, None], points1[which] - origin1[:, None]
-    design = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
-    weighted = (design * weights[..., None]).transpose(0, 2, 1)
-    # The square of a pixel on the diagonal keeps a match without supporters solvable; its affinity is never the best.
-    normal = weighted @ design + 1e-6 * np.eye(3)
-    solved = np.linalg.solve(normal, weighted @ y).transpose(0, 2, 1)
-    solved[:, :, 2] += origin1 - (solved[:, :, :2] @ origin0[..., None])[..., 0]
-    return np.asarray(solved)
 
 
 def _search(

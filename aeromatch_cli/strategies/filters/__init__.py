@@ -9,6 +9,7 @@ from aeromatch_cli.strategies.filters.chain import apply_chain as apply_chain
 from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.colour import Colour
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
+from aeromatch_cli.strategies.filters.graph import Graph
 from aeromatch_cli.strategies.filters.homography import Homography
 from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.pose import PoseBand
@@ -18,6 +19,7 @@ FILTERS: Mapping[str, type[Strategy]] = {
     "poselib": Poselib,
     "pose": PoseBand,
     "colour": Colour,
+    "graph": Graph,
     "clustered-ransac": ClusteredRansac,
     "epipolar": Epipolar,
     "homography": Homography,

@@ -1,0 +1,83 @@
+"""Neighbourhood consistency: a match needs neighbours that move with it."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from aeromatch_cli.data import BoolArray, Candidates, FloatArray, IntArray, PairGeometry, Verdict
+from aeromatch_cli.geometry.affinities import joint_places, local_support, nearest_matches
+from aeromatch_cli.geometry.two_view import undistorted
+from aeromatch_cli.strategies import Strategy
+
+# The first round only clears the field, so that the second one's neighbours are true ones: it takes this many times the
+# threshold and asks for the least support alone.
+_COARSE = 5 / 3
+
+
+class Graph(Strategy):
+    """Keeps the matches that enough of their neighbours move with.
+
+    Matches are the nodes of a graph, joined with those nearest by where they lie in both images. A match is supported
+    by the neighbours that one affinity through it explains: some of them, for at a depth step the others lie on another
+    surface. How many it needs follows from how many those half of its neighbours have that have least: sparse parts and
+    strips are not held to the support of open ground, a wrong match among true ones is. Two rounds: the first drops
+    what next to nothing supports, the second compares what is left. Where they would leave fewer than min_matches there
+    is too little to compare by, and everything passes. The graph limits matches and is no evidence for them: the
+    verdict is "not verifiable" with the others kept.
+
+    Source: the graph constraint of J. Geo-inf. Sci. 2021(10), 1823-1837; neighbours as evidence after Aguilar et al.,
+    GTM, Image and Vision Computing 27(7), 2009, and Bian et al., GMS, CVPR 2017.
+    """
+
+    version: ClassVar[int] = 1
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
+    verifies: ClassVar[bool] = False
+    name: Literal["graph"] = "graph"
+    neighbours: int = Field(12, ge=4, le=32, description="Matches that each is joined with; time grows with its cube.")
+    threshold_px: float = Field(
+        3.0,
+        gt=0.0,
+        description="Largest distance of a neighbour to where it would move, undistorted pixels of image 1.",
+    )
+    least: float = Field(
+        0.9,
+        ge=0.0,
+        description="Neighbours that must move with a match besides the two that define its affinity, weighted by how "
+        "well.",
+    )
+    share: float = Field(
+        0.65,
+        ge=0.0,
+        le=1.0,
+        description="Support that a match needs, of the mean support of those half of its neighbours with least.",
+    )
+    min_matches: int = Field(20, ge=8, description="With fewer matches, or where fewer would be left, all pass.")
+
+    def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
+        """errors_px stay unknown: support has no pixels. Nothing is drawn at random."""
+        points0, points1, usable = undistorted(candidates.points0_px, candidates.points1_px, geometry)
+        if len(points0) < self.min_matches:
+            return _passed(len(usable), f"{len(points0)} matches are too few to compare with their neighbours")
+        alive = np.arange(len(points0))
+        for fine in (False, True):
+            alive = alive[self._supported(points0[alive], points1[alive], fine)]
+            if len(alive) < self.min_matches:
+                return _passed(len(usable), f"only {len(alive)} of {len(points0)} matches move with their neighbours")
+        keep = np.zeros(len(usable), dtype=bool)
+        keep[np.flatnonzero(usable)[alive]] = True
+        return Verdict(keep=keep, state="not verifiable", reason="neighbours limit the matches but do not verify them")
+
+    def _supported(self, points0: FloatArray, points1: FloatArray, fine: bool) -> BoolArray:
+        """Which of the matches (M, 2) have support enough."""
+        around: IntArray = nearest_matches(joint_places(points0, points1), self.neighbours)
+        threshold_px = self.threshold_px if fine else _COARSE * self.threshold_px
+        support, _ = local_support(points0, points1, around, threshold_px)
+        least = np.sort(support[around], axis=1)[:, : around.shape[1] // 2].mean(axis=1)
+        return np.asarray(support >= np.maximum(self.share * least if fine else 0.0, self.least))
+
+
+def _passed(count: int, reason: str) -> Verdict:
+    return Verdict(keep=np.ones(count, dtype=bool), state="not verifiable", reason=reason)
