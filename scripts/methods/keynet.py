@@ -40,7 +40,7 @@ class KeyNet:
         )
         self.detector.model.load_state_dict(read_weights(options, "keynet_pytorch.pth"))
         network: Any = TFeat(pretrained=False)
-        network.load_state_dict(_in_tfeat_words(read_weights(options, descriptor)))
+        network.load_state_dict(in_tfeat_words(read_weights(options, descriptor)))
         self.describer: Any = LAFDescriptor(network.eval(), patch_size=32)
         self.detector.eval()
 
@@ -63,7 +63,7 @@ class KeyNet:
         return match_described(cameras[image0], cameras[image1], features0, features1, _RATIO)
 
 
-def _in_tfeat_words(tensors: dict[str, Any]) -> dict[str, Any]:
+def in_tfeat_words(tensors: dict[str, Any]) -> dict[str, Any]:
     """Weights of TFeat or HardTFeat by kornia's names."""
     if "descr.0.weight" in tensors:
         return tensors

@@ -1,0 +1,196 @@
+"""Keypoints of this project's detector beside SIFT, Key.Net and ALIKED, and the angles given to them, by exact truth.
+
+Pairs of rendered blocks that no training has seen, by class of view angle. `source`: on the stored images; `ground`: on
+the north-up ground views that preset `baseline` makes. Of each detector's keypoints those count whose true place the
+other picture shows, too; of these the 1,000 strongest of either side (fewer where it finds fewer). Repeated: pairs of
+them, one to one, within 3 px and within 1 px of the truth, px of the stored image, the larger of both directions.
+Repeatability: repeated over the keypoints of the side that has fewer. Error: median of those repeated within 3 px.
+
+Angles: SIFT keypoints of both pictures that are one place within 3 px at one size within a factor of 1.5. Error:
+difference of both angles less the true turn between the pictures at that place. Where SIFT gives a place several
+angles, those that agree best count.
+
+Writes OUT/results.json and OUT/table.md; OUT/scenes keeps rendered blocks. Detectors and networks of angles are named
+NAME, or LABEL=NAME, or LABEL=ours:FILE for other weights of this project's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import write_readme
+from keypoint_bench.blocks import Asked, blocks
+from keypoint_bench.correspondence import in_overlap, partners
+from keypoint_bench.detectors import DETECTORS, Detector, Keypoints
+from keypoint_bench.named import Named, make, named, without_paths
+from keypoint_bench.orientations import ORIENTERS, disagreement_deg, orientation_row, turned_keypoints
+from keypoint_bench.pictures import GROUND, SOURCE, Picture, Pictures
+from keypoint_bench.tables import detector_table, orientation_table
+from methods.base import Options
+from methods.results import write_rows
+from methods.scenes import Judged, JudgedPair
+
+from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.evaluate import RenderedTruth
+from aeromatch_cli.workspace import write_text
+
+Row = dict[str, Any]
+# Asked of a detector: enough that 1,000 lie in an overlap of a tenth of the picture.
+MOST = 10_000
+FULL = {"scenes": "city,suburb,hills,farmland", "pairs": 12, "size": "1000x750", "images": 24, "keypoints": 1000}
+QUICK = {"scenes": "suburb", "pairs": 4, "size": "480x360", "images": 10, "keypoints": 200}
+
+
+def shared_keypoints(
+    truth: RenderedTruth, found: tuple[Keypoints, Keypoints], pictures: tuple[Picture, Picture], count: int
+) -> list[Keypoints]:
+    """The strongest `count` of either side that the other picture shows, too."""
+    sides = ((found[0], pictures[0], pictures[1]), (found[1], pictures[1], pictures[0]))
+    return [
+        side.take(np.flatnonzero(in_overlap(truth, picture, side.points_px, other))[:count])
+        for side, picture, other in sides
+    ]
+
+
+def detector_row(
+    truth: RenderedTruth, found: tuple[Keypoints, Keypoints], pictures: tuple[Picture, Picture], count: int
+) -> Row:
+    """How many keypoints of a pair were found again, and how exactly."""
+    sides = shared_keypoints(truth, found, pictures, count)
+    stored = [picture.stored_px(side.points_px) for picture, side in zip(pictures, sides, strict=True)]
+    again = partners(truth, pictures[0].image, stored[0], pictures[1].image, stored[1])
+    return {
+        "keypoints0": len(stored[0]),
+        "keypoints1": len(stored[1]),
+        "repeated_3px": len(again.errors_px),
+        "repeated_1px": int((again.errors_px <= 1.0).sum()),
+        "error_px": float(np.median(again.errors_px)) if len(again.errors_px) else None,
+    }
+
+
+def facts(judged: Judged, pair: JudgedPair, section: str, frame: str, method: Named) -> Row:
+    """What every row begins with."""
+    return {
+        "section": section,
+        "method": method.label,
+        "frame": frame,
+        "scene": judged.scene.name,
+        "pair": " ".join(pair.images),
+        "view_angle_deg": round(pair.conditions.view_angle_deg, 3),
+        "overlap": round(pair.conditions.overlap, 4),
+    }
+
+
+def detector_rows(
+    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Detector], count: int
+) -> Iterator[Row]:
+    """One row for each detector, frame and pair of a block."""
+    for frame in (SOURCE, GROUND):
+        for method, detector in methods.items():
+            found = {name: detector(pictures(name, frame), MOST) for name in images_of(judged)}
+            for pair in judged.pairs:
+                both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
+                sides = found[pair.images[0]], found[pair.images[1]]
+                row = facts(judged, pair, "detector", frame, method)
+                yield row | detector_row(truth, sides, both, count)
+
+
+def orientation_rows(
+    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Any], count: int
+) -> Iterator[Row]:
+    """One row for each network of angles, frame and pair of a block."""
+    for frame in (SOURCE, GROUND):
+        for pair in judged.pairs:
+            both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
+            sides, turn = turned_keypoints(truth, both, MOST, 2 * count)
+            for method, orienter in methods.items():
+                angles = [orienter(picture, side) for picture, side in zip(both, sides, strict=True)]
+                row = facts(judged, pair, "orientation", frame, method)
+                yield row | orientation_row(disagreement_deg(angles[0], angles[1], turn))
+
+
+def images_of(judged: Judged) -> list[str]:
+    return sorted({name for pair in judged.pairs for name in pair.images})
+
+
+def run(args: argparse.Namespace) -> list[Row]:
+    """All rows, written as they come."""
+    width, _, height = args.size.partition("x")
+    asked = Asked(
+        tuple(args.scenes.split(",")), args.flight, (int(width), int(height)), args.images, args.pairs, args.seed
+    )
+    options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
+    detectors = {method: make(DETECTORS, method, options) for method in named(args.detectors, DETECTORS)}
+    orienters = {method: make(ORIENTERS, method, options) for method in named(args.orienters, ORIENTERS)}
+    rows: list[Row] = []
+    for judged, truth in blocks(args.out, asked):
+        if not judged.pairs:
+            continue
+        with tempfile.TemporaryDirectory() as scratch:
+            pictures = Pictures(judged.scene, Path(scratch))
+            rows += detector_rows(judged, truth, pictures, detectors, args.keypoints)
+            write_rows(args.out / "results.json", rows)
+            rows += orientation_rows(judged, truth, pictures, orienters, args.keypoints)
+            write_rows(args.out / "results.json", rows)
+        print(f"{judged.scene.name}: {len(judged.pairs)} pairs", file=sys.stderr, flush=True)
+    return rows
+
+
+def command(args: argparse.Namespace) -> str:
+    """This run's command line without machine paths."""
+    parts = f"scripts/bench_detector --detectors '{without_paths(args.detectors)}' --orienters '{without_paths(args.orienters)}'"
+    parts += f" --scenes {args.scenes} --flight {args.flight} --pairs {args.pairs} --size {args.size}"
+    parts += f" --images {args.images} --keypoints {args.keypoints} --seed {args.seed} --reference-weights DIR"
+    return f"{parts} --out DIR"
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--detectors", default=",".join(DETECTORS), help="comma-separated; '' for none")
+    add("--orienters", default=",".join(ORIENTERS), help="comma-separated; '' for none")
+    add("--scenes", help="presets of rendered blocks, comma-separated")
+    add("--flight", default="oblique", help="of rendered blocks")
+    add("--pairs", type=int, help="of each block")
+    add("--size", metavar="WxH", help="of rendered images")
+    add("--images", type=int, help="of each block")
+    add("--keypoints", type=int, help="of either side of a pair")
+    add("--seed", type=int, default=0, help="another seed gives other blocks and pairs")
+    add("--threads", type=int, default=2)
+    add("--quick", action="store_true", help="one small block, few pairs")
+    add("--reference-weights", type=Path, metavar="DIR", help="weights of keynet, aliked and orinet")
+    add("--readme", action="store_true", help="write the tables into the README")
+    add("--out", type=Path, required=True)
+    args = parser.parse_args()
+    for key, value in (QUICK if args.quick else FULL).items():
+        if getattr(args, key) is None:
+            setattr(args, key, value)
+    return args
+
+
+def main() -> None:
+    args = parse()
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[variable] = str(args.threads)
+    try:
+        rows = run(args)
+    except AeromatchError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from error
+    text = f"At most {args.keypoints} keypoints of either side, seed {args.seed}.\n\n"
+    text += f"{detector_table(rows)}\n\n### Angles\n\n{orientation_table(rows)}\n"
+    write_text(args.out / "table.md", text)
+    print(text)
+    if args.readme:
+        write_readme(f"    {command(args)}\n\n{text}", "bench_detector")
+
+
+if __name__ == "__main__":
+    main()
