@@ -94,8 +94,7 @@ def near(points_px: FloatArray, others_px: FloatArray, radius_px: float) -> Bool
     """Which points (N, 2) have one of the others (M, 2) within the radius; those that are NaN have none."""
     if not len(others_px):
         return np.zeros(len(points_px), bool)
-    known: BoolArray = np.isfinite(points_px).all(axis=1, keepdims=True)
-    apart, _ = cKDTree(others_px).query(np.where(known, points_px, 1e9))
+    apart, _ = cKDTree(others_px).query(np.nan_to_num(points_px, nan=1e9))
     return np.asarray(apart <= radius_px)
 
 

@@ -145,7 +145,8 @@ def run(args: argparse.Namespace) -> list[Row]:
 
 def command(args: argparse.Namespace) -> str:
     """This run's command line without machine paths."""
-    parts = f"scripts/bench_detector --detectors '{without_paths(args.detectors)}' --orienters '{without_paths(args.orienters)}'"
+    parts = f"scripts/bench_detector --detectors '{without_paths(args.detectors)}'"
+    parts += f" --orienters '{without_paths(args.orienters)}'"
     parts += f" --scenes {args.scenes} --flight {args.flight} --pairs {args.pairs} --size {args.size}"
     parts += f" --images {args.images} --keypoints {args.keypoints} --seed {args.seed} --reference-weights DIR"
     return f"{parts} --out DIR"

@@ -13,7 +13,7 @@ import pytest
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate import open_truth
+from aeromatch_cli.evaluate import RenderedTruth, open_truth
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 Module = Any
@@ -52,6 +52,7 @@ def test_the_smallest_error_goes_first_and_every_keypoint_once() -> None:
 
 def test_true_places_are_partners_and_shifted_ones_as_far_off_as_they_were_shifted(rendered: Path) -> None:
     correspondence, truth = module("correspondence"), open_truth(rendered)
+    assert isinstance(truth, RenderedTruth)
     name0, name1 = names_of(rendered)
     x, y = np.meshgrid(np.arange(10.0, 310.0, 23.0), np.arange(10.0, 230.0, 19.0))
     points = np.column_stack([x.ravel(), y.ravel()])

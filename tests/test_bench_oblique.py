@@ -73,9 +73,8 @@ def test_peers_on_rectified_views_answer_in_stored_pixels(site: Site) -> None:
         assert (side.places_px >= -0.5).all()
         assert (side.places_px <= [WIDTH - 0.5, HEIGHT - 0.5]).all()
     found = method.match(*names, *sides)
-    score = truth.judge(
-        *names, found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
-    )
+    answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+    score = truth.judge(names[0], names[1], *answer)
     assert score.correct >= 20
     assert score.median_error_px < 1.0
     with pytest.raises(ConfigError, match="budget"):

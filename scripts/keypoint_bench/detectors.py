@@ -78,7 +78,7 @@ class KeyNet:
         with torch.inference_mode():
             frames, responses = detector.eval()(pixels)
             frames = frames[:, torch.nonzero(responses[0] > 0)[:, 0]]
-        scales = get_laf_scale(frames)[0, :, 0].numpy().astype(np.float64)
+        scales = get_laf_scale(frames)[0, :, 0, 0].numpy().astype(np.float64)
         centres = frames[0, :, :, 2].numpy().astype(np.float64) + 0.5 * (scales[:, None] / detector.mr_size - 1.0)
         return _kept(picture, Keypoints(centres, _KEYNET_SIZE * scales, np.zeros(len(centres))))
 
