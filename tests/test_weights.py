@@ -214,7 +214,7 @@ def test_what_ships_is_what_its_sums_say(tmp_path: Path, monkeypatch: pytest.Mon
     (copy / "shadow.safetensors").unlink()
     with (copy / "lightglue.safetensors").open("r+b") as stream:
         stream.truncate(1_000_000)
-    assert [(c.name, c.state) for c in verify_shipped()] == [
+    assert [(c.name, c.state) for c in verify_shipped() if c.state != "ok"] == [
         ("lightglue.safetensors", "changed"),
         ("shadow.safetensors", "missing"),
     ]

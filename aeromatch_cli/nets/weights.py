@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Weights that come with the package, each beside its model card.
 SHIPPED_FOLDER = Path(__file__).parent / "trained"
 SHIPPED_LIGHTGLUE = SHIPPED_FOLDER / "lightglue.safetensors"
+SHIPPED_DETECTOR = SHIPPED_FOLDER / "detector.safetensors"
 _SUMS = "SHA256SUMS"  # of what ships, as sha256sum writes and checks them
 SUFFIXES = (".safetensors", ".pth", ".pt")
 
@@ -35,7 +36,7 @@ _INDEX_NAME = "index.json"
 class WeightsEntry:
     """A file of the weights folder as it was when it was added, or one that ships.
 
-    architecture: "lightglue" or "shadow".
+    architecture: "lightglue", "shadow" or "detector".
     """
 
     name: str

@@ -1,0 +1,106 @@
+"""The keypoint detector: a small fully convolutional network that turns a level of a pyramid into a heat map.
+
+It is applied to every level of `strategies.extractors.pyramid.levels_of`, so it needs no scales of its own. Seven
+convolutions at the level's full resolution, because places count: 5 x 5 from the gray to CHANNELS, five of 3 x 3 (two
+of them with gaps of one pixel) and 3 x 3 to the heat; 12,161 parameters. What a pixel answers depends on the
+2 REACH_PX + 1 pixels squared around it, and through local brightness and contrast on FIELD_PX to every side.
+scripts/train_detector.py documents the training, trained/detector.md the weights.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.weights import SHIPPED_DETECTOR, read_tensors
+
+CHANNELS = 16
+_GAPS = (1, 1, 2, 2, 1)
+REACH_PX = 2 + sum(_GAPS) + 1
+# Local brightness and contrast: means of CELL_PX x CELL_PX pixels, smoothed over 5 x 5 of them.
+CELL_PX = 4
+FIELD_PX = REACH_PX + 8 * CELL_PX
+# Contrast below which a picture is taken for flat, of the gray range 0-1: one gray level of 8 bit.
+_FLAT = 1.0 / 255.0
+
+
+class Detector(nn.Module):
+    """Heat of gray pictures; layers may run in bfloat16, the entrance and the last layer are float32 always."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(1, CHANNELS, 5, padding=2)
+        self.layers = nn.ModuleList(nn.Conv2d(CHANNELS, CHANNELS, 3, padding=gap, dilation=gap) for gap in _GAPS)
+        self.last = nn.Conv2d(CHANNELS, 1, 3, padding=1)
+
+    def forward(self, gray: Tensor) -> Tensor:
+        """Logits (N, 1, H, W) float32 of the heat (confidence 0-1 by a sigmoid) for gray (N, 1, H, W), 0-1.
+
+        Pixels beyond the picture are as bright as its local mean. Pieces of a picture give the numbers of the whole
+        where they start at multiples of CELL_PX, FIELD_PX away from their edges.
+        """
+        if gray.ndim != 4 or gray.shape[1] != 1:
+            raise ValueError(f"gray has shape {tuple(gray.shape)} instead of (N, 1, H, W)")
+        x = evened(gray.float()).to(self.first.weight.dtype).contiguous(memory_format=torch.channels_last)
+        x = F.relu(self.first(x))
+        for layer in self.layers:
+            x = F.relu(layer(x))
+        with torch.autocast(gray.device.type, enabled=False):
+            bias = self.last.bias
+            return F.conv2d(x.float(), self.last.weight.float(), None if bias is None else bias.float(), padding=1)
+
+    def in_bfloat16(self) -> Detector:
+        """Itself, layers changed for faster arithmetic where the processor has it."""
+        self.to(dtype=torch.bfloat16)
+        return self
+
+
+def evened(gray: Tensor) -> Tensor:
+    """Gray (N, 1, H, W) free of local brightness and contrast: gain and offset of the light change nothing."""
+    height, width = gray.shape[-2:]
+    padded = F.pad(gray, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
+    # Less a mean: the difference of large squares would lose the contrast of faint pictures.
+    cells = F.avg_pool2d(padded, CELL_PX)
+    mean = _smooth(cells)
+    moved = padded - _enlarged(mean)
+    spread = _enlarged(_smooth(F.avg_pool2d(moved.square(), CELL_PX)))
+    return (moved / (spread + _FLAT**2).sqrt())[..., :height, :width]
+
+
+def _smooth(cells: Tensor) -> Tensor:
+    """Means over 3 x 3 twice, edges repeated."""
+    for _ in range(2):
+        cells = F.avg_pool2d(F.pad(cells, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
+    return cells
+
+
+def _enlarged(cells: Tensor) -> Tensor:
+    return F.interpolate(cells, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
+
+
+def load_detector(path: Path) -> Detector:
+    """The network with the weights of a file, float32, for inference. Raises ConfigError where they are another's."""
+    tensors = read_tensors(path)
+    with torch.random.fork_rng(devices=[]):
+        network = Detector()
+    try:
+        network.load_state_dict({name: value.float() for name, value in tensors.items()}, strict=True)
+    except RuntimeError as error:
+        raise ConfigError(f"weights file {path} is not a detector: {error}") from error
+    # As the pictures between the layers lie in memory: another order costs several times the seconds.
+    for parameter in network.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False)
+
+
+@lru_cache(maxsize=2)
+def shipped_detector(dtype: torch.dtype = torch.float32) -> Detector:
+    """The shipped weights, once per process and type; bfloat16 is for processors that have it."""
+    network = load_detector(SHIPPED_DETECTOR)
+    return network.in_bfloat16() if dtype == torch.bfloat16 else network

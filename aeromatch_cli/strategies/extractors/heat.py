@@ -1,0 +1,156 @@
+"""Keypoints of a picture where the detector's heat is largest over place and scale.
+
+The paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837) searches Gaussian heat maps for scale-space maxima and
+refines them below the pixel; here the maps are those of `nets.detector` on every level of a half-octave pyramid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.strategies.extractors.pyramid import Level, levels_of
+from aeromatch_cli.strategies.extractors.tiles import tiles
+
+# Diameter of a keypoint in pixels of its level: its patch is then 32 of them (pyramid.SUPPORT).
+SIZE_PX = 5.0
+# Pixels of a level that the network works on at once: what its layers hold stays small.
+TILE_AREA_PX = 500_000
+_TILE_MARGIN_PX = 64
+# Closer to a level's edge the zeros that the layers put around it are seen.
+BORDER_PX = 4
+# Of 5 x 5 pixels, in gray levels: with less there is nothing but rounding.
+_LEAST_CONTRAST = 3
+# Of two keypoints this close, in picture pixels, the weaker one shows nothing new, whatever their sizes.
+_APART_PX = 2.0
+Logits = NDArray[np.float32]
+
+
+def heat_keypoints(
+    gray: NDArray[np.uint8], most: int, valid: BoolArray | None = None, network: Any = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The surest keypoints of a picture (H, W), the surest first: points_px (N, 2) x and y, sizes_px (N,) the
+    diameters SIZE_PX / scale of their levels, confidences (N,) 0-1; all float64, N at most `most`.
+
+    valid: (H, W) where the picture shows something; keypoints whose size reaches beyond are left out.
+    network: a Detector, by default the shipped one. The result does not depend on tiles.
+    """
+    levels = levels_of(gray)
+    maps = [heat(level.gray, network) for level in levels]
+    points, sizes, logits = maxima(levels, maps)
+    inside = _within(valid, points, sizes)
+    points, sizes, logits = points[inside], sizes[inside], logits[inside]
+    order = np.lexsort((points[:, 0], points[:, 1], sizes, -logits))
+    order = order[_apart(points[order], most)]
+    return points[order], sizes[order], 1.0 / (1.0 + np.exp(-logits[order]))
+
+
+def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_AREA_PX) -> Logits:
+    """Log odds (H, W) of the heat of a gray picture (H, W), in tiles."""
+    import torch
+
+    from aeromatch_cli.nets.detector import CELL_PX, shipped_detector
+    from aeromatch_cli.nets.precision import has_bfloat16
+
+    if network is None:
+        network = shipped_detector(torch.bfloat16 if has_bfloat16() else torch.float32)
+    height, width = gray.shape
+    out = np.empty((height, width), np.float32)
+    with torch.inference_mode():
+        for tile in tiles(width, height, tile_area_px, _TILE_MARGIN_PX):
+            assert tile.x0 % CELL_PX == 0
+            assert tile.y0 % CELL_PX == 0
+            piece = torch.from_numpy(np.ascontiguousarray(gray[tile.y0 : tile.y1, tile.x0 : tile.x1]))
+            found = network(piece.float()[None, None] / 255.0)[0, 0].numpy()
+            left, top, right, bottom = tile.core
+            x0, x1 = int(np.ceil(max(left, tile.x0))), int(np.ceil(min(right, tile.x1)))
+            y0, y1 = int(np.ceil(max(top, tile.y0))), int(np.ceil(min(bottom, tile.y1)))
+            out[y0:y1, x0:x1] = found[y0 - tile.y0 : y1 - tile.y0, x0 - tile.x0 : x1 - tile.x0]
+    return out
+
+
+def maxima(levels: Sequence[Level], maps: Sequence[Logits]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """All maxima over place and scale: picture points (N, 2), sizes (N,), log odds (N,), refined below the pixel.
+
+    A maximum is larger than its eight neighbours and than the nine pixels around its place in the levels next to its
+    own.
+    """
+    import cv2
+
+    square, wide = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
+    tops = [cv2.dilate(logits, square) for logits in maps]
+    square[1, 1] = 0
+    found_points, found_sizes, found_logits = [], [], []
+    for index, (level, logits) in enumerate(zip(levels, maps, strict=True)):
+        peak = logits > cv2.dilate(logits, square)
+        peak &= cv2.dilate(level.gray, wide).astype(np.int16) - cv2.erode(level.gray, wide) >= _LEAST_CONTRAST
+        peak[:BORDER_PX], peak[-BORDER_PX:], peak[:, :BORDER_PX], peak[:, -BORDER_PX:] = False, False, False, False
+        y, x = np.nonzero(peak)
+        places = level.to_picture(np.column_stack([x, y]).astype(np.float64))
+        stands = np.ones(len(x), bool)
+        for other in (index - 1, index + 1):
+            if 0 <= other < len(levels):
+                stands &= logits[y, x] > _nearest(tops[other], levels[other].from_picture(places))
+        x, y = x[stands], y[stands]
+        steps, values = refined(logits, x, y)
+        points = level.to_picture(np.column_stack([x, y]) + steps)
+        found_points.append(points)
+        found_sizes.append(np.full(len(x), SIZE_PX / float(np.sqrt(level.scale.prod()))))
+        found_logits.append(values)
+    return np.concatenate(found_points), np.concatenate(found_sizes), np.concatenate(found_logits)
+
+
+def refined(logits: Logits, x: IntArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Steps (N, 2), x and y, at most one pixel, from pixels (N,) to the tops of paraboloids, and their heights (N,).
+
+    The paraboloid is the least-squares one through 3 x 3 pixels: the log of a Gaussian is one, and so are the log odds
+    of a low one. Where it has no top, the step is 0.
+    """
+    v = [[logits[y + dy, x + dx].astype(np.float64) for dx in (-1, 0, 1)] for dy in (-1, 0, 1)]
+    columns, rows = [v[0][k] + v[1][k] + v[2][k] for k in range(3)], [sum(row) for row in v]
+    slope_x, slope_y = (columns[2] - columns[0]) / 6.0, (rows[2] - rows[0]) / 6.0
+    bend_x, bend_y = ((s[0] - 2.0 * s[1] + s[2]) / 3.0 for s in (columns, rows))
+    twist = (v[2][2] - v[2][0] - v[0][2] + v[0][0]) / 4.0
+    determinant = bend_x * bend_y - twist**2
+    has_top = (bend_x < 0.0) & (determinant > 1e-12)
+    safe = np.where(has_top, determinant, 1.0)
+    steps = np.column_stack([twist * slope_y - bend_y * slope_x, twist * slope_x - bend_x * slope_y]) / safe[:, None]
+    steps[~has_top] = 0.0
+    steps = np.clip(steps, -1.0, 1.0)
+    return steps, v[1][1] + 0.5 * (steps[:, 0] * slope_x + steps[:, 1] * slope_y)
+
+
+def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
+    """Values (N,) of a map at the pixels nearest to points (N, 2)."""
+    columns, rows = np.rint(points_px).astype(np.int64).T
+    return values[np.clip(rows, 0, values.shape[0] - 1), np.clip(columns, 0, values.shape[1] - 1)]
+
+
+def _within(valid: BoolArray | None, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
+    """Which keypoints (N,) see nothing but what the picture shows: a mask's edge is no texture."""
+    if valid is None or bool(valid.all()):
+        return np.ones(len(points_px), bool)
+    import cv2
+
+    distance = cv2.distanceTransform(valid.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(_nearest(distance, points_px) > 1.0 + sizes_px)
+
+
+def _apart(points_px: FloatArray, most: int) -> IntArray:
+    """Rows of the first `most` points (N, 2) without one before them, itself kept, within _APART_PX."""
+    from scipy.spatial import cKDTree
+
+    pairs = np.sort(cKDTree(points_px).query_pairs(_APART_PX, output_type="ndarray"), axis=1)
+    pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+    keep = np.ones(len(points_px), bool)
+    # Of chains, too, what is kept never depends on what was left out.
+    undecided = pairs
+    while len(undecided):
+        first = np.setdiff1d(undecided[:, 0], undecided[:, 1])
+        keep[undecided[np.isin(undecided[:, 0], first), 1]] = False
+        undecided = undecided[keep[undecided].all(axis=1) & ~np.isin(undecided[:, 0], first)]
+    return np.flatnonzero(keep)[:most]

@@ -1,0 +1,69 @@
+"""The detector network: shapes, what it does not see, and the shipped weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.detector import FIELD_PX, REACH_PX, Detector, evened, load_detector, shipped_detector
+from aeromatch_cli.nets.weights import SHIPPED_DETECTOR
+
+
+@pytest.fixture(scope="module")
+def network() -> Detector:
+    torch.manual_seed(0)
+    return Detector().eval().requires_grad_(False)
+
+
+def noise(*size: int) -> torch.Tensor:
+    return torch.rand(1, 1, *size, generator=torch.Generator().manual_seed(1))
+
+
+def test_heat_has_the_size_of_its_picture(network: Detector) -> None:
+    assert network(noise(61, 42)).shape == (1, 1, 61, 42)
+    with pytest.raises(ValueError, match=r"\(N, 1, H, W\)"):
+        network(torch.zeros(1, 3, 8, 8))
+
+
+def test_gain_and_offset_of_the_light_change_nothing() -> None:
+    picture = 0.2 + 0.6 * noise(64, 64)
+    assert torch.allclose(evened(0.5 * picture + 0.1), evened(picture), atol=2e-3)
+
+
+def test_what_is_farther_away_than_the_field_changes_nothing(network: Detector) -> None:
+    picture = noise(160, 160)
+    changed = picture.clone()
+    changed[..., 80, 80] = 1.0 - changed[..., 80, 80]
+    differs = (network(picture) != network(changed))[0, 0].nonzero()
+    assert (differs - 80).abs().max() <= FIELD_PX
+    inputs = torch.zeros(1, 1, 64, 64, requires_grad=True)
+    x = torch.relu(network.first(inputs))
+    for layer in network.layers:
+        x = layer(x)  # without rectifiers nothing hides how far it reaches
+    network.last(x)[0, 0, 32, 32].backward()
+    assert inputs.grad is not None
+    assert int((inputs.grad[0, 0].nonzero() - 32).abs().max()) == REACH_PX
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    save_file({"first.weight": torch.zeros(16, 1, 5, 5)}, tmp_path / "half.safetensors")
+    with pytest.raises(ConfigError, match="not a detector"):
+        load_detector(tmp_path / "half.safetensors")
+
+
+def test_shipped_weights_are_small_and_shared_by_a_process() -> None:
+    assert SHIPPED_DETECTOR.stat().st_size < 1_000_000
+    assert shipped_detector() is shipped_detector()
+    assert not any(parameter.requires_grad for parameter in shipped_detector().parameters())
+
+
+def test_bfloat16_agrees_with_float32() -> None:
+    picture = noise(96, 96)
+    exact, fast = (shipped_detector(dtype)(picture) for dtype in (torch.float32, torch.bfloat16))
+    assert exact.dtype == fast.dtype == torch.float32
+    assert np.corrcoef(exact.flatten(), fast.flatten())[0, 1] > 0.999

@@ -1,0 +1,92 @@
+"""Keypoints from heat maps: exact places, scale, light, tiles, and how often the shipped weights find them again."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat, heat_keypoints, maxima, refined
+from aeromatch_cli.strategies.extractors.pyramid import levels_of
+
+Gray = NDArray[np.uint8]
+
+
+def spot(middle_px: tuple[float, float], radius_px: float, side_px: int = 96) -> Gray:
+    """A bright disc with a soft edge on dark ground."""
+    y, x = np.mgrid[0:side_px, 0:side_px].astype(np.float64)
+    away = np.hypot(x - middle_px[0], y - middle_px[1])
+    return np.rint(70 + 110 / (1.0 + np.exp((away - radius_px) / 0.4))).astype(np.uint8)
+
+
+def texture(height: int, width: int, seed: int = 0) -> Gray:
+    """Random rectangles, as roofs and fields have corners."""
+    rng = np.random.default_rng(seed)
+    picture = np.full((height, width), 110.0)
+    for _ in range(height * width // 900):
+        x, y = int(rng.integers(width)), int(rng.integers(height))
+        picture[y : y + int(rng.integers(4, 40)), x : x + int(rng.integers(4, 40))] = rng.uniform(40, 215)
+    blurred = cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0.0, 2.0, picture.shape)
+    return np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
+
+
+def share_within(points0_px: NDArray[np.float64], points1_px: NDArray[np.float64], limit_px: float) -> float:
+    """Of the first points, those that have a second one within the limit."""
+    away = np.linalg.norm(points0_px[:, None] - points1_px[None], axis=2).min(axis=1)
+    return float((away <= limit_px).mean())
+
+
+def test_top_of_a_gaussian_is_found_below_the_pixel() -> None:
+    y, x = np.mgrid[0:21, 0:21].astype(np.float64)
+    logits = (2.0 - ((x - 10.3) ** 2 + (y - 9.6) ** 2) / (2 * 1.2**2)).astype(np.float32)
+    steps, values = refined(logits, np.array([10]), np.array([10]))
+    assert steps[0] == pytest.approx([0.3, -0.4], abs=1e-5)
+    assert values[0] == pytest.approx(2.0, abs=0.01)
+
+
+def test_a_maximum_beats_its_neighbours_in_place_and_scale() -> None:
+    levels = levels_of(texture(128, 128), most=3)
+    maps = [np.full(level.gray.shape, -9.0, np.float32) for level in levels]
+    for number, (level, logits) in enumerate(zip(levels, maps, strict=True)):
+        column, row = np.rint(level.from_picture(np.array([[60.0, 40.0]]))[0]).astype(int)
+        logits[row, column] = (0.0, 2.0, 1.0)[number]
+    points, sizes, values = maxima(levels, maps)
+    assert len(points) == 1
+    assert sizes[0] == pytest.approx(SIZE_PX * 2**0.5, rel=0.02)
+    assert points[0] == pytest.approx([60.0, 40.0], abs=0.75)
+    assert values[0] == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.parametrize("middle", [(47.0, 48.0), (47.4, 48.3), (46.75, 44.5)])
+def test_a_spot_is_found_at_its_place(middle: tuple[float, float]) -> None:
+    points, sizes, confidences = heat_keypoints(spot(middle, 1.5), 10)
+    assert np.linalg.norm(points[0] - middle) < 0.4
+    assert points.dtype == sizes.dtype == confidences.dtype == np.float64
+    assert (np.diff(confidences) <= 0).all()
+
+
+def test_light_changes_few_keypoints() -> None:
+    picture = texture(240, 320)
+    darker = np.rint(picture * 0.6 + 20).astype(np.uint8)
+    first, second = (heat_keypoints(each, 200)[0] for each in (picture, darker))
+    assert share_within(first, second, 0.5) > 0.85
+
+
+def test_tiles_change_nothing() -> None:
+    picture = texture(400, 500)
+    whole, tiled = heat(picture), heat(picture, tile_area_px=70_000)
+    assert np.abs(whole - tiled).max() < 1e-4
+    assert np.array_equal(heat(picture), whole)
+
+
+def test_budget_border_and_mask() -> None:
+    picture = texture(240, 320)
+    valid = np.ones(picture.shape, bool)
+    valid[:, :100] = False
+    points, sizes, _ = heat_keypoints(picture, 50, valid)
+    assert len(points) == len(sizes) == 50
+    assert (points[:, 0] - 99.0 > sizes).all()
+    assert len(heat_keypoints(np.full((64, 64), 90, np.uint8), 50)[0]) == 0
+    away = np.linalg.norm(points[:, None] - points[None], axis=2) + 10.0 * np.eye(len(points))
+    assert away.min() > 2.0
