@@ -1,0 +1,119 @@
+"""What the networks that look at patches share: standardised input, convolutions that fold, weights files, batches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.weights import read_tensors
+
+SIDE_PX = 32
+# Patches at once: what a layer answers to so many stays in a core's cache.
+BATCH = 128
+_MAX_NAMED = 3
+Precision = Literal["auto", "float32", "bfloat16"]
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class Convolution(nn.Module):
+    """A square convolution, then batch norm without scale and shift of its own; folded: one convolution with a bias.
+
+    Odd sides keep the picture's size (over the stride), even ones are laid on where they fit.
+    """
+
+    def __init__(self, inside: int, outside: int, side: int, *, stride: int = 1, folded: bool = False) -> None:
+        super().__init__()
+        padding = side // 2 if side % 2 else 0
+        self.convolution = nn.Conv2d(inside, outside, side, stride, padding, bias=folded)
+        self.norm: nn.Module = nn.Identity() if folded else nn.BatchNorm2d(outside, affine=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inside, H, W) of the weights' type -> (N, outside, H', W')."""
+        answer: Tensor = self.norm(self.convolution(x))
+        return answer
+
+    def fold_into(self, other: Convolution) -> None:
+        """Gives a folded one of the same shape the weights that make it answer as this one does in evaluation."""
+        norm = self.norm
+        if not isinstance(norm, nn.BatchNorm2d) or norm.running_mean is None or norm.running_var is None:
+            raise TypeError("this convolution is folded already")
+        scale = (norm.running_var + norm.eps).rsqrt()
+        bias = -norm.running_mean * scale
+        if self.convolution.bias is not None:
+            bias = bias + self.convolution.bias * scale
+        with torch.no_grad():
+            other.convolution.weight.copy_(self.convolution.weight * scale[:, None, None, None])
+            other.convolution.get_parameter("bias").copy_(bias)
+
+
+def fold(trained: nn.Module, folded: Network) -> Network:
+    """`folded`, a network of the same architecture, with the weights of the trained one; for evaluation."""
+    shared = {name: value for name, value in trained.state_dict().items() if name in folded.state_dict()}
+    folded.load_state_dict(shared, strict=False)
+    for name, part in trained.named_modules():
+        if isinstance(part, Convolution):
+            target = folded.get_submodule(name)
+            if not isinstance(target, Convolution):
+                raise TypeError(f"{name} is no convolution in the folded network")
+            part.fold_into(target)
+    return folded.eval().requires_grad_(False)
+
+
+def standardised(patches: Tensor) -> Tensor:
+    """Patches (N, 1, S, S) of any type as float32, each of mean 0 and standard deviation 1; flat ones are all 0."""
+    values = patches.float()
+    values = values - values.mean(dim=(1, 2, 3), keepdim=True)
+    deviation = values.square().mean(dim=(1, 2, 3), keepdim=True).sqrt()
+    return values / deviation.clamp(min=1e-4)
+
+
+def load_folded(network: Network, path: Path, precision: Precision = "auto") -> Network:
+    """The folded network with the weights of a file, for evaluation on a CPU, channels last.
+
+    precision: of weights and layers; auto is bfloat16 where the processor multiplies it itself. Every tensor comes from
+    the file and every tensor of the file is used; raises ConfigError otherwise.
+    """
+    given, expected = read_tensors(path), network.state_dict()
+    shapes = sorted(key for key in expected.keys() & given.keys() if expected[key].shape != given[key].shape)
+    kinds = {
+        "missing": sorted(expected.keys() - given.keys()),
+        "unexpected": sorted(given.keys() - expected.keys()),
+        "wrong shape": shapes,
+    }
+    problems = [f"{kind}: {', '.join(keys[:_MAX_NAMED])}" for kind, keys in kinds.items() if keys]
+    if problems:
+        raise ConfigError(f"weights file {path} is not a {type(network).__name__}: {'; '.join(problems)}")
+    network.load_state_dict(given, strict=True)
+    native = precision == "auto" and has_bfloat16()
+    kind = torch.bfloat16 if precision == "bfloat16" or native else torch.float32
+    network = network.to(dtype=kind).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network.eval().requires_grad_(False)
+
+
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 itself; emulated it is slower than float32."""
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
+
+
+@torch.inference_mode()
+def answers(network: nn.Module, patches: NDArray[Any], length: int) -> NDArray[np.float32]:
+    """(N, length) float32 that a network says of patches (N, SIDE_PX, SIDE_PX).
+
+    Always BATCH at a time, the last filled up with zeros: a patch has the same answer whatever goes with it.
+    """
+    if patches.shape[1:] != (SIDE_PX, SIDE_PX):
+        raise ValueError(f"patches are of shape {patches.shape}, must be (N, {SIDE_PX}, {SIDE_PX})")
+    out = np.empty((len(patches), length), np.float32)
+    batch = np.zeros((BATCH, 1, SIDE_PX, SIDE_PX), patches.dtype)
+    for start in range(0, len(patches), BATCH):
+        count = len(patches[start : start + BATCH])
+        batch[:count, 0] = patches[start : start + BATCH]
+        batch[count:] = 0
+        out[start : start + count] = network(torch.from_numpy(batch))[:count].numpy()
+    return out

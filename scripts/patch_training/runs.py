@@ -1,0 +1,113 @@
+"""What both recipes share: the state of a run, its recipe on file, learning rate, curves."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+DECAY = 0.998
+# Patches at once through a network: their answers stay in the cache, and batch norm's statistics are of so many.
+CHUNK = 256
+
+
+@dataclass
+class Run:
+    """Everything that a resumed run needs. average: moving average of the weights, batch norm's statistics included."""
+
+    network: nn.Module
+    average: nn.Module
+    optimiser: torch.optim.Optimizer
+    step: int
+    log: list[dict[str, Any]]
+
+    @classmethod
+    def begin(cls, path: Path, make: Callable[[], nn.Module], rate: float, seed: int) -> Run:
+        """Where the state file `path` left it, else from nothing."""
+        torch.manual_seed(seed)
+        network = make().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
+        run = cls(network, copy.deepcopy(network), optimiser, 0, [])
+        if path.is_file():
+            run.step, run.log, *states = torch.load(path, weights_only=True)
+            for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
+                part.load_state_dict(state)
+        return run
+
+    def save(self, path: Path) -> None:
+        parts = (self.network, self.average, self.optimiser)
+        partly = path.with_suffix(".partly")
+        torch.save((self.step, self.log, *(part.state_dict() for part in parts)), partly)
+        partly.replace(path)
+
+    def learn(self, loss: Tensor, rate: float) -> None:
+        """One step of the optimiser, and of the average."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        self.optimiser.step()
+        keep = min(DECAY, (self.step + 1) / (self.step + 10))
+        with torch.no_grad():
+            for old, new in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+                if old.is_floating_point():
+                    old.lerp_(new, 1.0 - keep)
+        self.step += 1
+
+
+def answered(network: Callable[[Tensor], Tensor], patches: Tensor) -> Tensor:
+    """What a network in training says of patches (N, 1, 32, 32), CHUNK at a time, in bfloat16."""
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return torch.cat([network(part) for part in patches.split(CHUNK)])
+
+
+def rate_at(step: int, total: int, largest: float) -> float:
+    """A short rise, then a cosine to next to nothing."""
+    return largest * (min(1.0, (step + 1) / (0.04 * total)) * (0.5 + 0.5 * math.cos(math.pi * step / total)) + 0.002)
+
+
+def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, names: Sequence[str]) -> None:
+    """Refuses to go on with a run of other arguments; OUT/recipe.json remembers them."""
+    asked = {name: str(getattr(args, name)) for name in names}
+    path = args.out / "recipe.json"
+    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else asked
+    other = [f"{name} {known.get(name)}" for name in names if known.get(name) != asked[name]]
+    if other:
+        parser.error(f"{args.out} holds another run ({', '.join(other)}); give another --out")
+    args.out.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(asked, indent=1) + "\n", encoding="utf-8")
+
+
+def ship(folded: nn.Module, path: Path) -> None:
+    """Weights as float16."""
+    save_file({name: value.half().contiguous() for name, value in folded.state_dict().items()}, path)
+
+
+def draw_curves(
+    log: list[dict[str, Any]], values: dict[str, list[float]], lines: dict[str, float], label: str, path: Path
+) -> None:
+    """Values by step, lines of others to compare with (dashed), and the loss."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.0), dpi=110, layout="constrained")
+    axes, losses = figure.subplots(1, 2)
+    steps = [row["step"] for row in log]
+    for name, series in values.items():
+        axes.plot(steps, series, label=name)
+    for number, (name, value) in enumerate(lines.items()):
+        axes.axhline(value, color=f"C{number + len(values)}", linestyle="--", linewidth=0.9, label=name)
+    axes.set(xlabel="steps", ylabel=label)
+    axes.legend(frameon=False, fontsize=8)
+    losses.plot(steps, [row["loss"] for row in log])
+    losses.set(xlabel="steps", ylabel="loss")
+    figure.savefig(path)

@@ -1,0 +1,102 @@
+"""Pictures of a place, as taken and as north-up ground views, and where ground points lie in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.warps import source_from_view, view_from_source
+from aeromatch_cli.images import shrink_camera
+from aeromatch_cli.stages import simulate
+from aeromatch_cli.stages.common import Context
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, Level, levels_of
+from aeromatch_cli.strategies.extractors.sift import Sift
+
+# Of a patch's half side that must lie on what the picture saw.
+_SEEN_SHARE = 0.6
+SMALLEST_PX, LARGEST_PX = 3.2, 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One picture: as taken, or a ground view, made with an approximate pose. camera, pose: the true ones of the image.
+
+    sun: which light shone. pixels: with the view that they belong to.
+    """
+
+    image: str
+    pixels: ViewPixels
+    camera: Camera
+    pose: Pose
+    sun: int
+
+    @property
+    def upright(self) -> bool:
+        """Whether things keep their orientation from picture to picture."""
+        return self.pixels.view.north_up
+
+    @cached_property
+    def levels(self) -> list[Level]:
+        return levels_of(self.pixels.gray)
+
+    @cached_property
+    def _room_px(self) -> NDArray[np.float32]:
+        """(H, W) distance to what the picture did not see."""
+        gray, valid = self.pixels.gray, self.pixels.valid
+        seen = np.zeros((gray.shape[0] + 2, gray.shape[1] + 2), np.uint8)
+        seen[1:-1, 1:-1] = 1 if valid is None else valid
+        return cv2.distanceTransform(seen, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
+
+    def source_px(self, points_px: FloatArray) -> FloatArray:
+        """Stored pixels (N, 2) of the picture's own."""
+        view = self.pixels.view
+        return points_px if view.is_source else source_from_view(self.camera, view.undistorted_from_view, points_px)
+
+    def places_px(self, points_m: FloatArray) -> FloatArray:
+        """The picture's pixels (N, 2) of world points (N, 3), wherever they lie; NaN behind the camera."""
+        assert self.pose.world_rotation is not None
+        there = project(self.camera, self.pose.world_rotation, self.pose.center_m, points_m)
+        view = self.pixels.view
+        return there if view.is_source else view_from_source(self.camera, view.undistorted_from_view, there)
+
+    def shows(self, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
+        """Whether most of the patch around each point (N, 2) lies on what the picture saw."""
+        height, width = self.pixels.gray.shape
+        rounded = np.rint(np.nan_to_num(points_px, nan=-1e6))
+        inside = ((rounded >= 0) & (rounded < [width, height])).all(axis=1)
+        column, row = np.where(inside[:, None], rounded, 0).astype(np.int64).T
+        needed = _SEEN_SHARE * SUPPORT / 2.0 * np.nan_to_num(sizes_px)
+        return np.asarray(inside & (self._room_px[row, column] >= needed))
+
+    def keypoints(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Places (N, 2) and diameters (N,) of at most `count` SIFT keypoints, evenly spread."""
+        found = Sift(keypoints=count, orientation="upright")(self.camera, [self.pixels])
+        sizes = found.view_size_px.astype(np.float64)
+        fit = (sizes >= SMALLEST_PX) & (sizes <= LARGEST_PX)
+        return found.view_keypoints_px[fit].astype(np.float64), sizes[fit]
+
+
+def sights_of(
+    context: Context, cameras: Mapping[str, Camera] | None, poses: Mapping[str, Pose] | None, suns: Mapping[str, int]
+) -> list[Sight]:
+    """Every image of a block as its preset looks at it; set `simulate.source=true` for the pictures as taken, too.
+
+    cameras, poses: the true ones by name where they are not those of the block.
+    """
+    found = []
+    for image in context.block.images:
+        task = simulate.make_task(context, image)
+        pose = context.block.poses[image.image_id] if poses is None else poses[image.name]
+        own = shrink_camera(task.source.camera, task.source.scale) if cameras is None else cameras[image.name]
+        pictures: list[Any] = simulate.render(task)[0]
+        found += [Sight(image.name, picture, own, pose, suns.get(image.name, 0)) for picture in pictures]
+    return found

@@ -1,0 +1,162 @@
+"""Train the orientation network that ships with the package, by nothing but turns.
+
+Two patches of one ground point, each turned at will, are to have orientations that differ by the turn between them: the
+drawn one plus the true one between their pictures (patch_training.sources; the patches are those of
+scripts/train_descriptor.py). Place and scale are off as a detector leaves them and every patch has a light of its own.
+Nobody says what the orientation of a patch is: the network settles on what it finds again. The loss is the logarithm of
+the chance that two draws from both histograms differ by the turn.
+
+Validation knows neither the scenes nor the flights. Beside it stand SIFT's gradient histogram and, with --reference,
+OriNet, on the same patches.
+
+OUT/state.pt is kept: a killed run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it
+is the same run. Writes OUT/orientation.safetensors (float16, batch norm folded in), OUT/log.json, OUT/table.json,
+OUT/curves.png and OUT/errors.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from patch_training.data import prepare, read
+from patch_training.draws import Source, developed, drawn, sources_of
+from patch_training.runs import Run, answered, check_recipe, draw_curves, rate_at, ship
+from patch_training.turns import (
+    Orient,
+    TurnedPairs,
+    draw_distribution,
+    errors_deg,
+    gradient_peaks,
+    orinet,
+    table,
+    turned,
+    unseen_pairs,
+)
+from torch import Tensor
+
+from aeromatch_cli.nets.orientation import BINS, OrientationNet, directions
+from aeromatch_cli.nets.patches import fold
+
+# A chance below the floor counts as hopeless: two suns, or nothing to orient by.
+TOLERANCE_DEG, FLOOR = 7.0, 0.02
+# Small view angles first.
+HARDNESS = (-1.0, 0.5)
+REPORT_EVERY, SAVE_EVERY = 200, 50  # steps
+GROUPS = 4
+OF_RUN = ("patches", "blocks", "groups", "real", "seed", "steps", "batch", "rate")
+EACH = 1500  # validation pairs of a set
+PEER = "OriNet.pth"
+
+
+def turn_loss(first: Tensor, second: Tensor, turn_deg: Tensor) -> Tensor:
+    """Of logarithms of histograms (N, 36) and the turn (N,) by which the second's orientation is to exceed the first's.
+
+    The chance that an orientation drawn from the one and one drawn from the other differ by the turn, give or take
+    TOLERANCE_DEG; its logarithm over a floor.
+    """
+    spectra = (torch.fft.rfft(side.exp(), dim=1) for side in (first, second))
+    along, other = spectra
+    differences = torch.fft.irfft(along.conj() * other, n=BINS, dim=1)  # (N, 36) chances of 0, 10, ... 350 degrees
+    steps = torch.arange(BINS) * (360.0 / BINS)
+    off = torch.deg2rad(steps - turn_deg[:, None])
+    near = torch.exp((torch.cos(off) - 1.0) / np.deg2rad(TOLERANCE_DEG) ** 2)
+    return -torch.log((differences * near).sum(dim=1).clamp(min=0.0) + FLOOR).mean()
+
+
+def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Namespace) -> None:
+    """To the end, or until --minutes are over."""
+    weights = np.array([source.weight for source in known])
+    started, losses = time.monotonic(), []
+    while run.step < args.steps:
+        rng = np.random.default_rng([run.step, 11, args.seed])
+        hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * run.step / args.steps
+        chosen = rng.choice(len(known), GROUPS, p=weights / weights.sum())
+        sides = [turned(drawn(known[i], args.batch // GROUPS, hardness, rng), rng) for i in chosen]
+        first, second = (torch.cat([developed(side[i], rng) for side in sides]) for i in (0, 1))
+        turn = torch.from_numpy(np.concatenate([side[2] for side in sides])).float()
+        run.network.train()
+        both = answered(run.network.scores, torch.stack([first, second], dim=1).flatten(0, 1)).view(len(first), 2, BINS)
+        loss = turn_loss(both[:, 0], both[:, 1], turn)
+        run.learn(loss, rate_at(run.step, args.steps, args.rate))
+        losses.append(float(loss.detach()))
+        if run.step % REPORT_EVERY == 0 or run.step == args.steps:
+            minutes = round((time.monotonic() - started) / 60.0, 1)
+            row = {"step": run.step, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
+            run.log.append(row | {"unseen": table(oriented_by(run), quick)["all"]})
+            print(json.dumps(run.log[-1]), flush=True)
+            losses = []
+        over = args.minutes and time.monotonic() - started > 60.0 * args.minutes
+        if over or run.step % SAVE_EVERY == 0 or run.step == args.steps:
+            run.save(args.out / "state.pt")
+        if over:
+            return
+
+
+def oriented_by(run: Run) -> Orient:
+    """The averaged network as it is used, in bfloat16."""
+    network = fold(run.average.eval(), OrientationNet(folded=True)).to(torch.bfloat16)
+    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def orient(patches: Any) -> Any:
+        found = directions(patches, network)
+        return np.rad2deg(np.arctan2(found[:, 1], found[:, 0]))
+
+    return orient
+
+
+def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) -> dict[str, Any]:
+    """OUT/table.json and OUT/errors.png: every estimator on the same patches."""
+    ways: dict[str, Orient] = {"ours": oriented_by(run), "gradient histogram": gradient_peaks}
+    if reference is not None:
+        content = torch.load(reference / PEER, map_location="cpu", weights_only=True)
+        ways["OriNet"] = orinet(content.get("state_dict", content))
+    found = {name: table(way, unseen) for name, way in ways.items()}
+    (out / "table.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    draw_distribution({name: errors_deg(way, unseen) for name, way in ways.items()}, out / "errors.png")
+    for row in found["ours"]:
+        print(row, {name: list(rows[row].values()) for name, rows in found.items()}, flush=True)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
+    add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
+    add("--reference", type=Path, help="folder of other networks' weights, to compare with")
+    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
+    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
+    add("--groups", type=int, default=1600, help="groups of homography views, a multiple of 40")
+    add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
+    add("--seed", type=int, default=0)
+    add("--steps", type=int, default=6000)
+    add("--batch", type=int, default=128, help="pairs of a step")
+    add("--rate", type=float, default=3e-3, help="largest learning rate")
+    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
+    add("--out", type=Path, required=True)
+    args = parser.parse_args()
+    args.patches, args.rendered = args.patches or args.out / "data", args.rendered or args.out / "blocks"
+    torch.set_num_threads(args.jobs)
+    check_recipe(parser, args, OF_RUN)
+    prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
+    unseen = read(args.patches / "unseen")
+    run = Run.begin(args.out / "state.pt", OrientationNet, args.rate, args.seed)
+    train(run, sources_of(read(args.patches / "known")), unseen_pairs(unseen, EACH // 5), args)
+    ship(fold(run.average.eval(), OrientationNet(folded=True)), args.out / "orientation.safetensors")
+    (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
+    found = compare(run, unseen_pairs(unseen, EACH), args.out, args.reference)
+    names = [name for name in found["ours"]["all"] if name.startswith("within")]
+    values = {name: [row["unseen"][name] for row in run.log] for name in names}
+    lines = {f"{way}, {name}": rows["all"][name] for way, rows in found.items() for name in names if way != "ours"}
+    draw_curves(run.log, values, lines, "share of unseen pairs within 10 and 20 degrees", args.out / "curves.png")
+
+
+if __name__ == "__main__":
+    main()
