@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.nets.weights import read_tensors
 
 SIDE_PX = 32
 # Patches at once: what a layer answers to so many stays in a core's cache.
-BATCH = 128
+BATCH = 64
 _MAX_NAMED = 3
 Precision = Literal["auto", "float32", "bfloat16"]
 Network = TypeVar("Network", bound=nn.Module)
@@ -94,11 +95,6 @@ def load_folded(network: Network, path: Path, precision: Precision = "auto") -> 
     kind = torch.bfloat16 if precision == "bfloat16" or native else torch.float32
     network = network.to(dtype=kind).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.eval().requires_grad_(False)
-
-
-def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16 itself; emulated it is slower than float32."""
-    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
 
 
 @torch.inference_mode()

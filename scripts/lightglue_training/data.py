@@ -31,7 +31,7 @@ def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[s
     for folder in ("stage1", "stage2", "unseen1", "unseen2"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     blocks = range(args.blocks)
-    folders = _map(partial(render, args.rendered), list(blocks), args.jobs)
+    folders = mapped(partial(render, args.rendered), list(blocks), args.jobs)
     known = [folder for index, folder in enumerate(folders) if index not in LEFT_OUT]
     left = [folders[index] for index in LEFT_OUT]
     real, other = (pictures(data / name for name in names) for names in (trained_on, unseen))
@@ -46,7 +46,7 @@ def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[s
     for name, group in (("stage2", known), ("unseen2", left)):
         paths = ((out / name / f"{folder.name}.npz", folder) for folder in group)
         jobs += [partial(write_block, path, partial(block_pairs, folder)) for path, folder in paths]
-    _map(_call, jobs, args.jobs)
+    mapped(_call, jobs, args.jobs)
 
 
 def _call(job: Callable[[], None]) -> None:
@@ -54,7 +54,7 @@ def _call(job: Callable[[], None]) -> None:
     job()
 
 
-def _map(function: Callable[[Any], Any], items: list[Any], jobs: int) -> list[Any]:
+def mapped(function: Callable[[Any], Any], items: list[Any], jobs: int) -> list[Any]:
     if jobs == 1:
         return [function(item) for item in items]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -80,7 +80,7 @@ def write_groups(path: Path, chosen: list[Path], first: int, count: int) -> None
         for a, b in combinations(range(len(group.views)), 2):
             truth = group.truth(a, b)
             arrays |= {f"{number}.{a}{b}.of0": truth.of0, f"{number}.{a}{b}.of1": truth.of1}
-    _save(path, arrays)
+    save_arrays(path, arrays)
 
 
 def write_block(path: Path, pairs: Callable[[], list[Pair]]) -> None:
@@ -97,10 +97,10 @@ def write_block(path: Path, pairs: Callable[[], list[Pair]]) -> None:
         arrays |= {f"pair.{number}.of0": pair.truth.of0, f"pair.{number}.of1": pair.truth.of1}
     for index, side in sides.values():
         arrays |= {f"side.{index}.{name}": value for name, value in side.arrays().items()}
-    _save(path, arrays)
+    save_arrays(path, arrays)
 
 
-def _save(path: Path, arrays: dict[str, Any]) -> None:
+def save_arrays(path: Path, arrays: dict[str, Any]) -> None:
     partly = path.with_suffix(".partly")  # no .npz: a killed run's is never read
     with partly.open("wb") as stream:
         np.savez(stream, **arrays)

@@ -50,12 +50,12 @@ def _moved(matrix: Array, points_px: Array) -> Array:
 def make_group(paths: list[Path], seed: int) -> Group:
     """Group number `seed`; the same for the same list of pictures."""
     rng = np.random.default_rng([seed, 5])
-    base = _base(read_pixels(paths[int(rng.integers(len(paths)))], colour=False), rng)
+    base = base_of(read_pixels(paths[int(rng.integers(len(paths)))], colour=False), rng)
     free = rng.random() < 0.5
     extractor = Sift(keypoints=KEYPOINTS, orientation="gradient" if free else "upright")
     views, matrices = [], []
     for _ in range(VIEWS):
-        matrix = _homography(base.shape[::-1], free, rng)
+        matrix = random_homography(base.shape[::-1], free, rng)
         gray = cv2.warpPerspective(base, matrix, SIZE_PX, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
         seen_px = cv2.warpPerspective(np.full(base.shape, 255, np.uint8), matrix, SIZE_PX) > 254
         gray = developed(gray, rng)
@@ -66,7 +66,7 @@ def make_group(paths: list[Path], seed: int) -> Group:
     return Group(tuple(views), np.stack(matrices))
 
 
-def _base(gray: Array, rng: np.random.Generator) -> Array:
+def base_of(gray: Array, rng: np.random.Generator) -> Array:
     """A random square of a picture, at most 1000 pixels wide."""
     if gray.dtype != np.uint8:
         gray = cv2.convertScaleAbs(gray, alpha=255.0 / max(1.0, float(np.percentile(gray, 99.5))))
@@ -77,7 +77,7 @@ def _base(gray: Array, rng: np.random.Generator) -> Array:
     return cv2.resize(base, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else base
 
 
-def _homography(base_px: tuple[int, int], free: bool, rng: np.random.Generator) -> Array:
+def random_homography(base_px: tuple[int, int], free: bool, rng: np.random.Generator) -> Array:
     """Base pixel -> view pixel: any turn (or a small one), scale within a factor of 1.41 of its mean, perspective."""
     width, height = SIZE_PX
     turn = rng.uniform(-np.pi, np.pi) if free else np.deg2rad(rng.normal(0.0, 5.0))

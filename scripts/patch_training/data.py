@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lightglue_training.data import _map, _save, pictures
+from lightglue_training.data import mapped, pictures, save_arrays
 from training_blocks import LEFT_OUT, render
 
 from patch_training import sources
@@ -38,7 +38,7 @@ def prepare(out: Path, rendered: Path, real: Path, names: Sequence[str], args: A
     jobs.append(partial(_write, out / "unseen", partial(_unseen_groups, rendered), "homographies"))
     for index in numbers(args.blocks):
         jobs.append(partial(_write, out / "known", partial(_rendered, rendered, index), f"block-{index}"))
-    _map(_call, jobs, args.jobs)
+    mapped(_call, jobs, args.jobs)
 
 
 def numbers(text: str) -> list[int]:
@@ -81,7 +81,7 @@ def _write(folder: Path, make: Callable[[], Mapping[str, Tracks]], name: str) ->
     if done.is_file():
         return
     for kind, tracks in make().items():
-        _save(folder / f"{name}.{kind}.npz", vars(tracks))
+        save_arrays(folder / f"{name}.{kind}.npz", vars(tracks))
     done.touch()
 
 

@@ -23,21 +23,15 @@ from aeromatch_cli.strategies.extractors.sift import Sift
 
 # Of a patch's half side that must lie on what the picture saw.
 _SEEN_SHARE = 0.6
-SMALLEST_PX, LARGEST_PX = 3.2, 40.0
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """One picture: as taken, or a ground view, made with an approximate pose. camera, pose: the true ones of the image.
+class Picture:
+    """What was seen, and the camera of the image that it was made of. light: pictures of another number had another."""
 
-    sun: which light shone. pixels: with the view that they belong to.
-    """
-
-    image: str
     pixels: ViewPixels
     camera: Camera
-    pose: Pose
-    sun: int
+    light: int
 
     @property
     def upright(self) -> bool:
@@ -56,18 +50,6 @@ class Sight:
         seen[1:-1, 1:-1] = 1 if valid is None else valid
         return cv2.distanceTransform(seen, cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
 
-    def source_px(self, points_px: FloatArray) -> FloatArray:
-        """Stored pixels (N, 2) of the picture's own."""
-        view = self.pixels.view
-        return points_px if view.is_source else source_from_view(self.camera, view.undistorted_from_view, points_px)
-
-    def places_px(self, points_m: FloatArray) -> FloatArray:
-        """The picture's pixels (N, 2) of world points (N, 3), wherever they lie; NaN behind the camera."""
-        assert self.pose.world_rotation is not None
-        there = project(self.camera, self.pose.world_rotation, self.pose.center_m, points_m)
-        view = self.pixels.view
-        return there if view.is_source else view_from_source(self.camera, view.undistorted_from_view, there)
-
     def shows(self, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
         """Whether most of the patch around each point (N, 2) lies on what the picture saw."""
         height, width = self.pixels.gray.shape
@@ -80,9 +62,27 @@ class Sight:
     def keypoints(self, count: int) -> tuple[FloatArray, FloatArray]:
         """Places (N, 2) and diameters (N,) of at most `count` SIFT keypoints, evenly spread."""
         found = Sift(keypoints=count, orientation="upright")(self.camera, [self.pixels])
-        sizes = found.view_size_px.astype(np.float64)
-        fit = (sizes >= SMALLEST_PX) & (sizes <= LARGEST_PX)
-        return found.view_keypoints_px[fit].astype(np.float64), sizes[fit]
+        return found.view_keypoints_px.astype(np.float64), found.view_size_px.astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight(Picture):
+    """A picture of a known place: as taken, or a ground view, made with an approximate pose. pose: the true one."""
+
+    image: str
+    pose: Pose
+
+    def source_px(self, points_px: FloatArray) -> FloatArray:
+        """Stored pixels (N, 2) of the picture's own."""
+        view = self.pixels.view
+        return points_px if view.is_source else source_from_view(self.camera, view.undistorted_from_view, points_px)
+
+    def places_px(self, points_m: FloatArray) -> FloatArray:
+        """The picture's pixels (N, 2) of world points (N, 3), wherever they lie; NaN behind the camera."""
+        assert self.pose.world_rotation is not None
+        there = project(self.camera, self.pose.world_rotation, self.pose.center_m, points_m)
+        view = self.pixels.view
+        return there if view.is_source else view_from_source(self.camera, view.undistorted_from_view, there)
 
 
 def sights_of(
@@ -98,5 +98,5 @@ def sights_of(
         pose = context.block.poses[image.image_id] if poses is None else poses[image.name]
         own = shrink_camera(task.source.camera, task.source.scale) if cameras is None else cameras[image.name]
         pictures: list[Any] = simulate.render(task)[0]
-        found += [Sight(image.name, picture, own, pose, suns.get(image.name, 0)) for picture in pictures]
+        found += [Sight(picture, own, suns.get(image.name, 0), image.name, pose) for picture in pictures]
     return found

@@ -12,19 +12,19 @@ from lightglue_training import homographies
 from lightglue_training.blocks import prepared
 
 from aeromatch_cli.config import load
-from aeromatch_cli.data import BoolArray, FloatArray, View
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
 from aeromatch_cli.images import read_pixels
 from aeromatch_cli.stages import pairs
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT
-from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.synthetic import load_truth
 from aeromatch_cli.synthetic.truth import Truth
-from patch_training.sights import SMALLEST_PX, Sight, sights_of
-from patch_training.tracks import MARGIN, STORED_PX, Look, Spots, Tracks, cut, tracks_of
+from patch_training.sights import Picture, Sight, sights_of
+from patch_training.tracks import MARGIN, STORED_PX, Look, Spots, Tracks, assembled, part, tracks_of
 
+SMALLEST_PX, LARGEST_PX = 3.2, 40.0
 KEYPOINTS = 700  # asked for in a picture of a rendered block
 TRACKS = 1800  # of a block and kind
 VIEWS, PER_VIEW = 3, 120  # of a homography group
@@ -32,6 +32,7 @@ REAL_SIZE_PX, REAL_TRACKS = 1600, 3500
 # Patches of a reference point that correlate less with the one that is most like the others do not show it.
 LEAST_NCC = 0.4
 _BENT = 0.35
+_CAMERA = Camera("PINHOLE", *homographies.SIZE_PX, (500.0, 500.0, 239.5, 199.5))  # of homography views; nobody asks
 
 
 def rendered(folder: Path) -> dict[str, Tracks]:
@@ -57,8 +58,10 @@ def rendered(folder: Path) -> dict[str, Tracks]:
 
 
 def _met(truth: Truth, sight: Sight, points_px: FloatArray, sizes_px: FloatArray) -> Spots:
-    """What keypoints of a sight show, tangents by differences over a quarter of their diameter; without those where the
-    surface is bent or broken there."""
+    """What keypoints of a sight show, tangents by differences over a quarter of their diameter; without very small and
+    large ones, and those where the surface is bent or broken there."""
+    fit = (sizes_px >= SMALLEST_PX) & (sizes_px <= LARGEST_PX)
+    points_px, sizes_px = points_px[fit], sizes_px[fit]
     step = 0.25 * sizes_px[:, None]
     offsets = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]
     asked = np.concatenate([points_px + step * np.array(offset) for offset in offsets])
@@ -130,12 +133,8 @@ def _agreeing(tracks: Tracks) -> Tracks:
         alike = blurred[start:end] @ blurred[start:end].T
         agrees = alike[np.argmax(alike.sum(axis=1))] >= LEAST_NCC
         keep[start:end] = agrees & (agrees.sum() > 1)
-    numbers, track = np.unique(tracks.track[keep], return_inverse=True)
-    per_patch = {
-        key: value[keep] for key, value in vars(tracks).items() if key not in ("track", "place_m", "reach_m", "scene")
-    }
-    per_track = {key: getattr(tracks, key)[numbers] for key in ("place_m", "reach_m", "scene")}
-    return Tracks(**per_patch, **per_track, track=track.astype(np.int32))
+    names = ("patches", "track", "picture", "size_px", "turn_deg", "ray", "sun")
+    return assembled([{name: getattr(tracks, name)[keep] for name in names}], tracks.place_m, tracks.reach_m)
 
 
 def homography(paths: list[Path], seed: int) -> tuple[str, Tracks] | None:
@@ -145,59 +144,33 @@ def homography(paths: list[Path], seed: int) -> tuple[str, Tracks] | None:
     and cut upright.
     """
     rng = np.random.default_rng([seed, 33])
-    base = homographies._base(read_pixels(paths[int(rng.integers(len(paths)))], colour=False), rng)
+    base = homographies.base_of(read_pixels(paths[int(rng.integers(len(paths)))], colour=False), rng)
     free = rng.random() < 0.5
     size = homographies.SIZE_PX
-    matrices = [homographies._homography(base.shape[::-1], free, rng) for _ in range(VIEWS)]
-    sights = []
-    for matrix in matrices:
+    matrices = [homographies.random_homography(base.shape[::-1], free, rng) for _ in range(VIEWS)]
+    pictures = []
+    for light, matrix in enumerate(matrices):
         gray = cv2.warpPerspective(base, matrix, size, flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
         seen = cv2.warpPerspective(np.full(base.shape, 255, np.uint8), matrix, size) > 254
         view = View("source", *size, np.eye(3), True, 0.0, north_up=not free)
-        pixels = ViewPixels(view, homographies.developed(gray, rng), seen)
-        sights.append(Sight("", pixels, None, None, len(sights)))  # type: ignore[arg-type]
-    found = Sift(keypoints=4 * PER_VIEW, orientation="upright")(None, [sights[0].pixels])  # type: ignore[arg-type]
-    sizes = found.view_size_px.astype(np.float64)
+        pictures.append(Picture(ViewPixels(view, homographies.developed(gray, rng), seen), _CAMERA, light))
+    points, sizes = pictures[0].keypoints(4 * PER_VIEW)
     rows = _spread(sizes, PER_VIEW, rng)
     rows = rows[sizes[rows] >= SMALLEST_PX]
-    if len(rows) < 2:
-        return None
-    tracks = _warped(sights, matrices, found.view_keypoints_px[rows].astype(np.float64), sizes[rows])
-    return tracks and ("source" if free else "ground", tracks)
+    tracks = _warped(pictures, matrices, points[rows], sizes[rows])
+    return ("source" if free else "ground", tracks) if len(tracks.place_m) > 1 else None
 
 
-def _warped(sights: list[Sight], matrices: list[Any], points_px: FloatArray, sizes_px: FloatArray) -> Tracks | None:
-    parts, base_px = [], apply_homography(np.linalg.inv(matrices[0]), points_px)
-    for index, (sight, matrix) in enumerate(zip(sights, matrices, strict=True)):
-        warp = matrix @ np.linalg.inv(matrices[0])
+def _warped(pictures: list[Picture], matrices: list[Any], points_px: FloatArray, sizes_px: FloatArray) -> Tracks:
+    """Tracks of places (N, 2) of the first picture; metres are pixels of the base."""
+    parts, straight = [], np.tile([0.0, 0.0, -1.0], (len(points_px), 1))
+    to_base = np.linalg.inv(matrices[0])
+    for index, (picture, matrix) in enumerate(zip(pictures, matrices, strict=True)):
+        warp = matrix @ to_base
         there = apply_homography(warp, points_px)
         seen = Look.of(there, homography_jacobians(warp, points_px, there))
-        rows = np.flatnonzero(seen.usable(sizes_px) & sight.shows(there, sizes_px * seen.scale))
-        seen = Look(*(value[rows] for value in vars(seen).values()))
-        parts.append(
-            {
-                "patches": cut(sight.levels, seen, sizes_px[rows], aligned=not sight.upright),
-                "track": rows.astype(np.int32),
-                "picture": np.full(len(rows), index, np.int32),
-                "size_px": (sizes_px[rows] * seen.scale).astype(np.float32),
-                "turn_deg": (seen.turn_deg if sight.upright else np.zeros(len(rows))).astype(np.float32),
-                "ray": np.tile(np.float32([0.0, 0.0, -1.0]), (len(rows), 1)),
-                "sun": np.full(len(rows), index, np.int8),
-            }
-        )
-    merged = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    counts = np.bincount(merged["track"], minlength=len(sizes_px))
-    keep = np.flatnonzero(counts[merged["track"]] >= 2)
-    keep = keep[np.argsort(merged["track"][keep], kind="stable")]
-    numbers, track = np.unique(merged.pop("track")[keep], return_inverse=True)
-    if len(numbers) < 2:
-        return None
-    base_scale = np.sqrt(np.abs(np.linalg.det(homography_jacobians(np.linalg.inv(matrices[0]), points_px, base_px))))
-    place = np.column_stack([base_px, np.zeros(len(base_px))])[numbers]
-    return Tracks(
-        **{key: value[keep] for key, value in merged.items()},
-        track=track.astype(np.int32),
-        place_m=place.astype(np.float32),
-        reach_m=(SUPPORT / 2.0 * sizes_px * base_scale)[numbers].astype(np.float32),
-        scene=np.zeros(len(numbers), np.int32),
-    )
+        rows = np.flatnonzero(seen.usable(sizes_px) & picture.shows(there, sizes_px * seen.scale))
+        parts.append(part(picture, seen, sizes_px, straight, rows, index))
+    base_px = apply_homography(to_base, points_px)
+    scale = np.sqrt(np.abs(np.linalg.det(homography_jacobians(to_base, points_px, base_px))))
+    return assembled(parts, np.column_stack([base_px, np.zeros(len(base_px))]), SUPPORT / 2.0 * sizes_px * scale)

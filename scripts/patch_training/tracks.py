@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.strategies.extractors.pyramid import PATCH_PX, SUPPORT, Level, cut_patches
-from patch_training.sights import Sight
+from patch_training.sights import Picture, Sight
 
 MARGIN = 1.5  # a stored patch shows so much more than a patch of 32 px, as finely
 STORED_PX = round(MARGIN * PATCH_PX)
@@ -83,6 +84,9 @@ class Look:
         largest = np.linalg.norm(np.nan_to_num(jacobians), ord=2, axis=(1, 2))
         return cls(points_px, scale, np.rad2deg(turn), largest**2 / np.where(known, determinant, np.nan))
 
+    def take(self, which: IntArray | BoolArray) -> Look:
+        return Look(*(value[which] for value in vars(self).values()))
+
     def usable(self, sizes_px: FloatArray) -> BoolArray:
         size = sizes_px * self.scale
         with np.errstate(invalid="ignore"):
@@ -125,34 +129,46 @@ def tracks_of(
         usable[index, fit] = visible(sight, spots.points_m[fit])
         looks.append(seen)
     chosen = _chosen(usable, origins, rng)
-    rows = [np.flatnonzero(chosen[index]) for index in range(len(sights))]
-    parts = [_part(sight, looks[i], spots, rows[i], i) for i, sight in enumerate(sights)]
-    merged = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    parts = []
+    for index, sight in enumerate(sights):
+        rays = spots.points_m - sight.pose.center_m
+        parts.append(part(sight, looks[index], spots.sizes_px, rays, np.flatnonzero(chosen[index]), index))
+    pixel_m = np.sqrt(np.linalg.norm(np.cross(spots.tangents_m[:, :, 0], spots.tangents_m[:, :, 1]), axis=1))
+    return assembled(parts, spots.points_m, SUPPORT / 2.0 * spots.sizes_px * pixel_m)
+
+
+def part(
+    picture: Picture, seen: Look, sizes_px: FloatArray, rays: FloatArray, rows: IntArray, index: int
+) -> dict[str, NDArray[Any]]:
+    """What Tracks keeps of some rows of N places in picture number `index`, tracks numbered by row.
+
+    sizes_px: (N,) where they were found. rays: (N, 3) from the camera, of any length.
+    """
+    seen, upright = seen.take(rows), picture.upright
+    return {
+        "patches": cut(picture.levels, seen, sizes_px[rows], aligned=not upright),
+        "track": rows.astype(np.int32),
+        "picture": np.full(len(rows), index, np.int32),
+        "size_px": (sizes_px[rows] * seen.scale).astype(np.float32),
+        "turn_deg": (seen.turn_deg if upright else np.zeros(len(rows))).astype(np.float32),
+        "ray": (rays[rows] / np.linalg.norm(rays[rows], axis=1, keepdims=True)).astype(np.float32),
+        "sun": np.full(len(rows), picture.light, np.int8),
+    }
+
+
+def assembled(parts: Sequence[dict[str, NDArray[Any]]], places_m: FloatArray, reach_m: FloatArray) -> Tracks:
+    """Tracks of one scene, those of fewer than LEAST patches left out. places_m: (N, 3), reach_m: (N,)."""
+    merged = {key: np.concatenate([one[key] for one in parts]) for key in parts[0]}
     order = np.argsort(merged["track"], kind="stable")
+    order = order[np.bincount(merged["track"], minlength=1)[merged["track"][order]] >= LEAST]
     numbers, track = np.unique(merged.pop("track")[order], return_inverse=True)
-    kept = spots.take(numbers)
-    pixel_m = np.sqrt(np.linalg.norm(np.cross(kept.tangents_m[:, :, 0], kept.tangents_m[:, :, 1]), axis=1))
     return Tracks(
         **{key: value[order] for key, value in merged.items()},
         track=track.astype(np.int32),
-        place_m=kept.points_m.astype(np.float32),
-        reach_m=(SUPPORT / 2.0 * kept.sizes_px * pixel_m).astype(np.float32),
+        place_m=places_m[numbers].astype(np.float32),
+        reach_m=reach_m[numbers].astype(np.float32),
         scene=np.zeros(len(numbers), np.int32),
     )
-
-
-def _part(sight: Sight, seen: Look, spots: Spots, rows: IntArray, index: int) -> dict[str, NDArray[np.generic]]:
-    seen = Look(*(value[rows] for value in vars(seen).values()))
-    rays = spots.points_m[rows] - sight.pose.center_m
-    return {
-        "patches": cut(sight.levels, seen, spots.sizes_px[rows], aligned=not sight.upright),
-        "track": rows.astype(np.int32),
-        "picture": np.full(len(rows), index, np.int32),
-        "size_px": (spots.sizes_px[rows] * seen.scale).astype(np.float32),
-        "turn_deg": (seen.turn_deg if sight.upright else np.zeros(len(rows))).astype(np.float32),
-        "ray": (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32),
-        "sun": np.full(len(rows), sight.sun, np.int8),
-    }
 
 
 def _chosen(usable: BoolArray, origins: IntArray, rng: np.random.Generator) -> BoolArray:
