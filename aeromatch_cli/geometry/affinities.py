@@ -89,7 +89,7 @@ def _best_affinity(move0: FloatArray, move1: FloatArray, threshold_px: float) ->
 
 
 def fit_affinities(points0: FloatArray, points1: FloatArray, around: IntArray, weights: FloatArray) -> FloatArray:
-    """(M, 2, 3) affinities, x1 = A (x0, 1), fitted by least squares to each match and its weighted neighbours (M, n)."""
+    """(M, 2, 3) affinities, x1 = A (x0, 1), by least squares on each match and its weighted neighbours (M, n)."""
     which = np.column_stack([np.arange(len(around)), around])
     weights = np.concatenate([np.ones((len(which), 1)), weights], axis=1)
     origin0, origin1 = points0[which[:, 0]], points1[which[:, 0]]
