@@ -13,8 +13,9 @@ answer, right within 3 px of its partner; area below precision over recall of th
 first to second distance (or of the distance), mean over pairs. Right: share of the corresponding keypoints whose
 nearest neighbour is right.
 
-Writes OUT/results.json and OUT/table.md; OUT/scenes keeps rendered blocks. Descriptors are named NAME, or LABEL=NAME,
-or LABEL=ours:FILE for other weights of this project's own.
+Writes OUT/results.json row by row and OUT/table.md; OUT/scenes keeps rendered blocks and all figures: what depends on
+nothing that changed is not made again, so that a killed run goes on where it was. Descriptors are named NAME, or
+LABEL=NAME, or LABEL=ours:FILE for other weights of this project's own.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ import argparse
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from common import write_readme
 from keypoint_bench.blocks import Asked, blocks
 from keypoint_bench.correspondence import Partners, in_overlap, of_one_size, partners
 from keypoint_bench.descriptors import DESCRIBERS, Describer, Side, make_side, strongest_sift
+from keypoint_bench.figures import Store
 from keypoint_bench.metrics import distances, false_positive_rate, nearest_neighbours
 from keypoint_bench.named import Named, make, named, without_paths
 from keypoint_bench.pictures import GROUND, Pictures
@@ -123,42 +126,47 @@ def descriptor_row(describer: Describer, task: Task) -> Row:
 
 
 def rows_of(
-    judged: Judged, truth: RenderedTruth, describers: dict[Named, Describer], args: argparse.Namespace
+    judged: Judged,
+    truth: RenderedTruth,
+    describers: dict[Named, Describer],
+    args: argparse.Namespace,
+    store: Store,
 ) -> Iterator[Row]:
     """One row for each descriptor and pair of a block."""
     with tempfile.TemporaryDirectory() as scratch:
         pictures = Pictures(judged.scene, Path(scratch))
         for pair in judged.pairs:
-            rng = np.random.default_rng([args.seed, stable_hash(" ".join(pair.images)) % (1 << 32)])
-            task = make_task(truth, pictures, pair, args.keypoints, rng, upright=args.angles == "upright")
-            if not (task.partner >= 0).any():
-                continue
+
+            @cache
+            def task(pair: JudgedPair = pair) -> Task:
+                rng = np.random.default_rng([args.seed, stable_hash(" ".join(pair.images)) % (1 << 32)])
+                return make_task(truth, pictures, pair, args.keypoints, rng, upright=args.angles == "upright")
+
             suns = {truth.truth.sorties[name] for name in pair.images}
+            light = {"suns": "one" if len(suns) == 1 else "two"}
             for method, describer in describers.items():
-                yield {
-                    "section": "descriptor",
-                    "method": method.label,
-                    "scene": judged.scene.name,
-                    "pair": " ".join(pair.images),
-                    "view_angle_deg": round(pair.conditions.view_angle_deg, 3),
-                    "suns": "one" if len(suns) == 1 else "two",
-                    **descriptor_row(describer, task),
-                }
+
+                def made(describer: Describer = describer, task: Callable[[], Task] = task) -> Row:
+                    return descriptor_row(describer, task())
+
+                yield store.row(judged, pair, "descriptor", GROUND, method, made) | light
 
 
 def run(args: argparse.Namespace) -> list[Row]:
-    """All rows, written block by block."""
+    """All rows, written as they come."""
     width, _, height = args.size.partition("x")
     options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
     describers = {method: make(DESCRIBERS, method, options) for method in named(args.descriptors, DESCRIBERS)}
+    store = Store(args.out / "scenes" / "figures", [args.keypoints, args.angles, args.seed])
     rows: list[Row] = []
     for flight in args.flights.split(","):
         asked = Asked(
             tuple(args.scenes.split(",")), flight, (int(width), int(height)), args.images, args.pairs, args.seed
         )
         for judged, truth in blocks(args.out, asked):
-            rows += ({"flight": flight} | row for row in rows_of(judged, truth, describers, args))
-            write_rows(args.out / "results.json", rows)
+            for row in rows_of(judged, truth, describers, args, store):
+                rows.append(row | {"flight": flight})
+                write_rows(args.out / "results.json", rows)
             print(f"{judged.scene.name}, {flight}: {len(judged.pairs)} pairs", file=sys.stderr, flush=True)
     return rows
 

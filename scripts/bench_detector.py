@@ -10,8 +10,9 @@ Angles: SIFT keypoints of both pictures that are one place within 3 px at one si
 difference of both angles less the true turn between the pictures at that place. Where SIFT gives a place several
 angles, those that agree best count.
 
-Writes OUT/results.json and OUT/table.md; OUT/scenes keeps rendered blocks. Detectors and networks of angles are named
-NAME, or LABEL=NAME, or LABEL=ours:FILE for other weights of this project's own.
+Writes OUT/results.json row by row and OUT/table.md; OUT/scenes keeps rendered blocks and all figures: what depends on
+nothing that changed is not made again, so that a killed run goes on where it was. Detectors and networks of angles are
+named NAME, or LABEL=NAME, or LABEL=ours:FILE for other weights of this project's own.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ import argparse
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +33,16 @@ from common import write_readme
 from keypoint_bench.blocks import Asked, blocks
 from keypoint_bench.correspondence import in_overlap, partners
 from keypoint_bench.detectors import DETECTORS, Detector, Keypoints
+from keypoint_bench.figures import Store
 from keypoint_bench.named import Named, make, named, without_paths
-from keypoint_bench.orientations import ORIENTERS, disagreement_deg, orientation_row, turned_keypoints
+from keypoint_bench.orientations import (
+    ORIENTERS,
+    Orienter,
+    Turned,
+    disagreement_deg,
+    orientation_row,
+    turned_keypoints,
+)
 from keypoint_bench.pictures import GROUND, SOURCE, Picture, Pictures
 from keypoint_bench.tables import detector_table, orientation_table
 from methods.base import Options
@@ -46,6 +58,14 @@ Row = dict[str, Any]
 MOST = 10_000
 FULL = {"scenes": "city,suburb,hills,farmland", "pairs": 12, "size": "1000x750", "images": 24, "keypoints": 1000}
 QUICK = {"scenes": "suburb", "pairs": 4, "size": "480x360", "images": 10, "keypoints": 200}
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """keypoints: of either side of a pair. store: of figures."""
+
+    keypoints: int
+    store: Store
 
 
 def shared_keypoints(
@@ -75,49 +95,47 @@ def detector_row(
     }
 
 
-def facts(judged: Judged, pair: JudgedPair, section: str, frame: str, method: Named) -> Row:
-    """What every row begins with."""
-    return {
-        "section": section,
-        "method": method.label,
-        "frame": frame,
-        "scene": judged.scene.name,
-        "pair": " ".join(pair.images),
-        "view_angle_deg": round(pair.conditions.view_angle_deg, 3),
-        "overlap": round(pair.conditions.overlap, 4),
-    }
-
-
 def detector_rows(
-    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Detector], count: int
+    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Detector], task: Task
 ) -> Iterator[Row]:
     """One row for each detector, frame and pair of a block."""
     for frame in (SOURCE, GROUND):
         for method, detector in methods.items():
-            found = {name: detector(pictures(name, frame), MOST) for name in images_of(judged)}
+
+            @cache
+            def found(name: str, frame: str = frame, detector: Detector = detector) -> Keypoints:
+                return detector(pictures(name, frame), MOST)
+
             for pair in judged.pairs:
-                both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
-                sides = found[pair.images[0]], found[pair.images[1]]
-                row = facts(judged, pair, "detector", frame, method)
-                yield row | detector_row(truth, sides, both, count)
+
+                def made(pair: JudgedPair = pair, frame: str = frame, found: Callable[[str], Keypoints] = found) -> Row:
+                    both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
+                    return detector_row(truth, (found(pair.images[0]), found(pair.images[1])), both, task.keypoints)
+
+                yield task.store.row(judged, pair, "detector", frame, method, made)
 
 
 def orientation_rows(
-    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Any], count: int
+    judged: Judged, truth: RenderedTruth, pictures: Pictures, methods: dict[Named, Orienter], task: Task
 ) -> Iterator[Row]:
     """One row for each network of angles, frame and pair of a block."""
     for frame in (SOURCE, GROUND):
         for pair in judged.pairs:
-            both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
-            sides, turn = turned_keypoints(truth, both, MOST, 2 * count)
+
+            @cache
+            def shared(pair: JudgedPair = pair, frame: str = frame) -> Turned:
+                both = pictures(pair.images[0], frame), pictures(pair.images[1], frame)
+                return turned_keypoints(truth, both, MOST, 2 * task.keypoints)
+
             for method, orienter in methods.items():
-                angles = [orienter(picture, side) for picture, side in zip(both, sides, strict=True)]
-                row = facts(judged, pair, "orientation", frame, method)
-                yield row | orientation_row(disagreement_deg(angles[0], angles[1], turn))
 
+                def made(orienter: Orienter = orienter, shared: Callable[[], Turned] = shared) -> Row:
+                    turned = shared()
+                    sides = zip(turned.pictures, turned.keypoints, strict=True)
+                    angles0, angles1 = (orienter(picture, side) for picture, side in sides)
+                    return orientation_row(disagreement_deg(angles0, angles1, turned.turn_deg))
 
-def images_of(judged: Judged) -> list[str]:
-    return sorted({name for pair in judged.pairs for name in pair.images})
+                yield task.store.row(judged, pair, "orientation", frame, method, made)
 
 
 def run(args: argparse.Namespace) -> list[Row]:
@@ -129,16 +147,17 @@ def run(args: argparse.Namespace) -> list[Row]:
     options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
     detectors = {method: make(DETECTORS, method, options) for method in named(args.detectors, DETECTORS)}
     orienters = {method: make(ORIENTERS, method, options) for method in named(args.orienters, ORIENTERS)}
+    task = Task(args.keypoints, Store(args.out / "scenes" / "figures", args.keypoints))
     rows: list[Row] = []
     for judged, truth in blocks(args.out, asked):
-        if not judged.pairs:
-            continue
         with tempfile.TemporaryDirectory() as scratch:
             pictures = Pictures(judged.scene, Path(scratch))
-            rows += detector_rows(judged, truth, pictures, detectors, args.keypoints)
-            write_rows(args.out / "results.json", rows)
-            rows += orientation_rows(judged, truth, pictures, orienters, args.keypoints)
-            write_rows(args.out / "results.json", rows)
+            for row in chain(
+                detector_rows(judged, truth, pictures, detectors, task),
+                orientation_rows(judged, truth, pictures, orienters, task),
+            ):
+                rows.append(row)
+                write_rows(args.out / "results.json", rows)
         print(f"{judged.scene.name}: {len(judged.pairs)} pairs", file=sys.stderr, flush=True)
     return rows
 

@@ -137,10 +137,12 @@ def test_sift_is_found_again_and_its_angles_agree(rendered: Path, tmp_path: Path
     assert 0.3 < row["repeated_3px"] / 150 <= 1.0
     assert 0.2 < row["repeated_1px"] / row["repeated_3px"] < 1.0
     assert 0.05 < row["error_px"] < 1.5
-    shared, turn = orientations.turned_keypoints(truth, pictures, 5000, 300)
-    assert len(turn) > 30
-    angles = [orientations.OfSift(None)(picture, side) for picture, side in zip(pictures, shared, strict=True)]
-    errors = orientations.disagreement_deg(*angles, turn)
+    turned = orientations.turned_keypoints(truth, pictures, 5000, 300)
+    assert len(turned.turn_deg) > 30
+    angles = [
+        orientations.OfSift(None)(picture, side) for picture, side in zip(pictures, turned.keypoints, strict=True)
+    ]
+    errors = orientations.disagreement_deg(*angles, turned.turn_deg)
     assert np.median(np.abs(errors)) < 10.0
 
 
@@ -201,6 +203,26 @@ def test_names_may_have_labels_and_weights(tmp_path: Path) -> None:
             named.named(wrong, {"sift": None, "ours": None})
     with pytest.raises(ConfigError, match="not found"):
         named.make({"ours": lambda _options, weights: weights}, found[2], None)
+
+
+def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
+    figures, named = module("figures"), module("named")
+    judged = SimpleNamespace(key="k", scene=SimpleNamespace(name="city"))
+    pair = SimpleNamespace(images=("a", "b"), conditions=SimpleNamespace(view_angle_deg=41.0, overlap=0.5))
+    made = []
+
+    def make() -> dict[str, Any]:
+        made.append(1)
+        return {"figure": len(made)}
+
+    def row(settings: int, method: str) -> Any:
+        one = named.Named(method, method, None)
+        return figures.Store(tmp_path, settings).row(judged, pair, "detector", "ground", one, make)
+
+    first = row(1, "sift")
+    assert (first["figure"], first["pair"], first["view_angle_deg"]) == (1, "a b", 41.0)
+    assert row(1, "sift") == first
+    assert [row(2, "sift")["figure"], row(1, "ours")["figure"]] == [2, 3]
 
 
 def test_tables_sum_pairs_and_put_large_angles_together() -> None:

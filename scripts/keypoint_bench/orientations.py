@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -95,10 +96,17 @@ def upright_patches(picture: Picture, keypoints: Keypoints) -> NDArray[np.uint8]
     return cut_patches(levels_of(picture.gray), keypoints.points_px, keypoints.sizes_px, np.zeros(count))
 
 
-def turned_keypoints(
-    truth: RenderedTruth, pictures: tuple[Picture, Picture], most: int, shown: int
-) -> tuple[tuple[Keypoints, Keypoints], FloatArray]:
-    """SIFT keypoints of both pictures that are one place at one size, and the turn (N,) from the first to the second.
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """Keypoints (N) of two pictures that are one place at one size, and the turn (N,) from the first to the second."""
+
+    pictures: tuple[Picture, Picture]
+    keypoints: tuple[Keypoints, Keypoints]
+    turn_deg: FloatArray
+
+
+def turned_keypoints(truth: RenderedTruth, pictures: tuple[Picture, Picture], most: int, shown: int) -> Turned:
+    """Of SIFT.
 
     most: keypoints of a picture; shown: the strongest of them in the overlap.
     """
@@ -110,7 +118,7 @@ def turned_keypoints(
     stored = [picture.stored_px(side.points_px) for picture, side in zip(pictures, sides, strict=True)]
     found = partners(truth, pictures[0].image, stored[0], pictures[1].image, stored[1])
     found, turn = of_one_size(truth, pictures, (sides[0], sides[1]), found)
-    return (sides[0].take(found.rows0), sides[1].take(found.rows1)), turn
+    return Turned(pictures, (sides[0].take(found.rows0), sides[1].take(found.rows1)), turn)
 
 
 def disagreement_deg(angles0: FloatArray, angles1: FloatArray, turn_deg: FloatArray) -> FloatArray:
