@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
 
-EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift, "lattice": Lattice}
+EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift, "lattice": Lattice, "learned": Learned}

@@ -1,0 +1,79 @@
+"""Descriptors of a view with what is around them, and how they are stored."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.strategies.extractors.detection import Raw
+
+# Descriptors of unit length as bytes: 128 and so many steps a unit. Their distances stay what they are, to 1 %.
+_BYTE_ZERO, _BYTES_PER_UNIT = 128.0, 256.0
+
+
+def as_bytes(descriptors: FloatArray) -> NDArray[np.uint8]:
+    """Descriptors (N, C) of unit length as bytes: 128 + 256 times the value, clipped."""
+    return np.clip(np.rint(_BYTE_ZERO + _BYTES_PER_UNIT * descriptors), 0, 255).astype(np.uint8)
+
+
+def from_bytes(descriptors: NDArray[np.uint8]) -> FloatArray:
+    """What `as_bytes` was given, float32, up to rounding."""
+    return np.asarray((descriptors.astype(np.float32) - np.float32(_BYTE_ZERO)) / np.float32(_BYTES_PER_UNIT))
+
+
+def with_context(
+    descriptors: NDArray[np.float32],
+    raw: Raw,
+    gray: NDArray[np.uint8],
+    precision: Literal["auto", "float32", "bfloat16"] = "auto",
+) -> NDArray[np.float32]:
+    """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them."""
+    import torch
+
+    from aeromatch_cli.nets.context import shipped_context
+    from aeromatch_cli.nets.precision import has_bfloat16
+
+    half = precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
+        found = shipped_context()(*context_inputs(descriptors, raw, gray))
+    return np.asarray(found.float().numpy())
+
+
+def context_inputs(descriptors: NDArray[np.float32], raw: Raw, gray: NDArray[np.uint8]) -> tuple[Any, ...]:
+    """What `nets.context.Context` is asked about features (N,) of one view (H, W): tensors in its order."""
+    import cv2
+
+    from aeromatch_cli.nets.context import REDUCED
+
+    height, width = gray.shape
+    small = max(8, width // REDUCED), max(8, height // REDUCED)
+    coarse = np.asarray(cv2.resize(gray, small, interpolation=cv2.INTER_AREA), np.uint8)
+    return context_inputs_of_coarse(descriptors, raw, coarse, (width, height))
+
+
+def context_inputs_of_coarse(
+    descriptors: NDArray[np.float32], raw: Raw, coarse: NDArray[np.uint8], size_px: tuple[int, int]
+) -> tuple[Any, ...]:
+    """The same of a view of this width and height whose coarse picture is there."""
+    import torch
+    from scipy.spatial import cKDTree
+
+    from aeromatch_cli.nets.context import NEIGHBOURS, layout_of
+
+    points = raw.points_px.astype(np.float32)
+    count = min(NEIGHBOURS + 1, len(points))
+    near = np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)[:, 1:]
+    # Few keypoints: the last neighbour again, or the keypoint itself.
+    near = near if near.shape[1] else np.arange(len(points))[:, None]
+    near = np.pad(near, ((0, 0), (0, NEIGHBOURS - near.shape[1])), mode="edge")
+    places = (2.0 * points + 1.0) / np.array(size_px, np.float32) - np.float32(1.0)
+    neighbours = torch.from_numpy(near.astype(np.int64))
+    angles = torch.from_numpy(np.deg2rad(raw.orientations_deg).astype(np.float32))
+    sizes = torch.from_numpy(raw.sizes_px.astype(np.float32))
+    layout = layout_of(torch.from_numpy(points), sizes, angles, neighbours)
+    picture = torch.from_numpy(coarse.astype(np.float32) / np.float32(255.0))[None, None]
+    places_there = torch.from_numpy(places.astype(np.float32))
+    return torch.from_numpy(descriptors.astype(np.float32)), places_there, layout, neighbours, picture

@@ -1,0 +1,128 @@
+"""Learned keypoints, orientations and descriptors on every view of an image.
+
+A heat map network finds the keypoints, an orientation network turns them where a view does not have north up, GeoDesc
+describes a patch of learned place, size and turn, and a context network adds what is around it. Trained by
+scripts/train_detector.py, train_orientation.py, train_descriptor.py and train_context.py (nets/trained/*.md).
+
+Source: Deep learning feature matching of oblique images, J. Geo-inf. Sci. 2021(10), 1823-1837; Luo et al., GeoDesc,
+ECCV 2018; Tian et al., L2-Net, CVPR 2017; Luo et al., ContextDesc, CVPR 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
+from aeromatch_cli.strategies.extractors.described import Described
+from aeromatch_cli.strategies.extractors.detection import Raw
+from aeromatch_cli.strategies.extractors.heat import heat_keypoints
+from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
+from aeromatch_cli.strategies.extractors.sift import Sift
+
+# Keypoints of a view that the even spread chooses from, for each that it may keep.
+_CHOICE = 4
+
+
+class Learned(Described):
+    """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
+
+    version: ClassVar[int] = 1
+    descriptors: ClassVar[str] = "GeoDesc"
+    name: Literal["learned"] = "learned"
+    detector: Literal["network", "sift"] = Field(
+        "network", description="Maxima of heat maps over place and scale, or SIFT's keypoints."
+    )
+    orientation: Literal["auto", "network", "upright"] = Field(
+        "auto",
+        description="Turn patches as the orientation network says, or never (upright); auto is upright in views whose "
+        "axes follow the world's.",
+    )
+    context: bool = Field(False, description="Descriptors know what is around them: picture and other keypoints.")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
+        "one for shards on different processors.",
+    )
+
+    @property
+    def follows_north(self) -> bool:
+        """Upright descriptors of views with north up match no others."""
+        return self.orientation == "auto"
+
+    def fingerprint_files(self) -> tuple[str, ...]:
+        """The weights that ship, of the networks that this recipe asks. Raises ConfigError where one is missing."""
+        from aeromatch_cli.nets.weights import shipped_path
+
+        names = [name for name, asked in (("detector", self.detector == "network"), ("context", self.context)) if asked]
+        names += ["geodesc", *(["orientation"] if self.orientation != "upright" else [])]
+        return tuple(str(shipped_path(name)) for name in sorted(names))
+
+    def detected(self, view: ViewPixels, view_idx: int) -> Raw:
+        """One feature for each point, not yet turned."""
+        if self.detector == "sift":
+            return Sift(orientation="upright").detected(view, view_idx)
+        points, sizes, confidences = heat_keypoints(view.gray, _CHOICE * self.keypoints, view.valid, self._detector())
+        return Raw(
+            source_px=points,
+            source_sizes_px=sizes.astype(np.float32),
+            points_px=points.astype(np.float32),
+            sizes_px=sizes.astype(np.float32),
+            orientations_deg=np.zeros(len(points), np.float32),
+            responses=confidences.astype(np.float32),
+            octaves=np.zeros(len(points), np.int32),
+            view_idx=np.full(len(points), view_idx, np.int32),
+        )
+
+    def strengths(self, raw: Raw) -> FloatArray:
+        """The network's confidence; of SIFT's keypoints as `Sift` has it."""
+        return Sift().strengths(raw) if self.detector == "sift" else raw.responses
+
+    def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
+        """Orientations by the network, where a view needs them."""
+        from aeromatch_cli.nets.orientation import directions, load_orientation
+
+        angles = raw.orientations_deg.copy()
+        for view_idx, view in enumerate(views):
+            of_view = np.flatnonzero(raw.view_idx == view_idx)
+            upright = self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
+            if len(of_view) and not upright:
+                patches = _patches(view, raw.take(of_view))
+                cosine, sine = directions(patches, load_orientation(precision=self.precision)).T
+                angles[of_view] = np.rad2deg(np.arctan2(sine, cosine))
+        return replace(raw, orientations_deg=angles)
+
+    def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
+        """Descriptor bytes (N, 128), see `context.as_bytes`."""
+        from aeromatch_cli.nets.geodesc import describe, load_geodesc
+
+        found = np.zeros((len(raw.view_idx), self.descriptor_length), np.float32)
+        for view_idx, view in enumerate(views):
+            of_view = np.flatnonzero(raw.view_idx == view_idx)
+            if len(of_view):
+                there = raw.take(of_view)
+                plain = describe(_patches(view, there), load_geodesc(precision=self.precision))
+                found[of_view] = with_context(plain, there, view.gray, self.precision) if self.context else plain
+        return as_bytes(found)
+
+    def _detector(self) -> Any:
+        import torch
+
+        from aeromatch_cli.nets.detector import shipped_detector
+        from aeromatch_cli.nets.precision import has_bfloat16
+
+        half = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16())
+        return shipped_detector(torch.bfloat16 if half else torch.float32)
+
+
+def _patches(view: ViewPixels, raw: Raw) -> NDArray[np.uint8]:
+    """(N, 32, 32) around the features."""
+    levels = levels_of(view.gray)
+    return cut_patches(levels, raw.points_px.astype(np.float64), raw.sizes_px, raw.orientations_deg)

@@ -1,0 +1,1 @@
+"""What train_context.py learns from."""

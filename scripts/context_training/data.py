@@ -1,0 +1,116 @@
+"""Views of rendered blocks with learned keypoints, their plain descriptors and coarse pictures, and true partners.
+
+Every block is looked at twice: in north-up ground views from noisy poses, upright, and in the stored pictures, turned
+by the orientation network.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from lightglue_training.blocks import prepared
+from lightglue_training.sides import Partners, Seen, partners, seen
+from numpy.typing import NDArray
+
+from aeromatch_cli.evaluate import open_truth
+from aeromatch_cli.formats import read_features
+from aeromatch_cli.nets.context import REDUCED
+from aeromatch_cli.stages import extract, simulate
+from aeromatch_cli.synthetic import load_truth
+
+_LEARNED = ("extract=learned", "extract.context=false")
+RECIPES = (_LEARNED, (*_LEARNED, "simulate=none"))
+KEYPOINTS, LEAST_PARTNERS = 1200, 32
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSeen:
+    """seen: keypoints and descriptor bytes. coarse: (h, w) uint8, the view REDUCED times smaller."""
+
+    seen: Seen
+    coarse: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ContextPair:
+    """Two views and who is whose partner. angle_deg: between both lines of sight."""
+
+    view0: ViewSeen
+    view1: ViewSeen
+    truth: Partners
+    angle_deg: float
+
+
+def block_pairs(folder: Path, path: Path) -> list[ContextPair]:
+    """Pairs of a rendered block with partners enough, from the file `path` where it is there."""
+    if not path.is_file():
+        _write(folder, path)
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    views = [_view(arrays, number) for number in range(int(arrays["views"]))]
+    found = []
+    for number in range(int(arrays["pairs"])):
+        first, second = arrays[f"pair.{number}"]
+        truth = Partners(arrays[f"pair.{number}.of0"], arrays[f"pair.{number}.of1"])
+        found.append(ContextPair(views[first], views[second], truth, float(arrays[f"pair.{number}.angle"])))
+    return found
+
+
+def _view(arrays: dict[str, Array], number: int) -> ViewSeen:
+    fields = {name: arrays[f"view.{number}.{name}"] for name in Seen.__dataclass_fields__}
+    return ViewSeen(Seen(**fields), arrays[f"view.{number}.coarse"])
+
+
+def _write(folder: Path, path: Path) -> None:
+    truth, judge = load_truth(folder), open_truth(folder)
+    arrays: dict[str, Any] = {}
+    views = pairs = 0
+    for recipe in RECIPES:
+        numbers: dict[str, int] = {}
+        known: dict[str, Seen] = {}
+        for name, shown in _views(folder, recipe):
+            numbers[name], known[name] = views, shown.seen
+            arrays[f"view.{views}.coarse"] = shown.coarse
+            arrays |= {f"view.{views}.{key}": value for key, value in shown.seen.arrays().items()}
+            views += 1
+        for name0, name1 in combinations(sorted(known), 2):
+            side0, side1 = known[name0], known[name1]
+            there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
+            there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
+            there0[hidden0], there1[hidden1] = np.nan, np.nan
+            mates = partners(side0, side1, there0, there1)
+            if mates.count >= LEAST_PARTNERS:
+                arrays[f"pair.{pairs}"] = np.array([numbers[name0], numbers[name1]])
+                arrays[f"pair.{pairs}.angle"] = np.array(judge.conditions(name0, name1).view_angle_deg)
+                arrays |= {f"pair.{pairs}.of0": mates.of0, f"pair.{pairs}.of1": mates.of1}
+                pairs += 1
+    arrays |= {"views": np.array(views), "pairs": np.array(pairs)}
+    partly = path.with_suffix(".partly")
+    with partly.open("wb") as stream:
+        np.savez(stream, **arrays)
+    partly.replace(path)
+
+
+def _views(folder: Path, recipe: tuple[str, ...]) -> Iterator[tuple[str, ViewSeen]]:
+    with tempfile.TemporaryDirectory() as scratch:
+        context = prepared(folder, scratch, (f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive", *recipe))
+        for image in context.block.images:
+            task = extract.task_of(context, image.image_id)
+            extract.run_task(task)
+            features = read_features(task.path)
+            if len(features.descriptors):
+                yield image.name, ViewSeen(seen(features), _coarse(simulate.render(task.views)[0][0].gray))
+
+
+def _coarse(gray: Array) -> Array:
+    height, width = gray.shape
+    small = max(8, width // REDUCED), max(8, height // REDUCED)
+    return np.asarray(cv2.resize(gray, small, interpolation=cv2.INTER_AREA))

@@ -1,0 +1,188 @@
+"""Train the context network that ships with the package: descriptors that know what is around them.
+
+Views of rendered blocks (training_blocks) with the shipped detector, orientation network and GeoDesc; partners by
+exact truth, so that parallax, occlusion, oblique views and other suns are in it. Of a pair, every keypoint with a
+partner must be more alike to it than to any other keypoint of the other view, either way (cross entropy over cosines,
+learned temperature). Keypoints are dropped, and coarse pictures' brightness changed, at random. The learning rate falls
+along a cosine; what is kept is a moving average. Validation: the blocks that training_blocks leaves out, with and
+without context.
+
+In float32 on the CPU. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it
+was. Writes OUT/context.safetensors (float16), OUT/log.json and OUT/curves.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from context_training.data import ContextPair, ViewSeen, block_pairs
+from context_training.validation import compared
+from torch import Tensor
+from training_blocks import LEFT_OUT, render
+
+from aeromatch_cli.nets.context import Context
+from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
+from aeromatch_cli.strategies.extractors.detection import Raw
+
+DECAY, CLIP, RATE, BATCH = 0.999, 1.0, 1e-3, 4
+REPORT_EVERY = 2_000
+_KEEP = (0.5, 1.0)  # share of the keypoints of a view, drawn for every step
+
+
+class Run(torch.nn.Module):
+    """The network, the temperature of its loss, and the average that is kept."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.network = Context()
+        self.sharpness = torch.nn.Parameter(torch.tensor(math.log(15.0)))
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+
+
+def inputs(view: ViewSeen, rng: np.random.Generator | None) -> tuple[tuple[Tensor, ...], np.ndarray[Any, Any]]:
+    """What the network is asked of a view, and which of its keypoints: all, or as drawn."""
+    seen, coarse = view.seen, view.coarse
+    rows = np.arange(len(seen.points_px))
+    if rng is not None:
+        share = rng.uniform(*_KEEP)
+        rows = np.sort(rng.permutation(len(rows))[: max(16, int(share * len(rows)))])
+        level = (coarse / 255.0) ** np.exp(rng.normal(0.0, 0.3)) * np.exp(rng.normal(0.0, 0.2))
+        coarse = np.clip(255.0 * level + rng.normal(0.0, 2.0, coarse.shape), 0, 255).astype(np.uint8)
+    places = seen.points_px[rows] - 0.5
+    raw = Raw(places, seen.sizes_px[rows], places, seen.sizes_px[rows], np.rad2deg(seen.angles_rad[rows]),
+              np.zeros(len(rows)), np.zeros(len(rows)), np.zeros(len(rows)))  # fmt: skip
+    descriptors = from_bytes(seen.descriptors[rows])
+    descriptors = descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+    size = int(seen.size_px[0]), int(seen.size_px[1])
+    return context_inputs_of_coarse(descriptors, raw, coarse, size), rows
+
+
+def loss_of(run: Run, pair: ContextPair, rng: np.random.Generator) -> Tensor:
+    (in0, rows0), (in1, rows1) = (inputs(view, rng) for view in (pair.view0, pair.view1))
+    similar = run.sharpness.exp() * run.network(*in0) @ run.network(*in1).T
+    truth = pair.truth.take(rows0, rows1)
+    parts = []
+    for scores, mates in ((similar, truth.of0), (similar.T, truth.of1)):
+        known = np.flatnonzero(mates >= 0)
+        if len(known):
+            parts.append(torch.nn.functional.cross_entropy(scores[known], torch.from_numpy(mates[known]).long()))
+    return torch.stack(parts).mean() if parts else similar.sum() * 0.0
+
+
+def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Namespace) -> Run | None:
+    """The finished run, or None where --minutes ended it before."""
+    run, started = Run(), time.monotonic()
+    optimiser = torch.optim.AdamW([*run.network.parameters(), run.sharpness], RATE, weight_decay=1e-3)
+    state, seen, log = args.out / "state.pt", 0, []
+    if state.is_file():
+        seen, log, own, others = torch.load(state, weights_only=True)
+        run.load_state_dict(own)
+        optimiser.load_state_dict(others)
+    plain = compared(unseen, lambda view: inputs(view, None)[0][0].numpy())
+    losses: list[float] = []
+    while seen < args.pairs:
+        rng = np.random.default_rng([args.seed, seen])
+        for group in optimiser.param_groups:
+            group["lr"] = RATE * min(1.0, (seen + 1) / 1000) * (0.5 + 0.5 * math.cos(math.pi * seen / args.pairs))
+        chosen = [pairs[int(rng.integers(len(pairs)))] for _ in range(BATCH)]
+        loss = torch.stack([loss_of(run, pair, rng) for pair in chosen]).mean()
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
+        optimiser.step()
+        keep = min(DECAY, (seen // BATCH + 1) / (seen // BATCH + 10))
+        with torch.no_grad():
+            for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
+                old.lerp_(new, 1.0 - keep)
+        losses.append(float(loss.detach()))
+        before, seen = seen, seen + BATCH
+        ended = bool(args.minutes) and time.monotonic() - started > 60.0 * args.minutes
+        if seen // REPORT_EVERY > before // REPORT_EVERY or seen >= args.pairs or ended:
+            with torch.inference_mode():
+                found = compared(unseen, lambda view: run.average(*inputs(view, None)[0]).numpy())
+            minutes = round((time.monotonic() - started) / 60.0, 1)
+            row = {"seen": seen, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
+            log.append(row | {"context": found, "plain": plain})
+            print(json.dumps(log[-1]), flush=True)
+            losses = []
+            torch.save((seen, log, run.state_dict(), optimiser.state_dict()), state.with_suffix(".partly"))
+            state.with_suffix(".partly").replace(state)
+            draw_curves(log, args.out / "curves.png")
+        if ended:
+            return None
+    (args.out / "log.json").write_text(json.dumps(log, indent=1) + "\n", encoding="utf-8")
+    return run
+
+
+def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
+    """Rank-1 rate by class of view angle, with context and without (dashed)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.0, 4.5), dpi=110, layout="constrained")
+    axes = figure.subplots()
+    for number, name in enumerate(log[-1]["context"]):
+        axes.plot(
+            [row["seen"] for row in log], [row["context"][name]["rank1"] for row in log], f"C{number}", label=name
+        )
+        axes.axhline(log[-1]["plain"][name]["rank1"], color=f"C{number}", linestyle="--", linewidth=0.8)
+    axes.set(xlabel="pairs seen", ylabel="nearest neighbour is the partner (dashed: without context)")
+    axes.legend(title="view angle", frameon=False)
+    figure.savefig(path)
+
+
+def one_block(out: Path, rendered: Path, index: int) -> None:
+    """Render block `index` and write its pairs, unless they are there."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    folder = render(rendered, index)
+    block_pairs(folder, out / "data" / f"{index:04d}.npz")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("--blocks", type=int, default=48, help="rendered blocks, at least 19")
+    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
+    add("--pairs", type=int, default=24_000, help="to be seen")
+    add("--seed", type=int, default=0, help="of what is drawn")
+    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
+    add("--out", type=Path, required=True)
+    args = parser.parse_args()
+    if args.blocks <= max(LEFT_OUT):
+        parser.error(f"--blocks {args.blocks}: block {max(LEFT_OUT)} is for validation; give {max(LEFT_OUT) + 1}")
+    (args.out / "data").mkdir(parents=True, exist_ok=True)
+    rendered = args.rendered or args.out / "blocks"
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        list(pool.map(partial(one_block, args.out, rendered), range(args.blocks)))
+    torch.set_num_threads(args.jobs)
+    groups: dict[bool, list[ContextPair]] = {False: [], True: []}
+    for index in range(args.blocks):
+        folder = render(rendered, index)
+        groups[index in LEFT_OUT] += block_pairs(folder, args.out / "data" / f"{index:04d}.npz")
+    print(f"{len(groups[False])} pairs, {len(groups[True])} unseen ones", flush=True)
+    run = train(groups[False], groups[True], args)
+    if run is not None:
+        from safetensors.torch import save_file
+
+        weights = {name: value.half().contiguous() for name, value in run.average.state_dict().items()}
+        save_file(weights, args.out / "context.safetensors")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""The context network: what it must not depend on, and where it begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aeromatch_cli.nets.context import NEIGHBOURS, Context, evened, layout_of
+from aeromatch_cli.strategies.extractors.context import as_bytes, context_inputs, from_bytes
+from aeromatch_cli.strategies.extractors.detection import Raw
+
+
+def raw_of(points: np.ndarray, sizes: np.ndarray) -> Raw:
+    nothing = np.zeros(len(points), np.float32)
+    return Raw(points, sizes, points, sizes, nothing, nothing, nothing.astype(np.int32), nothing.astype(np.int32))
+
+
+def unit(count: int, rng: np.random.Generator) -> np.ndarray:
+    values = rng.standard_normal((count, 128)).astype(np.float32)
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def test_untrained_context_changes_nothing() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 99, (40, 2)).astype(np.float32)
+    picture = rng.integers(0, 255, (100, 100), np.uint8)
+    descriptors = unit(40, rng)
+    out = Context()(*context_inputs(descriptors, raw_of(points, np.full(40, 5.0, np.float32)), picture))
+    np.testing.assert_allclose(out.detach().numpy(), descriptors, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, NEIGHBOURS, NEIGHBOURS + 1, 60])
+def test_few_keypoints_have_neighbours_too(count: int) -> None:
+    rng = np.random.default_rng(count)
+    points = rng.uniform(0, 63, (count, 2)).astype(np.float32)
+    inputs = context_inputs(
+        unit(count, rng), raw_of(points, np.full(count, 5.0, np.float32)), np.zeros((64, 64), np.uint8)
+    )
+    assert inputs[3].shape == (count, NEIGHBOURS)
+    assert bool(torch.isfinite(inputs[2]).all())
+    assert Context()(*inputs).shape == (count, 128)
+
+
+@given(turn=st.floats(-3.1, 3.1), scale=st.floats(0.3, 3.0))
+@settings(max_examples=25, deadline=None)
+def test_layout_turns_and_grows_with_the_keypoints(turn: float, scale: float) -> None:
+    rng = np.random.default_rng(1)
+    points, sizes, angles = rng.uniform(0, 100, (30, 2)), rng.uniform(4, 9, 30), rng.uniform(-3, 3, 30)
+    near = torch.from_numpy(rng.integers(0, 30, (30, 5)))
+    matrix = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    before, after = (
+        layout_of(torch.from_numpy(p), torch.from_numpy(s), torch.from_numpy(a), near)
+        for p, s, a in ((points, sizes, angles), (points @ matrix.T, sizes * scale, angles + turn))
+    )
+    np.testing.assert_allclose(before.numpy(), after.numpy(), atol=1e-9)
+
+
+def test_picture_is_free_of_brightness_and_contrast() -> None:
+    picture = torch.rand(1, 1, 80, 90, generator=torch.Generator().manual_seed(0))
+    np.testing.assert_allclose(evened(picture).numpy(), evened(0.5 * picture + 0.3).numpy(), atol=0.2)
+
+
+def test_bytes_keep_distances_to_a_hundredth() -> None:
+    values = unit(300, np.random.default_rng(2))
+    apart = np.linalg.norm(values[:150] - values[150:], axis=1)
+    stored = as_bytes(values).astype(np.float32)
+    np.testing.assert_allclose(np.linalg.norm(stored[:150] - stored[150:], axis=1) / 256.0, apart, rtol=0.01)
+    np.testing.assert_allclose(from_bytes(as_bytes(values)), values, atol=0.5 / 256.0 + 1e-6)

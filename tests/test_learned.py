@@ -1,0 +1,92 @@
+"""Learned features: budget, masks, turns and light, on a picture whose copies are known exactly."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.learned import Learned
+from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
+
+SIDE = 320
+
+
+@pytest.fixture(scope="module")
+def picture() -> NDArray[np.uint8]:
+    """Noise with structure at several scales, and rectangles."""
+    rng = np.random.default_rng(3)
+    total = np.zeros((SIDE, SIDE))
+    for scale in (3, 6, 12, 24):
+        coarse = rng.standard_normal((SIDE // scale + 2, SIDE // scale + 2))
+        total += scale**0.5 * cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+    gray = np.clip(128 + 14 * total, 0, 255).astype(np.uint8)
+    for _ in range(40):
+        x, y, w, h = (int(v) for v in rng.integers((0, 0, 8, 8), (SIDE, SIDE, 40, 40)))
+        gray[y : y + h, x : x + w] = gray[y : y + h, x : x + w] // 2 + int(rng.integers(0, 120))
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.8))
+
+
+def extract(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None, **settings: Any) -> Features:
+    height, width = gray.shape
+    camera = Camera("PINHOLE", width, height, (500.0, 500.0, (width - 1) / 2, (height - 1) / 2))
+    view = View("source", width, height, np.eye(3), is_source=True, angle_deg=0.0)
+    return Learned(**{"keypoints": 400, **settings})(camera, (ViewPixels(view, gray, valid),))
+
+
+def share_right(first: Features, second: Features, matrix: NDArray[np.floating[Any]]) -> tuple[int, float]:
+    """Matches, and the share of them that the affine matrix (2, 3) explains to 2 px."""
+    camera = Camera("PINHOLE", SIDE, SIDE, (500.0, 500.0, SIDE / 2, SIDE / 2))
+    geometry = PairGeometry(Pair("0", "1", np.nan, np.nan, "test"), camera, camera, None, None, None)
+    found = Bidirectional()(first, second, geometry).indices
+    there = first.keypoints_px[found[:, 0]] @ matrix[:, :2].T + matrix[:, 2]
+    right = np.linalg.norm(there - second.keypoints_px[found[:, 1]], axis=1) < 2.0
+    return len(found), float(right.mean())
+
+
+@pytest.mark.parametrize("settings", [{}, {"detector": "sift"}, {"precision": "float32"}])
+def test_budget_is_exact_and_runs_are_equal(picture: NDArray[np.uint8], settings: dict[str, Any]) -> None:
+    first, second = (extract(picture, keypoints=150, **settings) for _ in range(2))
+    assert first.descriptors.shape == (150, 128)
+    assert first.descriptors.dtype == np.uint8
+    for name in ("keypoints_px", "descriptors", "view_orientation_deg", "responses"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 35.0, 90.0, 200.0])
+def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: float) -> None:
+    middle = (SIDE - 1) / 2
+    matrix = cv2.getRotationMatrix2D((middle, middle), turn_deg, 0.9)
+    other = cv2.warpAffine(picture, matrix, (SIDE, SIDE), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
+    darker = np.clip(0.6 * other.astype(np.float32) + 5.0, 0, 255).astype(np.uint8)
+    count, share = share_right(extract(picture), extract(darker), matrix)
+    assert count >= 80
+    assert share > 0.9
+
+
+def test_upright_features_are_not_turned(picture: NDArray[np.uint8]) -> None:
+    assert not extract(picture, orientation="upright").view_orientation_deg.any()
+    assert extract(picture).view_orientation_deg.std() > 30.0
+
+
+def test_masked_ground_has_no_keypoints(picture: NDArray[np.uint8]) -> None:
+    valid = np.ones(picture.shape, bool)
+    valid[:, : SIDE // 2] = False
+    assert extract(picture, valid).keypoints_px[:, 0].min() > SIDE / 2
+
+
+def test_flat_picture_has_no_features() -> None:
+    flat = extract(np.full((SIDE, SIDE), 90, np.uint8))
+    assert flat.descriptors.shape == (0, 128)
+
+
+def test_matcher_for_other_descriptors_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"made for RootSIFT descriptors.*use match nearest"):
+        load("baseline", ["extract=learned", "match=lightglue"])
