@@ -1,10 +1,11 @@
 """This project's descriptors beside SIFT, TFeat and HardTFeat on the same patches, by exact truth.
 
 Pairs of rendered blocks that no training has seen, by class of view angle and by whether one sun shone on both images.
-Keypoints: SIFT's in the north-up ground views that preset `baseline` makes, the strongest of either side that the other
-image shows, too. Corresponding: one place within 3 px of stored pixels and one size within a factor of 1.5, one to one.
-Every descriptor sees the same place, size and angle (upright, or --angles sift): networks the same 32 x 32 patch of 6.4
-sizes, SIFT its own support (6 sizes and the blur between its bins) in the picture.
+Keypoints: of the 4,000 strongest of SIFT in the north-up ground views that preset `baseline` makes the strongest of
+either side that the other image shows, too. Corresponding: one place within 3 px of stored pixels and one size within a
+factor of 1.5, one to one. Every descriptor sees the same place, size and angle (upright, or --angles sift): networks
+the same 32 x 32 patch of 6.4 sizes, SIFT its own support (6 sizes and the blur between its bins) in the picture.
+Descriptors with context (ours+context) know the other keypoints and the picture around them.
 
 FPR95: share of different places accepted at the distance that accepts 95 % of the corresponding ones; the different
 ones are, for every corresponding pair, ten keypoints of the other image drawn at random from those farther than 10 px.
@@ -51,7 +52,8 @@ from aeromatch_cli.evaluate import RenderedTruth
 from aeromatch_cli.workspace import stable_hash, write_text
 
 Row = dict[str, Any]
-MOST = 10_000
+# Keypoints that a picture offers; a pair has those of the overlap.
+MOST = 4000
 NEGATIVES, FAR_PX = 10, 10.0
 FULL = {"scenes": "city,suburb,hills,farmland", "pairs": 12, "size": "1000x750", "images": 24, "keypoints": 1500}
 QUICK = {"scenes": "suburb", "pairs": 4, "size": "480x360", "images": 12, "keypoints": 400}
@@ -82,7 +84,7 @@ def make_task(
     for picture, other in (both, both[::-1]):
         table, own = strongest_sift(picture, MOST, upright=upright)
         rows = np.flatnonzero(in_overlap(truth, picture, table[:, :2], other))[:count]
-        sides.append(make_side(picture, table[rows], [own[i] for i in rows], upright=upright))
+        sides.append(make_side(picture, table, own, rows, upright=upright))
     first, second = (side.picture.stored_px(side.keypoints.points_px) for side in sides)
     found = partners(truth, pair.images[0], first, pair.images[1], second)
     found, _ = of_one_size(truth, both, (sides[0].keypoints, sides[1].keypoints), found)

@@ -13,7 +13,8 @@ from methods.base import Options
 from methods.keynet import in_tfeat_words
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.strategies.extractors.detection import Raw
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from keypoint_bench.detectors import Keypoints, detect_sift
 from keypoint_bench.pictures import Picture
@@ -23,16 +24,22 @@ _BATCH = 256
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One picture of a pair with its keypoints: those of the overlap, in the order of the descriptors.
+    """One picture of a pair with its keypoints of the overlap, in the order of the descriptors.
 
-    patches: (N, 32, 32) uint8, cut along the keypoints' angles. own: OpenCV's keypoints (N) of the same place, size
-    and angle, whose octaves SIFT needs.
+    every: all keypoints that the picture offers, wherever; rows: (N,) those of the overlap among them. patches: (N, 32,
+    32) uint8, cut along the keypoints' angles. own: OpenCV's keypoints (N) of the same place, size and angle, whose
+    octaves SIFT needs.
     """
 
     picture: Picture
-    keypoints: Keypoints
+    every: Keypoints
+    rows: IntArray
     patches: NDArray[np.uint8]
     own: tuple[Any, ...]
+
+    @property
+    def keypoints(self) -> Keypoints:
+        return self.every.take(self.rows)
 
 
 class Describer(Protocol):
@@ -97,6 +104,28 @@ class Own:
         return describe(side.patches, self.network)
 
 
+class OwnWithContext(Own):
+    """The same with context: all keypoints of the picture, not only those that the other one shows, are around."""
+
+    def __call__(self, side: Side) -> NDArray[np.float32]:
+        from aeromatch_cli.nets.geodesc import describe
+        from aeromatch_cli.strategies.extractors.context import with_context
+
+        every, nothing = side.every, np.zeros(len(side.every.points_px))
+        plain = describe(patches_of(side.picture, every), self.network)
+        raw = Raw(
+            source_px=every.points_px,
+            source_sizes_px=every.sizes_px,
+            points_px=every.points_px,
+            sizes_px=every.sizes_px,
+            orientations_deg=every.angles_deg,
+            responses=nothing,
+            octaves=nothing.astype(np.int32),
+            view_idx=nothing.astype(np.int32),
+        )
+        return with_context(plain, raw, side.picture.gray)[side.rows]
+
+
 def _tfeat(weights: str) -> Callable[..., Describer]:
     return lambda options: TFeat(options, weights=weights)
 
@@ -107,21 +136,26 @@ DESCRIBERS: Mapping[str, Callable[..., Describer]] = {
     "tfeat": _tfeat("tfeat-liberty.params"),
     "hardtfeat": _tfeat("HardTFeat.pth"),
     "ours": Own,
+    "ours+context": OwnWithContext,
 }
 
 
-def make_side(picture: Picture, table: FloatArray, own: Sequence[Any], *, upright: bool) -> Side:
-    """A side of the rows x, y, size, angle of OpenCV's keypoints; upright: all angles 0."""
+def make_side(picture: Picture, table: FloatArray, own: Sequence[Any], rows: IntArray, *, upright: bool) -> Side:
+    """A side of the rows x, y, size, angle of OpenCV's keypoints, `rows` of them in the overlap; upright: angles 0."""
     import cv2
 
-    angles = np.zeros(len(table)) if upright else table[:, 3]
-    keypoints = Keypoints(table[:, :2], table[:, 2], angles)
-    patches = cut_patches(levels_of(picture.gray), keypoints.points_px, keypoints.sizes_px, angles)
+    every = Keypoints(table[:, :2], table[:, 2], np.zeros(len(table)) if upright else table[:, 3])
+    shown = every.take(rows)
     turned = tuple(
-        cv2.KeyPoint(*one.pt, one.size, float(angle), one.response, one.octave)
-        for one, angle in zip(own, angles, strict=True)
+        cv2.KeyPoint(*own[row].pt, own[row].size, float(angle), own[row].response, own[row].octave)
+        for row, angle in zip(rows, shown.angles_deg, strict=True)
     )
-    return Side(picture, keypoints, patches, turned)
+    return Side(picture, every, rows, patches_of(picture, shown), turned)
+
+
+def patches_of(picture: Picture, keypoints: Keypoints) -> NDArray[np.uint8]:
+    """(N, 32, 32), cut along the keypoints' angles."""
+    return cut_patches(levels_of(picture.gray), keypoints.points_px, keypoints.sizes_px, keypoints.angles_deg)
 
 
 def strongest_sift(picture: Picture, most: int, *, upright: bool) -> tuple[FloatArray, list[Any]]:

@@ -32,7 +32,7 @@ class Store:
     ) -> Row:
         """The row of a method on a pair: facts of the pair, then figures, made where there are none."""
         weights = None if method.weights is None else file_digest(method.weights)
-        code = self._digests[method.name == _OWN]
+        code = self._digests[method.name.startswith(_OWN)]
         key = fingerprint(self._basis, code, judged.key, pair.images, section, frame, method.name, weights)[:16]
         facts: Row = {
             "section": section,
