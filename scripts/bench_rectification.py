@@ -147,7 +147,7 @@ def like(view0: View, view1: View) -> bool:
 def measured(truth: Truth, sides0: Sequence[Side], sides1: Sequence[Side]) -> tuple[float, float, float, int]:
     """Figures and number of points of the like views with most points."""
     grid_px = sample_grid(sides0[0].camera, _SAMPLES)
-    found = [np.zeros((0, 2, 2))]
+    found: list[FloatArray] = [np.zeros((0, 2, 2))]
     found += [jacobians(truth, a, b, grid_px) for a in sides0 for b in sides1 if like(a.view, b.view)]
     most = max(found, key=len)
     return *figures(most), len(most)
@@ -159,7 +159,7 @@ def block(folder: Path, preset: str, args: argparse.Namespace) -> Path:
     asked = {"seed": args.seed, "width_px": int(width), "height_px": int(height), "images": args.images}
     out = folder / f"{preset}-oblique-{fingerprint(preset, 'oblique', asked, code_digest('synthetic'))[:12]}"
     if not (out / "truth.json").is_file():
-        render_block(out, preset, flight="oblique", jobs=THREADS, **asked)  # type: ignore[arg-type]
+        render_block(out, preset, flight="oblique", jobs=THREADS, **asked)
     return out
 
 
