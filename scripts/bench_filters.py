@@ -1,9 +1,9 @@
 """Filters on the same matches, judged by exact truth.
 
-Input: mutual nearest neighbours without ratio between the features of a preset, thinned to 2 px in both images, on the
-rendered pairs where 30 to 80 % of them are correct (within 3 px of the truth and not hidden). Direct RANSAC is one
-homography for the whole pair; it is swept over thresholds, and beside every clustered row stands the smallest one that
-keeps as many correct matches in all, with the same filters before and after it.
+Input: mutual nearest neighbours between the features of a preset, without ratio unless --ratio gives one, thinned to
+2 px in both images, on the rendered pairs where 30 to 80 % of them are correct (within 3 px of the truth and not
+hidden). Direct RANSAC is one homography for the whole pair; it is swept over thresholds, and beside every clustered row
+stands the smallest one that keeps as many correct matches in all, with the same filters before and after it.
 
 Plane error: distance (larger of both directions) of every correct input match to the nearest plane of its cluster, for
 direct RANSAC to the one homography, median over all. Sums over pairs; ms: median pair, one thread. A pair that a filter
@@ -28,7 +28,7 @@ from common import write_readme
 from methods.base import Options
 from methods.ours import Preset
 from methods.results import write_rows
-from methods.scenes import Judged, Selection, rendered
+from methods.scenes import MIXED, Judged, Selection, rendered
 from methods.sources import code_digest
 from methods.worker import limit_threads
 
@@ -49,6 +49,7 @@ from aeromatch_cli.strategies.filters.homography import Homography
 from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.synthetic.flights import FLIGHTS
 from aeromatch_cli.workspace import write_text
 
 SWEPT_PX = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 70, 100)
@@ -109,7 +110,7 @@ def variants(threshold_px: float) -> list[Variant]:
 def inputs(judged: Judged, args: argparse.Namespace) -> Iterator[Input]:
     """The matches of every judged pair of a scene whose share of correct ones lies in the range."""
     name, settings = parse_method(args.features)
-    own = ("match=nearest", "match.ratio=1.0", "extract.colours=true")
+    own = ("match=nearest", f"match.ratio={args.ratio}", "extract.colours=true")
     options = Options(args.keypoints, "image", 1, args.seed, None)
     preset = Preset(judged.scene, options, preset=name, settings=(*settings, *own))
     known: dict[str, Any] = {}
@@ -258,7 +259,8 @@ def run(args: argparse.Namespace) -> list[Row]:
     rows: list[Row] = []
     for preset in filter(None, args.scenes.split(",")):
         size_px = int(width), int(height)
-        judged = rendered(folder, preset, selection, size_px=size_px, images=args.images, jobs=2, code=code)
+        asked = {"size_px": size_px, "images": args.images, "jobs": 2, "code": code, "flight": args.flight}
+        judged = rendered(folder, preset, selection, **asked)
         found = list(inputs(judged, args))
         print(f"{preset}: {len(found)} of {len(judged.pairs)} pairs are 30 to 80 % correct", file=sys.stderr)
         if found and not rows:  # imports and caches are not timed
@@ -278,6 +280,8 @@ def parse() -> argparse.Namespace:
     add("--seed", type=int, default=0, help="another seed gives other scenes, pairs and samples")
     add("--keypoints", type=int, default=FULL["keypoints"], help="descriptors per image")
     add("--threshold", type=int, default=3, choices=SWEPT_PX, help="of clustered RANSAC and of the peers, px")
+    add("--ratio", type=float, default=1.0, help="of the input's nearest to its second; 1: none")
+    add("--flight", default=MIXED, help=f"of the rendered blocks: {', '.join(FLIGHTS)}")
     add("--size", metavar="WxH", default=FULL["size"], help="of rendered images")
     add("--images", type=int, default=FULL["images"], help="of each rendered block")
     add("--readme", action="store_true", help="write the table into the README")
@@ -302,7 +306,10 @@ def main() -> None:
     if args.readme:
         asked = f"--features '{args.features}' --scenes {args.scenes} --pairs {args.pairs} --seed {args.seed}"
         more = f"--keypoints {args.keypoints} --threshold {args.threshold} --size {args.size} --images {args.images}"
-        write_readme(f"    scripts/bench_filters {asked} {more} --out DIR\n\n{text}", "bench_filters")
+        if (args.flight, args.ratio) != (MIXED, 1.0):
+            more += f" --flight {args.flight} --ratio {args.ratio}"
+        name = "bench_filters" if args.flight == MIXED else f"bench_filters_{args.flight}"
+        write_readme(f"    scripts/bench_filters {asked} {more} --out DIR\n\n{text}", name)
 
 
 if __name__ == "__main__":

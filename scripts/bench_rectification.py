@@ -32,7 +32,7 @@ from methods.base import Options, Scene
 from methods.goal_tables import markdown
 from methods.ours import Preset
 from methods.results import write_rows
-from methods.scenes import MIN_OVERLAP, NOISY_POSES
+from methods.scenes import EXACT_POSES, MIN_OVERLAP, NOISY_POSES, rendered_block
 from methods.sources import code_digest
 from methods.worker import limit_threads
 
@@ -43,8 +43,8 @@ from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.synthetic import Truth, load_truth, render_block
-from aeromatch_cli.workspace import fingerprint, stable_hash, write_text
+from aeromatch_cli.synthetic import Truth, load_truth
+from aeromatch_cli.workspace import stable_hash, write_text
 
 LARGEST_SCALE, LARGEST_TURN_DEG, GOAL = 1.25, 10.0, 0.9
 FULL = {"scenes": "city,suburb,hills", "pairs": 12, "images": 25, "size": "480x360"}
@@ -153,16 +153,6 @@ def measured(truth: Truth, sides0: Sequence[Side], sides1: Sequence[Side]) -> tu
     return *figures(most), len(most)
 
 
-def block(folder: Path, preset: str, args: argparse.Namespace) -> Path:
-    """Folder of the rendered block, made unless it is there already."""
-    width, _, height = args.size.partition("x")
-    asked = {"seed": args.seed, "width_px": int(width), "height_px": int(height), "images": args.images}
-    out = folder / f"{preset}-oblique-{fingerprint(preset, 'oblique', asked, code_digest('synthetic'))[:12]}"
-    if not (out / "truth.json").is_file():
-        render_block(out, preset, flight="oblique", jobs=THREADS, **asked)
-    return out
-
-
 def chosen(judge: BlockTruth, scene: str, args: argparse.Namespace) -> list[tuple[tuple[str, str], float, str]]:
     """Pairs, their view angles and classes: at most args.pairs of each class, seeded."""
     classes: dict[str, list[tuple[tuple[str, str], float, str]]] = {name: [] for name, _ in VIEW_ANGLE_CLASSES}
@@ -179,7 +169,7 @@ def rows_of(folder: Path, scene: str, args: argparse.Namespace) -> Iterator[Row]
     """Of all pairs of a block under all simulators."""
     judge, truth = open_truth(folder), load_truth(folder)
     pairs = chosen(judge, scene, args)
-    poses = folder / ("poses.csv" if args.exact else NOISY_POSES)
+    poses = folder / (EXACT_POSES if args.exact else NOISY_POSES)
     listed = tuple(pair for pair, _, _ in pairs)
     described = Scene(scene, folder / "images", poses, folder / "block.json", judge.cameras, listed)
     for simulator in args.simulators.split(","):
@@ -267,10 +257,22 @@ def main() -> None:
     (args.out / "scenes").mkdir(parents=True, exist_ok=True)
     (args.out / "rectification").mkdir(exist_ok=True)
     rows: list[Row] = []
+    width, _, height = args.size.partition("x")
+    size_px = int(width), int(height)
     try:
         for scene in filter(None, args.scenes.split(",")):
             print(scene, file=sys.stderr, flush=True)
-            rows += rows_of(block(args.out / "scenes", scene, args), scene, args)
+            folder = rendered_block(
+                args.out / "scenes",
+                scene,
+                args.seed,
+                "oblique",
+                size_px=size_px,
+                images=args.images,
+                jobs=THREADS,
+                code=code_digest("synthetic"),
+            )
+            rows += rows_of(folder, scene, args)
             write_rows(args.out / "rectification" / "results.json", [row.listed() for row in rows])
     except AeromatchError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -31,6 +31,7 @@ CONDITIONS = {
     "all": (HARD, EASY),
     "angles": tuple(name for name, _ in reversed(VIEW_ANGLE_CLASSES)),
 }
+MIXED = "mixed"  # the flight of all benchmarks that name no other
 EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
 
 
@@ -72,19 +73,26 @@ def rendered(
     images: int,
     jobs: int,
     code: str,
-    flight: str = "mixed",
+    flight: str = MIXED,
 ) -> Judged:
-    """A block of this preset with this flight, rendered below `folder` unless it is there already.
+    """A block of this preset and flight, rendered below `folder` unless it is there already; code as in its folder."""
+    out = rendered_block(folder, preset, selection.seed, flight, size_px=size_px, images=images, jobs=jobs, code=code)
+    return _judged(preset, out, open_truth(out), selection, set())
+
+
+def rendered_block(
+    folder: Path, preset: str, seed: int, flight: str, *, size_px: tuple[int, int], images: int, jobs: int, code: str
+) -> Path:
+    """Folder of the block below `folder`, rendered unless it is there already.
 
     code: digest of the renderer, so that pictures of an older one are not taken for its own.
     """
-    asked = {"seed": selection.seed, "width_px": size_px[0], "height_px": size_px[1], "images": images}
-    flown = () if flight == "mixed" else (flight,)  # blocks rendered before there was a choice keep their names
+    asked = {"seed": seed, "width_px": size_px[0], "height_px": size_px[1], "images": images}
+    flown = () if flight == MIXED else (flight,)
     out = folder / f"{preset}-{fingerprint(preset, asked, code, *flown)[:12]}"
     if not (out / "truth.json").is_file():
         render_block(out, preset, flight=flight, jobs=jobs, **asked)  # type: ignore[arg-type]
-    truth = open_truth(out)
-    return _judged(preset, out, truth, selection, set())
+    return out
 
 
 def real(folder: Path, data: Path, block: str, selection: Selection, *, max_size_px: int) -> Judged:
