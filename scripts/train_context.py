@@ -31,7 +31,7 @@ import torch
 from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
-from training_blocks import LEFT_OUT, render
+from training_blocks import LEFT_OUT, numbers, render
 
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
@@ -155,7 +155,7 @@ def one_block(out: Path, rendered: Path, index: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--blocks", type=int, default=48, help="rendered blocks, at least 19")
+    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; validation is on those left out")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--pairs", type=int, default=24_000, help="to be seen")
     add("--seed", type=int, default=0, help="of what is drawn")
@@ -163,16 +163,15 @@ def main() -> None:
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    if args.blocks <= max(LEFT_OUT):
-        parser.error(f"--blocks {args.blocks}: block {max(LEFT_OUT)} is for validation; give {max(LEFT_OUT) + 1}")
+    wanted = sorted({*numbers(args.blocks), *LEFT_OUT})
     (args.out / "data").mkdir(parents=True, exist_ok=True)
     rendered = args.rendered or args.out / "blocks"
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        list(pool.map(partial(one_block, args.out, rendered), range(args.blocks)))
+        list(pool.map(partial(one_block, args.out, rendered), wanted))
     torch.set_num_threads(args.jobs)
     groups: dict[bool, list[ContextPair]] = {False: [], True: []}
-    for index in range(args.blocks):
+    for index in wanted:
         folder = render(rendered, index)
         groups[index in LEFT_OUT] += block_pairs(folder, args.out / "data" / f"{index:04d}.npz")
     print(f"{len(groups[False])} pairs, {len(groups[True])} unseen ones", flush=True)

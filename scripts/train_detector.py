@@ -37,7 +37,7 @@ from detector_training.scenes import Sight, read_sights, sights, write_sights
 from detector_training.shapes import shape
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table, thinned
 from torch import Tensor
-from training_blocks import LEFT_OUT, render
+from training_blocks import LEFT_OUT, numbers, render
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector
 
@@ -319,15 +319,6 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
         )
     args.out.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(known | asked, indent=1) + "\n", encoding="utf-8")
-
-
-def numbers(text: str) -> list[int]:
-    """Of `0-15,17`: numbers and ranges, separated by commas."""
-    found: list[int] = []
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        found += range(int(first), int(last or first) + 1)
-    return found
 
 
 def main() -> None:

@@ -32,3 +32,12 @@ def render(out: Path, block_idx: int) -> Path:
             sun_deg=sun_deg,
         )  # fmt: skip
     return folder
+
+
+def numbers(text: str) -> list[int]:
+    """The blocks that `0-4,29` means."""
+    found: set[int] = set()
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        found |= set(range(int(first), int(last or first) + 1))
+    return sorted(found)

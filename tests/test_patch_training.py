@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from patch_training.data import numbers
+from patch_training.data import learnt_from
 from patch_training.draws import cropped, distinct, drawn, sources_of
 from patch_training.loss import descriptor_loss
 from patch_training.runs import check_recipe
@@ -106,7 +106,7 @@ def test_figures_of_small_sets() -> None:
 
 
 def test_blocks_for_validation_are_never_learnt_from() -> None:
-    assert numbers("0-2,15-18,204") == [0, 1, 2, 15, 17]
+    assert learnt_from("0-2,15-18,204") == [0, 1, 2, 15, 17]
 
 
 def test_another_recipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

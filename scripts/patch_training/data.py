@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from lightglue_training.data import mapped, pictures, save_arrays
-from training_blocks import LEFT_OUT, render
+from training_blocks import LEFT_OUT, numbers, render
 
 from patch_training import sources
 from patch_training.tracks import Tracks, joined
@@ -36,18 +36,14 @@ def prepare(out: Path, rendered: Path, real: Path, names: Sequence[str], args: A
         first = args.seed * 10**7 + number * GROUPS
         jobs.append(partial(_write, out / "known", partial(_groups, paths, first), f"homographies-{number}"))
     jobs.append(partial(_write, out / "unseen", partial(_unseen_groups, rendered), "homographies"))
-    for index in numbers(args.blocks):
+    for index in learnt_from(args.blocks):
         jobs.append(partial(_write, out / "known", partial(_rendered, rendered, index), f"block-{index}"))
     mapped(_call, jobs, args.jobs)
 
 
-def numbers(text: str) -> list[int]:
+def learnt_from(text: str) -> list[int]:
     """The blocks that `0-4,29` means, without those for validation."""
-    found: set[int] = set()
-    for part in text.split(","):
-        first, _, last = part.partition("-")
-        found |= set(range(int(first), int(last or first) + 1))
-    return sorted(found - set(UNSEEN))
+    return sorted({*numbers(text)} - {*UNSEEN})
 
 
 def _call(job: Callable[[], None]) -> None:
