@@ -36,17 +36,20 @@ from detector_training.loss import at, drawn, label_loss, peaks, repeat_loss
 from detector_training.scenes import Sight, read_sights, sights, write_sights
 from detector_training.shapes import shape
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table, thinned
+from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector
+from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
 
 DECAY, CLIP = 0.995, 1.0
 LABEL_PX2 = 160.0  # a view has one label per so many pixels
 OF_RUN = ("trained_on", "blocks", "unseen", "seed", "scale", "batch", "rate")
 STEEP_DEG, STEEP_PAIRS = 45.0, 4
 MOST_PAIRS = 16  # of validation between two view angles
-REPORT_EVERY, SAVE_EVERY = 300, 50  # steps
+OFFSET_KEYPOINTS = 500  # of each view of which the offset is measured
+REPORT_EVERY, SAVE_EVERY = 250, 50  # steps
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,9 @@ class Phase:
 
 def phases(scale: float) -> tuple[Phase, ...]:
     return (
-        Phase("shapes", round(200 * scale)),
-        Phase("adaptation", round(120 * scale), views=3, rendered=0.5),
-        Phase("pairs", round(1900 * scale), views=3, rendered=0.75, labels=0.1, pairs=1.0),
+        Phase("shapes", round(250 * scale)),
+        Phase("adaptation", round(150 * scale), views=3, rendered=0.5),
+        Phase("pairs", round(2000 * scale), views=3, rendered=0.75, labels=0.1, pairs=1.0),
     )
 
 
@@ -197,8 +200,7 @@ def groups(phase: Phase, batch: int, sources: Sources, rng: np.random.Generator)
         else:
             group = homography_group(sources.pictures, phase.views, rng)
         if group is not None:
-            # Dark spots are as good as bright ones; left to itself the network settles for one of them.
-            found.append(Group(255 - group.grays, group.places) if rng.random() < 0.5 else group)
+            found.append(group)
     return found
 
 
@@ -268,6 +270,23 @@ def write(run: Run, out: Path) -> None:
     save_file(weights, out / "detector.safetensors")
     (out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     draw_curves(run.log, out / "curves.png")
+
+
+def offset_px(network: Detector, blocks: list[list[Sight]]) -> Tensor:
+    """(2,) as Detector has it, the mean over the keypoints of one view of every block that its half turn shows, too."""
+    network = copy.deepcopy(network).eval()
+    network.offset_px.zero_()
+    found = []
+    for sight in (block[0] for block in blocks):
+        last = np.array(sight.gray.shape[::-1]) - 1.0
+        turned = np.ascontiguousarray(sight.gray[::-1, ::-1]), np.ascontiguousarray(sight.valid[::-1, ::-1])
+        points0, sizes0, _ = heat_keypoints(sight.gray, OFFSET_KEYPOINTS, sight.valid, network)
+        points1, sizes1, _ = heat_keypoints(turned[0], OFFSET_KEYPOINTS, turned[1], network)
+        if len(points0) and len(points1):
+            away, row = cKDTree(last - points1).query(points0)
+            same = (away < sizes0 / SIZE_PX) & (np.abs(sizes1[row] - sizes0) < 0.1 * sizes0)
+            found.append(((points0 + points1[row] - last) / (sizes0 / SIZE_PX)[:, None] / 2.0)[same])
+    return torch.from_numpy(np.concatenate(found).mean(axis=0)).float()
 
 
 def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
@@ -344,10 +363,11 @@ def main() -> None:
     unseen = prepared_views(args, numbers(args.unseen))
     blocks = prepared_views(args, numbers(args.blocks))
     # Blocks seen at steep angles are drawn three times as often.
-    blocks += [block for block in blocks if len(pairs_of([block], STEEP_DEG)) >= STEEP_PAIRS] * 2
+    steep = [block for block in blocks if len(pairs_of([block], STEEP_DEG)) >= STEEP_PAIRS]
     real = pictures([args.data / name for name in args.trained_on.split(",")])
-    run = train(args, Sources(real, blocks), unseen)
+    run = train(args, Sources(real, blocks + 2 * steep), unseen)
     if run is not None:
+        run.average.offset_px.copy_(offset_px(run.average, blocks))
         write(run, args.out)
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+from detector_training.scenes import sights
+from detector_training.validation import by_heat, by_sift, pairs_of, scores, table
 from numpy.typing import NDArray
 
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat, heat_keypoints, maxima, refined
@@ -51,7 +55,7 @@ def test_a_maximum_beats_its_neighbours_in_place_and_scale() -> None:
     for number, (level, logits) in enumerate(zip(levels, maps, strict=True)):
         column, row = np.rint(level.from_picture(np.array([[60.0, 40.0]]))[0]).astype(int)
         logits[row, column] = (0.0, 2.0, 1.0)[number]
-    points, sizes, values = maxima(levels, maps)
+    points, sizes, values = maxima(levels, maps, np.zeros(2))
     assert len(points) == 1
     assert sizes[0] == pytest.approx(SIZE_PX * 2**0.5, rel=0.02)
     assert points[0] == pytest.approx([60.0, 40.0], abs=0.75)
@@ -61,9 +65,23 @@ def test_a_maximum_beats_its_neighbours_in_place_and_scale() -> None:
 @pytest.mark.parametrize("middle", [(47.0, 48.0), (47.4, 48.3), (46.75, 44.5)])
 def test_a_spot_is_found_at_its_place(middle: tuple[float, float]) -> None:
     points, sizes, confidences = heat_keypoints(spot(middle, 1.5), 10)
-    assert np.linalg.norm(points[0] - middle) < 0.4
+    assert np.linalg.norm(points[0] - middle) < 0.5  # the network leans to one side of what stands alone
     assert points.dtype == sizes.dtype == confidences.dtype == np.float64
     assert (np.diff(confidences) <= 0).all()
+
+
+def test_places_move_with_the_picture_below_the_pixel() -> None:
+    # Means of 2 x 2 pixels, from the first pixel and from the second: exactly half a pixel apart.
+    fine = texture(481, 641, seed=2)
+    first, second = (
+        cv2.resize(fine[start : 480 + start, start : 640 + start], (320, 240), interpolation=cv2.INTER_AREA)
+        for start in (0, 1)
+    )
+    points0, points1 = (heat_keypoints(each, 200)[0] for each in (first, second))
+    away = np.linalg.norm(points0[:, None] - (points1[None] + 0.5), axis=2).min(axis=1)
+    same = away < 1.0
+    assert same.mean() > 0.75
+    assert np.median(away[same]) < 0.2
 
 
 def test_light_changes_few_keypoints() -> None:
@@ -80,6 +98,16 @@ def test_tiles_change_nothing() -> None:
     assert np.array_equal(heat(picture), whole)
 
 
+def test_more_of_a_rendered_place_is_found_again_than_with_sift(rendered: Path) -> None:
+    pairs = pairs_of([sights(rendered)])
+    heat_rows, sift_rows = (table(scores(pairs, find, 150)) for find in (by_heat(None), by_sift))
+    # Within 3 px 0.756 and 0.680, within 1 px 0.651 and 0.552 when these weights were made; SIFT: 0.571, 0.478 and
+    # 0.413, 0.326.
+    for angle, row in heat_rows.items():
+        assert row["3px"] > 1.25 * sift_rows[angle]["3px"]
+        assert row["1px"] > 1.45 * sift_rows[angle]["1px"]
+
+
 def test_budget_border_and_mask() -> None:
     picture = texture(240, 320)
     valid = np.ones(picture.shape, bool)
@@ -88,5 +116,5 @@ def test_budget_border_and_mask() -> None:
     assert len(points) == len(sizes) == 50
     assert (points[:, 0] - 99.0 > sizes).all()
     assert len(heat_keypoints(np.full((64, 64), 90, np.uint8), 50)[0]) == 0
-    away = np.linalg.norm(points[:, None] - points[None], axis=2) + 10.0 * np.eye(len(points))
-    assert away.min() > 2.0
+    away = np.linalg.norm(points[:, None] - points[None], axis=2) + 99.0 * np.eye(len(points))
+    assert away.min() > 3.0
