@@ -40,14 +40,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
 
-from aeromatch_cli.nets.detector import REACH_PX, Detector
+from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
 
 DECAY, CLIP = 0.995, 1.0
 LABEL_PX2 = 160.0  # a view has one label per so many pixels
 OF_RUN = ("trained_on", "blocks", "unseen", "seed", "scale", "batch", "rate")
 STEEP_DEG, STEEP_PAIRS = 45.0, 4
-MOST_PAIRS = 16  # of validation between two view angles
+MOST_PAIRS = 24  # of validation between two view angles
 OFFSET_KEYPOINTS = 500  # of each view of which the offset is measured
 REPORT_EVERY, SAVE_EVERY = 250, 50  # steps
 
@@ -355,12 +355,18 @@ def main() -> None:
     add("--rate", type=float, default=2e-3, help="largest learning rate")
     add("--jobs", type=int, default=1, help="threads")
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
+    add("--validate", type=Path, help="weights to validate, beside SIFT; nothing is trained")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
     args.rendered = args.rendered or args.out / "blocks"
     torch.set_num_threads(args.jobs)
     check(parser, args)
     unseen = prepared_views(args, numbers(args.unseen))
+    if args.validate is not None:
+        pairs = thinned(pairs_of(unseen), MOST_PAIRS)
+        for name, find in (("sift", by_sift), ("heat", by_heat(load_detector(args.validate).in_bfloat16()))):
+            print(json.dumps({name: table(scores(pairs, find, args.keypoints))}), flush=True)
+        return
     blocks = prepared_views(args, numbers(args.blocks))
     # Blocks seen at steep angles are drawn three times as often.
     steep = [block for block in blocks if len(pairs_of([block], STEEP_DEG)) >= STEEP_PAIRS]
