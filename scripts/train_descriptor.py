@@ -99,14 +99,13 @@ def peer_weights(path: Path) -> Any:
     return content.get("state_dict", content)
 
 
-def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> dict[str, Any]:
+def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> None:
     """OUT/table.json: every descriptor on the same patches."""
     found = {name: table(way, unseen) for name, way in {"GeoDesc": described_by(run), **peers(reference)}.items()}
     (out / "table.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     for row in found["GeoDesc"]:
         cells = (f"{way} {rows[row]['fpr95']:.3f} {rows[row]['map']:.3f}" for way, rows in found.items())
         print(f"{row} ({found['GeoDesc'][row]['pairs']}): {' | '.join(cells)}", flush=True)
-    return found
 
 
 def main() -> None:
@@ -137,14 +136,15 @@ def main() -> None:
         return
     unseen = read(args.patches / "unseen")
     run = Run.begin(args.out / "state.pt", GeoDesc, args.rate, args.seed)
+    quick = pairs_of(unseen, QUICK)[::5]
     if not args.only_table:
-        quick = pairs_of(unseen, QUICK)[::5]
         train(run, sources_of(read(args.patches / "known")), quick, args)
     ship(fold(run.average.eval(), GeoDesc(folded=True)), args.out / "geodesc.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
-    found = compare(run, pairs_of(unseen), args.out, args.reference)
+    compare(run, pairs_of(unseen), args.out, args.reference)
+    others = {way: table(peer, quick)["all"] for way, peer in peers(args.reference).items()}
     values = {name: [row["unseen"][name] for row in run.log] for name in ("fpr95", "map")}
-    lines = {f"{way} {name}": rows["all"][name] for way, rows in found.items() for name in values if way != "GeoDesc"}
+    lines = {f"{way} {name}": rows[name] for way, rows in others.items() for name in values}
     draw_curves(run.log, values, lines, "FPR95, mAP on unseen pairs", args.out / "curves.png")
 
 

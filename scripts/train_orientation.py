@@ -110,18 +110,23 @@ def oriented_by(run: Run) -> Orient:
     return orient
 
 
-def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) -> dict[str, Any]:
-    """OUT/table.json and OUT/errors.png: every estimator on the same patches."""
-    ways: dict[str, Orient] = {"ours": oriented_by(run), "gradient histogram": gradient_peaks}
+def peers(reference: Path | None) -> dict[str, Orient]:
+    """What stands beside it."""
+    ways: dict[str, Orient] = {"gradient histogram": gradient_peaks}
     if reference is not None:
         content = torch.load(reference / PEER, map_location="cpu", weights_only=True)
         ways["OriNet"] = orinet(content.get("state_dict", content))
+    return ways
+
+
+def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) -> None:
+    """OUT/table.json and OUT/errors.png: every estimator on the same patches."""
+    ways = {"ours": oriented_by(run), **peers(reference)}
     found = {name: table(way, unseen) for name, way in ways.items()}
     (out / "table.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     draw_distribution({name: errors_deg(way, unseen) for name, way in ways.items()}, out / "errors.png")
     for row in found["ours"]:
         print(row, {name: list(rows[row].values()) for name, rows in found.items()}, flush=True)
-    return found
 
 
 def main() -> None:
@@ -148,13 +153,15 @@ def main() -> None:
     prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     unseen = read(args.patches / "unseen")
     run = Run.begin(args.out / "state.pt", OrientationNet, args.rate, args.seed)
-    train(run, sources_of(read(args.patches / "known")), unseen_pairs(unseen, EACH // 5), args)
+    quick = unseen_pairs(unseen, EACH // 5)
+    train(run, sources_of(read(args.patches / "known")), quick, args)
     ship(fold(run.average.eval(), OrientationNet(folded=True)), args.out / "orientation.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
-    found = compare(run, unseen_pairs(unseen, EACH), args.out, args.reference)
-    names = [name for name in found["ours"]["all"] if name.startswith("within")]
+    compare(run, unseen_pairs(unseen, EACH), args.out, args.reference)
+    others = {way: table(peer, quick)["all"] for way, peer in peers(args.reference).items()}
+    names = [name for name in run.log[-1]["unseen"] if name.startswith("within")]
     values = {name: [row["unseen"][name] for row in run.log] for name in names}
-    lines = {f"{way}, {name}": rows["all"][name] for way, rows in found.items() for name in names if way != "ours"}
+    lines = {f"{way}, {name}": rows[name] for way, rows in others.items() for name in names}
     draw_curves(run.log, values, lines, "share of unseen pairs within 10 and 20 degrees", args.out / "curves.png")
 
 

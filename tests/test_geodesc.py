@@ -96,6 +96,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
 
 def test_the_shipped_weights_tell_unseen_places_apart(unseen: list[Pair]) -> None:
     ours, theirs = table(describe, unseen)["all"], table(sift, unseen)["all"]
-    assert theirs["fpr95"] == pytest.approx(0.5, abs=0.5)  # a set as hard as it was
-    assert ours["fpr95"] <= 0.5
-    assert ours["map"] >= theirs["map"]
+    assert theirs["fpr95"] == pytest.approx(0.144, abs=0.02)  # a set as hard as it was
+    # 0.005 and 0.952 when these weights were made; RootSIFT's mAP is 0.775.
+    assert ours["fpr95"] <= 0.012
+    assert ours["map"] >= 0.94

@@ -62,8 +62,8 @@ def test_turning_a_patch_by_a_right_angle_turns_its_orientation(unseen: TurnedPa
     # numpy's rot90 turns against x towards y.
     turned = np.ascontiguousarray(np.rot90(unseen.patches0, -1, axes=(1, 2)))
     off = np.abs(wrapped_deg(degrees(turned) - degrees(unseen.patches0) - 90.0))
-    assert np.median(off) < 4.0
-    assert (off < 15.0).mean() > 0.8
+    # By construction, unless two directions are as high as each other.
+    assert np.percentile(off, 98) < 1.0
 
 
 def test_a_patch_cut_along_its_orientation_is_upright(unseen: TurnedPairs) -> None:
@@ -94,5 +94,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
 
 def test_the_shipped_weights_find_turns_again(unseen: TurnedPairs) -> None:
     ours, gradients = table(degrees, unseen)["all"], table(gradient_peaks, unseen)["all"]
+    # 6.4 degrees and 0.752 when these weights were made; the histogram's are 5.9 and 0.738.
+    assert ours["median_deg"] < 7.0
     assert ours["within_20"] > gradients["within_20"]
-    assert np.median(errors_deg(degrees, unseen)) < 12.0
+    assert np.median(errors_deg(degrees, unseen)) == pytest.approx(ours["median_deg"], abs=0.01)
