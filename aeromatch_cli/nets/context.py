@@ -69,12 +69,11 @@ class Context(nn.Module):
         super().__init__()
         self.visual, self.geometric = VisualContext(), GeometricContext()
         width = DESCRIPTOR + VISUAL + GEOMETRIC
-        self.fusion = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, 192), nn.ReLU(), nn.Linear(192, DESCRIPTOR)
-        )  # fmt: skip
+        last = nn.Linear(192, DESCRIPTOR)
+        self.fusion = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 192), nn.ReLU(), last)
         # In the beginning, a descriptor is its own.
-        nn.init.zeros_(self.fusion[3].weight)
-        nn.init.zeros_(self.fusion[3].bias)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
 
     def forward(
         self, descriptors: Tensor, places: Tensor, layout: Tensor, neighbours: Tensor, picture: Tensor
