@@ -36,8 +36,10 @@ def compared(pairs: Sequence[ContextPair], describe: Describe) -> dict[str, dict
 
 
 def _judged(pair: ContextPair, describe: Describe, known: dict[int, Array]) -> tuple[float, float]:
-    sides = [known.setdefault(id(view), describe(view)) for view in (pair.view0, pair.view1)]
-    similar = sides[0] @ sides[1].T
+    for view in (pair.view0, pair.view1):
+        if id(view) not in known:
+            known[id(view)] = describe(view)
+    similar = known[id(pair.view0)] @ known[id(pair.view1)].T
     rows = np.arange(len(similar))
     best = similar.argmax(axis=1)
     nearest = similar[rows, best].copy()
