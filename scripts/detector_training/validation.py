@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from aeromatch_cli.data import FloatArray, View
 from aeromatch_cli.nets.detector import Detector
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors.detection import detect
 from aeromatch_cli.strategies.extractors.heat import heat_keypoints
 from aeromatch_cli.strategies.extractors.selection import distinct
 from aeromatch_cli.strategies.extractors.sift import Sift
@@ -65,10 +64,10 @@ def by_sift(sight: Sight) -> FloatArray:
     sift = Sift()
     height, width = sight.gray.shape
     view = View("ground", width, height, np.eye(3), True, 0.0, north_up=True)
-    raw = detect(sift._detector(), ViewPixels(view, sight.gray, sight.valid), 0).upright()
-    strengths = sift._strengths(raw)
+    raw = sift.detected(ViewPixels(view, sight.gray, sight.valid), 0)
+    strengths = sift.strengths(raw)
     raw = raw.take(distinct(raw.points_px, raw.sizes_px, strengths, 2.0))
-    return raw.points_px[np.argsort(-sift._strengths(raw), kind="stable")].astype(np.float64)
+    return raw.points_px[np.argsort(-sift.strengths(raw), kind="stable")].astype(np.float64)
 
 
 def by_heat(network: Detector | None) -> Finder:
