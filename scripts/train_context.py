@@ -7,7 +7,7 @@ learned temperature). Keypoints are dropped, and coarse pictures' brightness cha
 along a cosine; what is kept is a moving average. Validation: the blocks that training_blocks leaves out, with and
 without context.
 
-In float32 on the CPU. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it
+In bfloat16 where the processor has it, else in float32. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it
 was. Writes OUT/context.safetensors (float16), OUT/log.json and OUT/curves.png.
 """
 
@@ -34,6 +34,7 @@ from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
 
 from aeromatch_cli.nets.context import Context
+from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
 from aeromatch_cli.strategies.extractors.detection import Raw
 
@@ -48,7 +49,8 @@ class Run(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(0)
-        self.network = Context()
+        # Channels last: 1.6 times as fast in bfloat16.
+        self.network = Context().to(memory_format=torch.channels_last)
         self.sharpness = torch.nn.Parameter(torch.tensor(math.log(15.0)))
         self.average = copy.deepcopy(self.network).requires_grad_(False)
 
@@ -73,7 +75,9 @@ def inputs(view: ViewSeen, rng: np.random.Generator | None) -> tuple[tuple[Tenso
 
 def loss_of(run: Run, pair: ContextPair, rng: np.random.Generator) -> Tensor:
     (in0, rows0), (in1, rows1) = (inputs(view, rng) for view in (pair.view0, pair.view1))
-    similar = run.sharpness.exp() * run.network(*in0) @ run.network(*in1).T
+    with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
+        known0, known1 = run.network(*in0).float(), run.network(*in1).float()
+    similar = run.sharpness.exp() * known0 @ known1.T
     truth = pair.truth.take(rows0, rows1)
     parts = []
     for scores, mates in ((similar, truth.of0), (similar.T, truth.of1)):
