@@ -7,8 +7,9 @@ learned temperature). Keypoints are dropped, and coarse pictures' brightness cha
 along a cosine; what is kept is a moving average. Validation: the blocks that training_blocks leaves out, with and
 without context.
 
-In bfloat16 where the processor has it, else in float32. OUT/data and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes on where it
-was. Writes OUT/context.safetensors (float16), OUT/log.json and OUT/curves.png.
+In bfloat16 where the processor has it, else in float32. OUT/data and OUT/state.pt are kept: a killed run, or one ended
+by --minutes, goes on where it was; OUT/recipe.json makes sure that it is the same run. Writes OUT/context.safetensors
+(float16), OUT/log.json and OUT/curves.png.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
 
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.nets.precision import has_bfloat16
@@ -39,6 +41,7 @@ from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse
 from aeromatch_cli.strategies.extractors.detection import Raw
 
 DECAY, CLIP, RATE, BATCH = 0.999, 1.0, 1e-3, 4
+OF_RUN = ("blocks", "pairs", "seed")
 REPORT_EVERY = 2_000
 _KEEP = (0.5, 1.0)  # share of the keypoints of a view, drawn for every step
 
@@ -91,11 +94,8 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
     """The finished run, or None where --minutes ended it before."""
     run, started = Run(), time.monotonic()
     optimiser = torch.optim.AdamW([*run.network.parameters(), run.sharpness], RATE, weight_decay=1e-3)
-    state, seen, log = args.out / "state.pt", 0, []
-    if state.is_file():
-        seen, log, own, others = torch.load(state, weights_only=True)
-        run.load_state_dict(own)
-        optimiser.load_state_dict(others)
+    state = args.out / "state.pt"
+    seen, log = load_state(state, run, optimiser)
     plain = compared(unseen, lambda view: inputs(view, None)[0][0].numpy())
     losses: list[float] = []
     while seen < args.pairs:
@@ -104,14 +104,8 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
             group["lr"] = RATE * min(1.0, (seen + 1) / 1000) * (0.5 + 0.5 * math.cos(math.pi * seen / args.pairs))
         chosen = [pairs[int(rng.integers(len(pairs)))] for _ in range(BATCH)]
         loss = torch.stack([loss_of(run, pair, rng) for pair in chosen]).mean()
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
-        optimiser.step()
-        keep = min(DECAY, (seen // BATCH + 1) / (seen // BATCH + 10))
-        with torch.no_grad():
-            for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
-                old.lerp_(new, 1.0 - keep)
+        descend(loss, run.network, optimiser, CLIP)
+        follow(run.average, run.network, seen // BATCH, DECAY)
         losses.append(float(loss.detach()))
         before, seen = seen, seen + BATCH
         ended = bool(args.minutes) and time.monotonic() - started > 60.0 * args.minutes
@@ -123,8 +117,7 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
             log.append(row | {"context": found, "plain": plain})
             print(json.dumps(log[-1]), flush=True)
             losses = []
-            torch.save((seen, log, run.state_dict(), optimiser.state_dict()), state.with_suffix(".partly"))
-            state.with_suffix(".partly").replace(state)
+            save_state(state, seen, log, run, optimiser)
             draw_curves(log, args.out / "curves.png")
         if ended:
             return None
@@ -132,7 +125,7 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
     return run
 
 
-def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
+def draw_curves(log: Log, path: Path) -> None:
     """Rank-1 rate by class of view angle, with context and without (dashed)."""
     from matplotlib.figure import Figure
 
@@ -167,6 +160,7 @@ def main() -> None:
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
+    check_recipe(parser, args, OF_RUN)
     wanted = sorted({*numbers(args.blocks), *LEFT_OUT})
     (args.out / "data").mkdir(parents=True, exist_ok=True)
     rendered = args.rendered or args.out / "blocks"
@@ -183,8 +177,7 @@ def main() -> None:
     if run is not None:
         from safetensors.torch import save_file
 
-        weights = {name: value.half().contiguous() for name, value in run.average.state_dict().items()}
-        save_file(weights, args.out / "context.safetensors")
+        save_file(shipped(run.average), args.out / "context.safetensors")
 
 
 if __name__ == "__main__":

@@ -32,8 +32,9 @@ import torch
 from patch_training.data import prepare, read
 from patch_training.draws import Source, distinct, drawn, looked_at, sources_of
 from patch_training.loss import descriptor_loss
-from patch_training.runs import Run, answered, check_recipe, draw_curves, rate_at, ship
+from patch_training.runs import Run, answered, draw_curves, rate_at, ship
 from patch_training.validation import Describe, Pair, pairs_of, sift, table, tfeat
+from training_runs import check_recipe
 
 from aeromatch_cli.nets.geodesc import GeoDesc, describe
 from aeromatch_cli.nets.patches import fold

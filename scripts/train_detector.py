@@ -27,7 +27,6 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -39,6 +38,7 @@ from detector_training.validation import by_heat, by_sift, pairs_of, scores, tab
 from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
@@ -81,13 +81,10 @@ class Run:
     average: Detector
     optimiser: torch.optim.Optimizer
     step: int
-    log: list[dict[str, Any]]
+    log: Log
 
     def save(self, path: Path) -> None:
-        parts = (self.network, self.average, self.optimiser)
-        partly = path.with_suffix(".partly")
-        torch.save((self.step, self.log, *(part.state_dict() for part in parts)), partly)
-        partly.replace(path)
+        save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
     def begin(cls, path: Path, rate: float) -> Run:
@@ -97,10 +94,7 @@ class Run:
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
         with torch.no_grad():
             network.last.bias.fill_(-3.0)
-        if path.is_file():
-            run.step, run.log, *states = torch.load(path, weights_only=True)
-            for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
-                part.load_state_dict(state)
+        run.step, run.log = load_state(path, run.network, run.average, run.optimiser)
         return run
 
 
@@ -173,14 +167,8 @@ def step(run: Run, phase: Phase, batch: int, sources: Sources, rng: np.random.Ge
         loss, figures = shapes_loss(run.network, batch * 3, rng)
     else:
         loss, figures = views_loss(run.network, phase, groups(phase, batch, sources, rng))
-    run.optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
-    run.optimiser.step()
-    keep = min(DECAY, (run.step + 1) / (run.step + 10))
-    with torch.no_grad():
-        for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
-            old.lerp_(new, 1.0 - keep)
+    descend(loss, run.network, run.optimiser, CLIP)
+    follow(run.average, run.network, run.step, DECAY)
     return figures
 
 
@@ -266,8 +254,7 @@ def write(run: Run, out: Path) -> None:
     """Weights, log and curves as they are now."""
     from safetensors.torch import save_file
 
-    weights = {name: value.half().contiguous() for name, value in run.average.state_dict().items()}
-    save_file(weights, out / "detector.safetensors")
+    save_file(shipped(run.average), out / "detector.safetensors")
     (out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     draw_curves(run.log, out / "curves.png")
 
@@ -289,7 +276,7 @@ def offset_px(network: Detector, blocks: list[list[Sight]]) -> Tensor:
     return torch.from_numpy(np.concatenate(found).mean(axis=0)).float()
 
 
-def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
+def draw_curves(log: Log, path: Path) -> None:
     """Repeatability by steps and view angle at 3 px and 1 px, and SIFT's (dashed)."""
     from matplotlib.figure import Figure
 
@@ -328,16 +315,7 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     shared = {*LEFT_OUT, *numbers(args.unseen)} & set(numbers(args.blocks))
     if shared:
         parser.error(f"--blocks {args.blocks}: {', '.join(map(str, sorted(shared)))} are for validation")
-    asked = {name: str(getattr(args, name)) for name in OF_RUN}
-    path = args.out / "recipe.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    other = [name for name in asked if known.get(name, asked[name]) != asked[name]]
-    if other:
-        parser.error(
-            f"{args.out} holds another run ({', '.join(f'{n} {known[n]}' for n in other)}); give another --out"
-        )
-    args.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(known | asked, indent=1) + "\n", encoding="utf-8")
+    check_recipe(parser, args, OF_RUN)
 
 
 def main() -> None:

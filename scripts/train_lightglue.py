@@ -25,7 +25,6 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -35,6 +34,7 @@ from lightglue_training.data import SHARD, prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import Found, compared, fitted, report, thinned, together
 from training_blocks import LEFT_OUT
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
@@ -94,13 +94,10 @@ class Run:
     average: LightGlue
     optimiser: torch.optim.Optimizer
     seen: int
-    log: list[dict[str, Any]]
+    log: Log
 
     def save(self, path: Path) -> None:
-        parts = (self.network, self.average, self.optimiser)
-        partly = path.with_suffix(".partly")
-        torch.save((self.seen, self.log, *(part.state_dict() for part in parts)), partly)
-        partly.replace(path)
+        save_state(path, self.seen, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
     def begin(cls, path: Path, device: str, rate: float, start: Path | None = None) -> Run:
@@ -109,10 +106,7 @@ class Run:
         network = load_lightglue(start) if start else LightGlue(DIMENSIONS)
         network = network.to(device).requires_grad_(True)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
-        if path.is_file():
-            run.seen, run.log, *states = torch.load(path, map_location=device, weights_only=True)
-            for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
-                part.load_state_dict(state)
+        run.seen, run.log = load_state(path, run.network, run.average, run.optimiser, device=device)
         return run
 
 
@@ -173,15 +167,8 @@ def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, floa
     run.network.train()
     with torch.autocast(device, dtype=torch.bfloat16):
         loss = loss_of(run.network, batch, confidence=phase.confidence)
-    run.optimiser.zero_grad(set_to_none=True)
-    loss.total.backward()
-    torch.nn.utils.clip_grad_norm_(run.network.parameters(), CLIP)
-    run.optimiser.step()
-    steps = run.seen // len(batch.partners0)
-    keep = min(DECAY, (steps + 1) / (steps + 10))
-    with torch.no_grad():
-        for old, new in zip(run.average.parameters(), run.network.parameters(), strict=True):
-            old.lerp_(new, 1.0 - keep)
+    descend(loss.total, run.network, run.optimiser, CLIP)
+    follow(run.average, run.network, run.seen // len(batch.partners0), DECAY)
     return float(loss.total.detach()), loss.partner, loss.none
 
 
@@ -200,7 +187,7 @@ def validation_sets(data: Path, keypoints: tuple[int, int] = (512, 1024)) -> dic
     }
 
 
-def draw_curves(log: list[dict[str, Any]], path: Path) -> None:
+def draw_curves(log: Log, path: Path) -> None:
     """Recall at the ratio test's precision, and what that test recalls (dashed), by pairs seen."""
     from matplotlib.figure import Figure
 
@@ -231,9 +218,8 @@ def finish(run: Run, out: Path) -> None:
     sets = validation_sets(out / "data", (ALL_KEYPOINTS, ALL_KEYPOINTS))
     found = together([compared(network, pairs)[1] for name, pairs in sets.items() if name.startswith("rendered")])
     calibration = fitted(found)
-    weights = {name: value.half().cpu().contiguous() for name, value in network.state_dict().items()}
     metadata = {CALIBRATION_KEY: f"{calibration.slope:.4f} {calibration.offset:.4f}"}
-    save_file(weights, out / "lightglue.safetensors", metadata)
+    save_file(shipped(network), out / "lightglue.safetensors", metadata)
     (out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     draw_reliability({"raw": Calibration(), "calibrated": calibration}, found, out / "reliability.png")
 
@@ -264,17 +250,7 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     for name in (*args.trained_on.split(","), *args.unseen.split(",")):
         if not (args.data / name / "images").is_dir():
             parser.error(f"{args.data / name} has no folder images; see --data, --trained-on and --unseen")
-    names = OF_DATA if args.only_data else (*OF_DATA, *OF_RUN)
-    asked = {name: str(getattr(args, name)) for name in names}
-    path = args.out / "recipe.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    other = [name for name in asked if known.get(name, asked[name]) != asked[name]]
-    if other:
-        parser.error(
-            f"{args.out} holds another run ({', '.join(f'{n} {known[n]}' for n in other)}); give another --out"
-        )
-    args.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(known | asked, indent=1) + "\n", encoding="utf-8")
+    check_recipe(parser, args, OF_DATA if args.only_data else (*OF_DATA, *OF_RUN))
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from patch_training.data import prepare, read
 from patch_training.draws import Source, developed, drawn, sources_of
-from patch_training.runs import Run, answered, check_recipe, draw_curves, rate_at, ship
+from patch_training.runs import Run, answered, draw_curves, rate_at, ship
 from patch_training.turns import (
     Orient,
     TurnedPairs,
@@ -39,6 +39,7 @@ from patch_training.turns import (
     unseen_pairs,
 )
 from torch import Tensor
+from training_runs import check_recipe
 
 from aeromatch_cli.nets.orientation import BINS, OrientationNet, directions
 from aeromatch_cli.nets.patches import fold

@@ -29,6 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 from training_blocks import IMAGES, LEFT_OUT, render
+from training_runs import load_state, save_state
 
 from aeromatch_cli.strategies.enhancers.shadow_mask import Overview, network_inputs
 from aeromatch_cli.strategies.enhancers.tone import Tone
@@ -226,11 +227,8 @@ def train(args: argparse.Namespace, known: list[Any], left_out: list[Any]) -> Sh
         net.load_state_dict(torch.load(args.start, weights_only=False)[3])
     average = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), args.rate, weight_decay=1e-4)
-    state, first, log = args.out / "state.pt", 0, []
-    if state.is_file():
-        first, log, *parts = torch.load(state, weights_only=False)
-        for part, values in zip((net, average, optimiser), parts, strict=True):
-            part.load_state_dict(values)
+    state = args.out / "state.pt"
+    first, log = load_state(state, net, average, optimiser)
     for step in range(first, args.steps):
         rng = np.random.default_rng([step, 1])
         for group in optimiser.param_groups:
@@ -250,7 +248,7 @@ def train(args: argparse.Namespace, known: list[Any], left_out: list[Any]) -> Sh
         if (step + 1) % 200 == 0:
             log.append({"step": step + 1, "loss": loss.item(), "left_out_iou": left_out_iou(average, left_out)})
             print(log[-1], flush=True)
-            torch.save((step + 1, log, net.state_dict(), average.state_dict(), optimiser.state_dict()), state)
+            save_state(state, step + 1, log, net, average, optimiser)
     (args.out / "log.json").write_text(json.dumps(log, indent=1), encoding="utf-8")
     return average.eval()
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ import torch
 from patch_training.data import learnt_from
 from patch_training.draws import cropped, distinct, drawn, sources_of
 from patch_training.loss import descriptor_loss
-from patch_training.runs import check_recipe
 from patch_training.sources import homography
 from patch_training.tracks import Tracks
 from patch_training.turns import gradient_peaks, turned, wrapped_deg
@@ -107,12 +103,3 @@ def test_figures_of_small_sets() -> None:
 
 def test_blocks_for_validation_are_never_learnt_from() -> None:
     assert learnt_from("0-2,15-18,204") == [0, 1, 2, 15, 17]
-
-
-def test_another_recipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    parser = argparse.ArgumentParser()
-    check_recipe(parser, argparse.Namespace(out=tmp_path, steps=5), ("steps",))
-    check_recipe(parser, argparse.Namespace(out=tmp_path, steps=5), ("steps",))
-    with pytest.raises(SystemExit):
-        check_recipe(parser, argparse.Namespace(out=tmp_path, steps=6), ("steps",))
-    assert "holds another run (steps 5)" in capsys.readouterr().err

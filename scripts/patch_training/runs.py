@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import copy
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from training_runs import Log, descend, follow, load_state, save_state, shipped
 
-DECAY = 0.998
+DECAY, CLIP = 0.998, 5.0
 # Patches at once through a network: their answers stay in the cache, and batch norm's statistics are of so many.
 CHUNK = 256
 
@@ -28,7 +26,7 @@ class Run:
     average: nn.Module
     optimiser: torch.optim.Optimizer
     step: int
-    log: list[dict[str, Any]]
+    log: Log
 
     @classmethod
     def begin(cls, path: Path, make: Callable[[], nn.Module], rate: float, seed: int) -> Run:
@@ -37,31 +35,18 @@ class Run:
         network = make().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
         run = cls(network, copy.deepcopy(network), optimiser, 0, [])
-        if path.is_file():
-            run.step, run.log, *states = torch.load(path, weights_only=True)
-            for part, state in zip((run.network, run.average, run.optimiser), states, strict=True):
-                part.load_state_dict(state)
+        run.step, run.log = load_state(path, run.network, run.average, run.optimiser)
         return run
 
     def save(self, path: Path) -> None:
-        parts = (self.network, self.average, self.optimiser)
-        partly = path.with_suffix(".partly")
-        torch.save((self.step, self.log, *(part.state_dict() for part in parts)), partly)
-        partly.replace(path)
+        save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
 
     def learn(self, loss: Tensor, rate: float) -> None:
         """One step of the optimiser, and of the average."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
-        self.optimiser.step()
-        keep = min(DECAY, (self.step + 1) / (self.step + 10))
-        with torch.no_grad():
-            for old, new in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
-                if old.is_floating_point():
-                    old.lerp_(new, 1.0 - keep)
+        descend(loss, self.network, self.optimiser, CLIP)
+        follow(self.average, self.network, self.step, DECAY)
         self.step += 1
 
 
@@ -76,26 +61,12 @@ def rate_at(step: int, total: int, largest: float) -> float:
     return largest * (min(1.0, (step + 1) / (0.04 * total)) * (0.5 + 0.5 * math.cos(math.pi * step / total)) + 0.002)
 
 
-def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, names: Sequence[str]) -> None:
-    """Refuses to go on with a run of other arguments; OUT/recipe.json remembers them."""
-    asked = {name: str(getattr(args, name)) for name in names}
-    path = args.out / "recipe.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else asked
-    other = [f"{name} {known.get(name)}" for name in names if known.get(name) != asked[name]]
-    if other:
-        parser.error(f"{args.out} holds another run ({', '.join(other)}); give another --out")
-    args.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(asked, indent=1) + "\n", encoding="utf-8")
-
-
 def ship(folded: nn.Module, path: Path) -> None:
     """Weights as float16."""
-    save_file({name: value.half().contiguous() for name, value in folded.state_dict().items()}, path)
+    save_file(shipped(folded), path)
 
 
-def draw_curves(
-    log: list[dict[str, Any]], values: dict[str, list[float]], lines: dict[str, float], label: str, path: Path
-) -> None:
+def draw_curves(log: Log, values: dict[str, list[float]], lines: dict[str, float], label: str, path: Path) -> None:
     """Values by step, lines of others to compare with (dashed), and the loss."""
     from matplotlib.figure import Figure
 

@@ -1,0 +1,42 @@
+"""scripts/training_runs: which run a folder holds, states that read back, the average that follows."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+import torch
+from training_runs import check_recipe, descend, follow, load_state, save_state
+
+
+def test_another_recipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parser = argparse.ArgumentParser()
+    check_recipe(parser, argparse.Namespace(out=tmp_path, steps=5), ("steps",))
+    check_recipe(parser, argparse.Namespace(out=tmp_path, steps=5), ("steps",))
+    with pytest.raises(SystemExit):
+        check_recipe(parser, argparse.Namespace(out=tmp_path, steps=6), ("steps",))
+    assert "holds another run (steps 5)" in capsys.readouterr().err
+
+
+def test_a_state_reads_back_and_the_average_follows_slowly(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network, average = torch.nn.BatchNorm1d(3), torch.nn.BatchNorm1d(3)
+    optimiser = torch.optim.AdamW(network.parameters(), 0.1)
+    descend(network(torch.rand(8, 3)).square().sum(), network, optimiser, 1.0)
+    follow(average, network, 0, 0.999)  # a tenth of the old at first
+    assert torch.allclose(average.weight, 0.1 + 0.9 * network.weight)
+    assert torch.allclose(average.running_mean, 0.9 * network.running_mean)
+    before = average.weight.clone()
+    descend(network(torch.rand(8, 3)).square().sum(), network, optimiser, 1.0)
+    follow(average, network, 10**6, 0.999)
+    assert torch.allclose(average.weight, 0.999 * before + 0.001 * network.weight)
+    path = tmp_path / "state.pt"
+    fresh = torch.nn.BatchNorm1d(3)
+    assert load_state(path, fresh) == (0, [])
+    save_state(path, 2, [{"loss": 0.5}], network, optimiser)
+    again = torch.optim.AdamW(fresh.parameters(), 0.1)
+    assert load_state(path, fresh, again) == (2, [{"loss": 0.5}])
+    assert torch.equal(fresh.weight, network.weight)
+    assert again.state_dict()["state"][0]["step"] == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
