@@ -79,15 +79,15 @@ def inputs(view: ViewSeen, rng: np.random.Generator | None) -> tuple[tuple[Tenso
 def loss_of(run: Run, pair: ContextPair, rng: np.random.Generator) -> Tensor:
     (in0, rows0), (in1, rows1) = (inputs(view, rng) for view in (pair.view0, pair.view1))
     with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
-        known0, known1 = run.network(*in0).float(), run.network(*in1).float()
-    similar = run.sharpness.exp() * known0 @ known1.T
+        found0, found1 = run.network(*in0).float(), run.network(*in1).float()
     truth = pair.truth.take(rows0, rows1)
     parts = []
-    for scores, mates in ((similar, truth.of0), (similar.T, truth.of1)):
+    for own, others, mates in ((found0, found1, truth.of0), (found1, found0, truth.of1)):
         known = np.flatnonzero(mates >= 0)
         if len(known):
-            parts.append(torch.nn.functional.cross_entropy(scores[known], torch.from_numpy(mates[known]).long()))
-    return torch.stack(parts).mean() if parts else similar.sum() * 0.0
+            similar = run.sharpness.exp() * own[known] @ others.T
+            parts.append(torch.nn.functional.cross_entropy(similar, torch.from_numpy(mates[known]).long()))
+    return torch.stack(parts).mean() if parts else found0.sum() * 0.0
 
 
 def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Namespace) -> Run | None:

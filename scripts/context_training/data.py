@@ -101,7 +101,7 @@ def _write(folder: Path, path: Path) -> None:
 
 def _views(folder: Path, recipe: tuple[str, ...]) -> Iterator[tuple[str, ViewSeen]]:
     with tempfile.TemporaryDirectory() as scratch:
-        context = prepared(folder, scratch, (f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive", *recipe))
+        context = prepared(folder, scratch, (*recipe, f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive"))
         for image in context.block.images:
             task = extract.task_of(context, image.image_id)
             extract.run_task(task)
