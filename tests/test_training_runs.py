@@ -5,8 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from context_training.data import ContextPair, ViewSeen
+from context_training.validation import compared
+from lightglue_training.sides import Partners, Seen
 from training_runs import check_recipe, descend, follow, load_state, save_state
 
 
@@ -40,3 +44,15 @@ def test_a_state_reads_back_and_the_average_follows_slowly(tmp_path: Path) -> No
     assert torch.equal(fresh.weight, network.weight)
     assert again.state_dict()["state"][0]["step"] == 2
     assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
+
+
+def test_a_log_of_validation_figures_reads_back(tmp_path: Path) -> None:
+    nothing = np.zeros((3, 2))
+    seen = Seen(nothing, nothing, nothing, nothing, nothing, nothing)
+    views = ViewSeen(seen, nothing), ViewSeen(seen, nothing)
+    truth = Partners(np.array([0, 1, -1]), np.array([0, 1, -1]))
+    described = {id(views[0]): np.eye(3), id(views[1]): np.eye(3)[[0, 2, 1]]}
+    found = compared([ContextPair(*views, truth, 30.0)], lambda view: described[id(view)])
+    assert found["20-40"]["rank1"] == 0.5
+    save_state(tmp_path / "state.pt", 4, [{"context": found}])
+    assert load_state(tmp_path / "state.pt") == (4, [{"context": found}])

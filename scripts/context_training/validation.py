@@ -29,7 +29,8 @@ def compared(pairs: Sequence[ContextPair], describe: Describe) -> dict[str, dict
     for low, high in pairwise(ANGLES):
         rows = [_judged(pair, describe, known) for pair in pairs if low <= pair.angle_deg < high]
         if rows:
-            first, precision = np.mean(rows, axis=0)
+            # Plain numbers: a state of others cannot be read back.
+            first, precision = np.mean(rows, axis=0).tolist()
             name = f"{low:.0f}-{high:.0f}" if high < ANGLES[-1] else f"> {low:.0f}"
             table[name] = {"pairs": len(rows), "rank1": round(first, 4), "map": round(precision, 4)}
     return table
