@@ -32,9 +32,8 @@ import torch
 from patch_training.data import prepare, read
 from patch_training.draws import Source, distinct, drawn, looked_at, sources_of
 from patch_training.loss import descriptor_loss
-from patch_training.runs import Run, answered, draw_curves, rate_at, ship
+from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from patch_training.validation import Describe, Pair, pairs_of, sift, table, tfeat
-from training_runs import check_recipe
 
 from aeromatch_cli.nets.geodesc import GeoDesc, describe
 from aeromatch_cli.nets.patches import fold
@@ -43,7 +42,6 @@ GROUPS = 4  # of a batch, each from one block
 # How much pairs of larger view angle are favoured, at the first step and at the last.
 HARDNESS = (-1.0, 1.0)
 REPORT_EVERY, SAVE_EVERY = 100, 25  # steps
-OF_RUN = ("patches", "blocks", "groups", "real", "seed", "steps", "batch", "rate")
 QUICK = 120  # tracks of a pair of pictures, and every so many pairs, while it trains
 PEERS = {"TFeat": "tfeat-liberty.params", "HardTFeat": "HardTFeat.pth"}
 
@@ -111,27 +109,10 @@ def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
-    add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
-    add("--reference", type=Path, help="folder of other descriptors' weights, to compare with")
-    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
-    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--groups", type=int, default=1600, help="groups of homography views, a multiple of 40")
-    add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
-    add("--seed", type=int, default=0)
-    add("--steps", type=int, default=3000)
-    add("--batch", type=int, default=512, help="pairs of a step")
-    add("--rate", type=float, default=3e-3, help="largest learning rate")
-    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
-    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
-    add("--only-data", action="store_true", help="make the data and stop")
-    add("--only-table", action="store_true", help="compare the state as it is and write its weights")
-    add("--out", type=Path, required=True)
-    args = parser.parse_args()
-    args.patches, args.rendered = args.patches or args.out / "data", args.rendered or args.out / "blocks"
-    torch.set_num_threads(args.jobs)
-    check_recipe(parser, args, OF_RUN)
+    add_arguments(parser, others="descriptors", steps=3000, batch=512)
+    parser.add_argument("--only-data", action="store_true", help="make the data and stop")
+    parser.add_argument("--only-table", action="store_true", help="compare the state as it is and write its weights")
+    args = parsed(parser)
     prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     if args.only_data:
         return

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from patch_training.data import prepare, read
 from patch_training.draws import Source, developed, drawn, sources_of
-from patch_training.runs import Run, answered, draw_curves, rate_at, ship
+from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from patch_training.turns import (
     Orient,
     TurnedPairs,
@@ -39,7 +39,6 @@ from patch_training.turns import (
     unseen_pairs,
 )
 from torch import Tensor
-from training_runs import check_recipe
 
 from aeromatch_cli.nets.orientation import BINS, OrientationNet, directions
 from aeromatch_cli.nets.patches import fold
@@ -50,7 +49,6 @@ TOLERANCE_DEG, FLOOR = 7.0, 0.02
 HARDNESS = (-1.0, 0.5)
 REPORT_EVERY, SAVE_EVERY = 200, 50  # steps
 GROUPS = 4
-OF_RUN = ("patches", "blocks", "groups", "real", "seed", "steps", "batch", "rate")
 EACH = 1500  # validation pairs of a set
 PEER = "OriNet.pth"
 
@@ -132,25 +130,8 @@ def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
-    add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
-    add("--reference", type=Path, help="folder of other networks' weights, to compare with")
-    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
-    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--groups", type=int, default=1600, help="groups of homography views, a multiple of 40")
-    add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
-    add("--seed", type=int, default=0)
-    add("--steps", type=int, default=6000)
-    add("--batch", type=int, default=128, help="pairs of a step")
-    add("--rate", type=float, default=3e-3, help="largest learning rate")
-    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
-    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
-    add("--out", type=Path, required=True)
-    args = parser.parse_args()
-    args.patches, args.rendered = args.patches or args.out / "data", args.rendered or args.out / "blocks"
-    torch.set_num_threads(args.jobs)
-    check_recipe(parser, args, OF_RUN)
+    add_arguments(parser, others="networks", steps=6000, batch=128)
+    args = parsed(parser)
     prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     unseen = read(args.patches / "unseen")
     run = Run.begin(args.out / "state.pt", OrientationNet, args.rate, args.seed)

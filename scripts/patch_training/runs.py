@@ -1,7 +1,8 @@
-"""What both recipes share: the state of a run, its recipe on file, learning rate, curves."""
+"""What both recipes share: arguments, the state of a run, learning rate, curves."""
 
 from __future__ import annotations
 
+import argparse
 import copy
 import math
 from collections.abc import Callable
@@ -11,11 +12,40 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from training_runs import Log, descend, follow, load_state, save_state, shipped
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
 
 DECAY, CLIP = 0.998, 5.0
 # Patches at once through a network: their answers stay in the cache, and batch norm's statistics are of so many.
 CHUNK = 256
+OF_RUN = ("patches", "blocks", "groups", "real", "seed", "steps", "batch", "rate")
+
+
+def add_arguments(parser: argparse.ArgumentParser, *, others: str, steps: int, batch: int) -> None:
+    """Those of every recipe. others: whose weights --reference holds."""
+    add = parser.add_argument
+    add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
+    add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
+    add("--reference", type=Path, help=f"folder of other {others}' weights, to compare with")
+    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
+    add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
+    add("--groups", type=int, default=1600, help="groups of homography views, a multiple of 40")
+    add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
+    add("--seed", type=int, default=0)
+    add("--steps", type=int, default=steps)
+    add("--batch", type=int, default=batch, help="pairs of a step")
+    add("--rate", type=float, default=3e-3, help="largest learning rate")
+    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
+    add("--out", type=Path, required=True)
+
+
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The arguments of a run, its folders filled in; refuses to go on with another one."""
+    args = parser.parse_args()
+    args.patches, args.rendered = args.patches or args.out / "data", args.rendered or args.out / "blocks"
+    torch.set_num_threads(args.jobs)
+    check_recipe(parser, args, OF_RUN)
+    return args
 
 
 @dataclass
