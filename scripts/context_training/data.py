@@ -6,23 +6,20 @@ by the orientation network.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from lightglue_training.blocks import prepared
-from lightglue_training.sides import Partners, Seen, partners, seen
+from lightglue_training.blocks import extracted, partnered
+from lightglue_training.data import save_arrays
+from lightglue_training.sides import Partners, Seen
 from numpy.typing import NDArray
 
 from aeromatch_cli.evaluate import open_truth
-from aeromatch_cli.formats import read_features
 from aeromatch_cli.nets.context import REDUCED
-from aeromatch_cli.stages import extract, simulate
+from aeromatch_cli.stages import simulate
 from aeromatch_cli.synthetic import load_truth
 
 _LEARNED = ("extract=learned", "extract.context=false")
@@ -76,38 +73,17 @@ def _write(folder: Path, path: Path) -> None:
     for recipe in RECIPES:
         numbers: dict[str, int] = {}
         known: dict[str, Seen] = {}
-        for name, shown in _views(folder, recipe):
-            numbers[name], known[name] = views, shown.seen
-            arrays[f"view.{views}.coarse"] = shown.coarse
-            arrays |= {f"view.{views}.{key}": value for key, value in shown.seen.arrays().items()}
+        for name, side, task in extracted(folder, recipe, KEYPOINTS):
+            numbers[name], known[name] = views, side
+            arrays[f"view.{views}.coarse"] = _coarse(simulate.render(task.views)[0][0].gray)
+            arrays |= {f"view.{views}.{key}": value for key, value in side.arrays().items()}
             views += 1
-        for name0, name1 in combinations(sorted(known), 2):
-            side0, side1 = known[name0], known[name1]
-            there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
-            there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
-            there0[hidden0], there1[hidden1] = np.nan, np.nan
-            mates = partners(side0, side1, there0, there1)
-            if mates.count >= LEAST_PARTNERS:
-                arrays[f"pair.{pairs}"] = np.array([numbers[name0], numbers[name1]])
-                arrays[f"pair.{pairs}.angle"] = np.array(judge.conditions(name0, name1).view_angle_deg)
-                arrays |= {f"pair.{pairs}.of0": mates.of0, f"pair.{pairs}.of1": mates.of1}
-                pairs += 1
-    arrays |= {"views": np.array(views), "pairs": np.array(pairs)}
-    partly = path.with_suffix(".partly")
-    with partly.open("wb") as stream:
-        np.savez(stream, **arrays)
-    partly.replace(path)
-
-
-def _views(folder: Path, recipe: tuple[str, ...]) -> Iterator[tuple[str, ViewSeen]]:
-    with tempfile.TemporaryDirectory() as scratch:
-        context = prepared(folder, scratch, (*recipe, f"extract.keypoints={KEYPOINTS}", "pairs=exhaustive"))
-        for image in context.block.images:
-            task = extract.task_of(context, image.image_id)
-            extract.run_task(task)
-            features = read_features(task.path)
-            if len(features.descriptors):
-                yield image.name, ViewSeen(seen(features), _coarse(simulate.render(task.views)[0][0].gray))
+        for name0, name1, mates in partnered(truth, known, LEAST_PARTNERS):
+            arrays[f"pair.{pairs}"] = np.array([numbers[name0], numbers[name1]])
+            arrays[f"pair.{pairs}.angle"] = np.array(judge.conditions(name0, name1).view_angle_deg)
+            arrays |= {f"pair.{pairs}.of0": mates.of0, f"pair.{pairs}.of1": mates.of1}
+            pairs += 1
+    save_arrays(path, arrays | {"views": np.array(views), "pairs": np.array(pairs)})
 
 
 def _coarse(gray: Array) -> Array:

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from lightglue_training.blocks import prepared
+from lightglue_training.data import save_arrays
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Camera
@@ -149,9 +150,7 @@ def _bilinear(values: NDArray[np.float32], places_px: Array) -> Array:
 
 def write_sights(path: Path, found: list[Sight]) -> None:
     arrays = {f"{n}.{key}": np.asarray(value) for n, sight in enumerate(found) for key, value in vars(sight).items()}
-    partly = path.with_suffix(".partly.npz")
-    np.savez(partly, **arrays)
-    partly.replace(path)
+    save_arrays(path, arrays)
 
 
 def read_sights(path: Path) -> list[Sight]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -20,7 +20,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.stages import extract, pairs
 from aeromatch_cli.stages.common import Context
-from aeromatch_cli.synthetic import load_truth
+from aeromatch_cli.synthetic import Truth, load_truth
 from lightglue_training.sides import Partners, Seen, partners, seen
 
 RECIPES = ((), ("simulate=none", "extract.orientation=gradient"))
@@ -43,27 +43,35 @@ def block_pairs(folder: Path, keypoints: int = KEYPOINTS, recipes: tuple[tuple[s
     truth, suns = load_truth(folder), _suns(folder)
     found = []
     for recipe in recipes:
-        sides = dict(_sides(folder, recipe, keypoints))
-        for name0, name1 in combinations(sorted(sides), 2):
-            side0, side1 = sides[name0], sides[name1]
-            there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
-            there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
-            there0[hidden0], there1[hidden1] = np.nan, np.nan
-            found_partners = partners(side0, side1, there0, there1)
-            if found_partners.count >= LEAST_PARTNERS:
-                found.append(Pair(side0, side1, found_partners, suns[name0] != suns[name1]))
+        sides = {name: side for name, side, _ in extracted(folder, recipe, keypoints)}
+        for name0, name1, mates in partnered(truth, sides, LEAST_PARTNERS):
+            found.append(Pair(sides[name0], sides[name1], mates, suns[name0] != suns[name1]))
     return found
 
 
-def _sides(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tuple[str, Seen]]:
+def extracted(folder: Path, recipe: tuple[str, ...], keypoints: int) -> Iterator[tuple[str, Seen, extract.ExtractTask]]:
+    """Every picture of a rendered block that has keypoints: its name, what is seen in it, and what made that."""
     with tempfile.TemporaryDirectory() as scratch:
-        context = prepared(folder, scratch, (f"extract.keypoints={keypoints}", "pairs=exhaustive", *recipe))
+        # The recipe comes first: `extract=` resets what was set of it.
+        context = prepared(folder, scratch, (*recipe, f"extract.keypoints={keypoints}", "pairs=exhaustive"))
         for image in context.block.images:
             task = extract.task_of(context, image.image_id)
             extract.run_task(task)
             features = read_features(task.path)
             if len(features.descriptors):
-                yield image.name, seen(features)
+                yield image.name, seen(features), task
+
+
+def partnered(truth: Truth, sides: Mapping[str, Seen], least: int) -> Iterator[tuple[str, str, Partners]]:
+    """Pairs of pictures by name, those with `least` partners or more, and who is whose."""
+    for name0, name1 in combinations(sorted(sides), 2):
+        side0, side1 = sides[name0], sides[name1]
+        there0, hidden0 = truth.transfer(name0, side0.places_px, name1)
+        there1, hidden1 = truth.transfer(name1, side1.places_px, name0)
+        there0[hidden0], there1[hidden1] = np.nan, np.nan
+        mates = partners(side0, side1, there0, there1)
+        if mates.count >= least:
+            yield name0, name1, mates
 
 
 def prepared(folder: Path, workspace: str, changes: Sequence[str]) -> Context:
