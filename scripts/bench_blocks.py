@@ -28,13 +28,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from common import write_readme
+from common import errors_as_exits, fill_in, publish
 from methods.table import Named, named_methods
 from realblocks.cases import Case, answer, check_method, chosen_images, cross_pairs
 from realblocks.counts import count_matches
 from realblocks.tables import Row, blocks_table, cross_table, easy_table
 
-from aeromatch_cli.errors import AeromatchError, ConfigError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.workspace import write_text
@@ -125,9 +125,7 @@ def parse() -> argparse.Namespace:
     section = SECTIONS[args.section]
     if args.quick:
         args.keypoints = args.keypoints or QUICK_KEYPOINTS
-    for key in ("blocks", "thin", "keypoints", "methods"):
-        if getattr(args, key) is None:
-            setattr(args, key, getattr(section, key))
+    fill_in(args, {key: getattr(section, key) for key in ("blocks", "thin", "keypoints", "methods")})
     return args
 
 
@@ -136,7 +134,7 @@ def main() -> None:
     table = SECTIONS[args.section].table
     args.out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    try:
+    with errors_as_exits():
         names = named_methods(args.methods)
         for name in names:
             check_method(name.spec)
@@ -144,14 +142,9 @@ def main() -> None:
             rows.append(row)
             print(json.dumps(row), file=sys.stderr, flush=True)
             write_text(args.out / f"{args.section}.json", json.dumps(rows, indent=1) + "\n")
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     text = table(rows) + "\n"
-    write_text(args.out / f"{args.section}.md", text)
-    print(text)
-    if args.readme is not None:
-        write_readme(f"    {command(args)}\n\n{text}", f"bench_{args.readme or args.section}")
+    markers = None if args.readme is None else f"bench_{args.readme or args.section}"
+    publish(text, args.out / f"{args.section}.md", markers, command(args))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ LABEL=NAME, or LABEL=ours:FILE for other weights of this project's own.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -32,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_readme
+from common import errors_as_exits, fill_in, publish, size_px
 from keypoint_bench.blocks import Asked, blocks
 from keypoint_bench.correspondence import Partners, in_overlap, of_one_size, partners
 from keypoint_bench.descriptors import DESCRIBERS, Describer, Side, make_side, strongest_sift
@@ -44,12 +43,12 @@ from keypoint_bench.tables import descriptor_table
 from methods.base import Options
 from methods.results import write_rows
 from methods.scenes import Judged, JudgedPair
+from methods.worker import limit_threads
 from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.evaluate import RenderedTruth
-from aeromatch_cli.workspace import stable_hash, write_text
+from aeromatch_cli.workspace import stable_hash
 
 Row = dict[str, Any]
 # Keypoints that a picture offers; a pair has those of the overlap.
@@ -156,15 +155,12 @@ def rows_of(
 
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written as they come."""
-    width, _, height = args.size.partition("x")
     options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
     describers = {method: make(DESCRIBERS, method, options) for method in named(args.descriptors, DESCRIBERS)}
     store = Store(args.out / "scenes" / "figures", [args.keypoints, args.angles, args.seed])
     rows: list[Row] = []
     for flight in args.flights.split(","):
-        asked = Asked(
-            tuple(args.scenes.split(",")), flight, (int(width), int(height)), args.images, args.pairs, args.seed
-        )
+        asked = Asked(tuple(args.scenes.split(",")), flight, size_px(args.size), args.images, args.pairs, args.seed)
         for judged, truth in blocks(args.out, asked):
             for row in rows_of(judged, truth, describers, args, store):
                 rows.append(row | {"flight": flight})
@@ -199,27 +195,18 @@ def parse() -> argparse.Namespace:
     add("--readme", action="store_true", help="write the table into the README")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    for key, value in (QUICK if args.quick else FULL).items():
-        if getattr(args, key) is None:
-            setattr(args, key, value)
+    fill_in(args, QUICK if args.quick else FULL)
     return args
 
 
 def main() -> None:
     args = parse()
-    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[variable] = str(args.threads)
-    try:
+    limit_threads(args.threads)
+    with errors_as_exits():
         rows = run(args)
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     text = f"At most {args.keypoints} keypoints of either side, {args.angles}, seed {args.seed}.\n\n"
     text += f"{descriptor_table(rows)}\n"
-    write_text(args.out / "table.md", text)
-    print(text)
-    if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_descriptors")
+    publish(text, args.out / "table.md", "bench_descriptors" if args.readme else None, command(args))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ named NAME, or LABEL=NAME, or LABEL=ours:FILE for other weights of this project'
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -29,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_readme
+from common import errors_as_exits, fill_in, publish, size_px
 from keypoint_bench.blocks import Asked, blocks
 from keypoint_bench.correspondence import in_overlap, partners
 from keypoint_bench.detectors import DETECTORS, Detector, Keypoints
@@ -48,10 +47,9 @@ from keypoint_bench.tables import detector_table, orientation_table
 from methods.base import Options
 from methods.results import write_rows
 from methods.scenes import Judged, JudgedPair
+from methods.worker import limit_threads
 
-from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.evaluate import RenderedTruth
-from aeromatch_cli.workspace import write_text
 
 Row = dict[str, Any]
 # Asked of a detector: enough that 1,000 lie in an overlap of a tenth of the picture.
@@ -140,10 +138,7 @@ def orientation_rows(
 
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written as they come."""
-    width, _, height = args.size.partition("x")
-    asked = Asked(
-        tuple(args.scenes.split(",")), args.flight, (int(width), int(height)), args.images, args.pairs, args.seed
-    )
+    asked = Asked(tuple(args.scenes.split(",")), args.flight, size_px(args.size), args.images, args.pairs, args.seed)
     options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
     detectors = {method: make(DETECTORS, method, options) for method in named(args.detectors, DETECTORS)}
     orienters = {method: make(ORIENTERS, method, options) for method in named(args.orienters, ORIENTERS)}
@@ -189,27 +184,18 @@ def parse() -> argparse.Namespace:
     add("--readme", action="store_true", help="write the tables into the README")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    for key, value in (QUICK if args.quick else FULL).items():
-        if getattr(args, key) is None:
-            setattr(args, key, value)
+    fill_in(args, QUICK if args.quick else FULL)
     return args
 
 
 def main() -> None:
     args = parse()
-    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[variable] = str(args.threads)
-    try:
+    limit_threads(args.threads)
+    with errors_as_exits():
         rows = run(args)
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     text = f"At most {args.keypoints} keypoints of either side, seed {args.seed}.\n\n"
     text += f"{detector_table(rows)}\n\n### Angles\n\n{orientation_table(rows)}\n"
-    write_text(args.out / "table.md", text)
-    print(text)
-    if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_detector")
+    publish(text, args.out / "table.md", "bench_detector" if args.readme else None, command(args))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from bench_methods import FULL
-from common import write_readme
+from common import errors_as_exits, publish, size_px
 from methods.base import Options
 from methods.ours import Preset
 from methods.results import write_rows
@@ -34,7 +34,6 @@ from methods.worker import limit_threads
 
 from aeromatch_cli.config import parse_method
 from aeromatch_cli.data import BoolArray, Candidates, FloatArray, PairGeometry
-from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.evaluate.metrics import thin
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.geometry.planes import plane_distances_px
@@ -50,7 +49,6 @@ from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.synthetic.flights import FLIGHTS
-from aeromatch_cli.workspace import write_text
 
 SWEPT_PX = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 70, 100)
 LOWEST, HIGHEST = 0.3, 0.8  # share of the input that is correct
@@ -251,15 +249,13 @@ def _median_error(rows: Sequence[Row]) -> float:
 
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written scene by scene."""
-    width, _, height = args.size.partition("x")
     folder = args.out / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     (args.out / "filters").mkdir(exist_ok=True)
     code, selection = code_digest("synthetic"), Selection("all", args.pairs, args.seed)
     rows: list[Row] = []
     for preset in filter(None, args.scenes.split(",")):
-        size_px = int(width), int(height)
-        asked = {"size_px": size_px, "images": args.images, "jobs": 2, "code": code, "flight": args.flight}
+        asked = {"size_px": size_px(args.size), "images": args.images, "jobs": 2, "code": code, "flight": args.flight}
         judged = rendered(folder, preset, selection, **asked)
         found = list(inputs(judged, args))
         print(f"{preset}: {len(found)} of {len(judged.pairs)} pairs are 30 to 80 % correct", file=sys.stderr)
@@ -269,6 +265,16 @@ def run(args: argparse.Namespace) -> list[Row]:
         rows += [row(variant, given, args.threshold) for given in found for variant in variants(args.threshold)]
         write_rows(args.out / "filters" / "results.json", rows)
     return rows
+
+
+def command(args: argparse.Namespace) -> str:
+    """This run's command line without machine paths."""
+    parts = f"scripts/bench_filters --features '{args.features}' --scenes {args.scenes} --pairs {args.pairs}"
+    parts += f" --seed {args.seed} --keypoints {args.keypoints} --threshold {args.threshold} --size {args.size}"
+    parts += f" --images {args.images}"
+    if (args.flight, args.ratio) != (MIXED, 1.0):
+        parts += f" --flight {args.flight} --ratio {args.ratio}"
+    return f"{parts} --out DIR"
 
 
 def parse() -> argparse.Namespace:
@@ -293,23 +299,13 @@ def main() -> None:
     args = parse()
     limit_threads(1)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
-    try:
+    with errors_as_exits():
         rows = run(args)
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     if not rows:
         raise SystemExit("no pair is 30 to 80 % correct: give another --seed, --scenes or more --pairs")
+    name = "bench_filters" if args.flight == MIXED else f"bench_filters_{args.flight}"
     text = table(rows, args.threshold)
-    write_text(args.out / "filters" / "table.md", text)
-    print(text)
-    if args.readme:
-        asked = f"--features '{args.features}' --scenes {args.scenes} --pairs {args.pairs} --seed {args.seed}"
-        more = f"--keypoints {args.keypoints} --threshold {args.threshold} --size {args.size} --images {args.images}"
-        if (args.flight, args.ratio) != (MIXED, 1.0):
-            more += f" --flight {args.flight} --ratio {args.ratio}"
-        name = "bench_filters" if args.flight == MIXED else f"bench_filters_{args.flight}"
-        write_readme(f"    scripts/bench_filters {asked} {more} --out DIR\n\n{text}", name)
+    publish(text, args.out / "filters" / "table.md", name if args.readme else None, command(args))
 
 
 if __name__ == "__main__":

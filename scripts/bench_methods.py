@@ -28,7 +28,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from common import write_readme
+from common import errors_as_exits, fill_in, publish, size_px, write_readme
 from methods import worker
 from methods.base import Options
 from methods.goals import Comparison, Row
@@ -40,10 +40,10 @@ from methods.table import CLASSICAL, NEED_WEIGHTS, PEERS, Named, method, named_m
 from methods.worker import Measured
 
 from aeromatch_cli.config import load, parse_method
-from aeromatch_cli.errors import AeromatchError, ConfigError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.synthetic.flights import FLIGHTS
-from aeromatch_cli.workspace import fingerprint, write_text
+from aeromatch_cli.workspace import fingerprint
 
 THREADS = 2
 REAL_MAX_SIZE_PX = 1000
@@ -54,13 +54,11 @@ QUICK = {"scenes": "city,grass", "pairs": 4, "size": "480x360", "images": 12, "k
 
 def scenes(args: argparse.Namespace, selection: Selection) -> Iterator[Judged]:
     """One after the other, each made when it is needed."""
-    width, _, height = args.size.partition("x")
     folder = args.out / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     code = code_digest("synthetic")
     for preset in filter(None, args.scenes.split(",")):
-        size = int(width), int(height)
-        asked = {"size_px": size, "images": args.images, "flight": args.flight}
+        asked = {"size_px": size_px(args.size), "images": args.images, "flight": args.flight}
         yield rendered(folder, preset, selection, jobs=THREADS, code=code, **asked)
     for block in filter(None, args.blocks.split(",")):
         yield real(folder, args.data, block, selection, max_size_px=args.max_size)
@@ -189,9 +187,7 @@ def parse() -> argparse.Namespace:
     add("--readme", nargs="?", const="bench_methods", metavar="NAME", help="write tables between the README's markers")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    for key, value in (QUICK if args.quick else FULL).items():
-        if getattr(args, key) is None:
-            setattr(args, key, value)
+    fill_in(args, QUICK if args.quick else FULL)
     if args.methods is None:
         args.methods = ",".join((*CLASSICAL, "baseline"))
     if args.blocks and args.data is None:
@@ -207,7 +203,7 @@ def main() -> None:
     args = parse()
     worker.limit_threads(THREADS)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
-    try:
+    with errors_as_exits():
         names = named_methods(args.methods)
         for name in names:
             method(name.spec)
@@ -220,12 +216,8 @@ def main() -> None:
         rows = run(args, names)
         if not rows:
             raise ConfigError(f"no scene has a pair of condition {args.condition}: give another --seed or --condition")
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     text = tables(rows, comparison)
-    write_text(args.out / "table.md", text)
-    print(text)
+    publish(text, args.out / "table.md")
     if args.readme:
         chosen = tables(rows, comparison, tuple(args.tables.split(",")))
         write_readme(f"    {command(args)}\n\n{chosen}", args.readme)

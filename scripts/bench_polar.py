@@ -20,7 +20,7 @@ from itertools import chain
 from pathlib import Path
 
 import cv2
-from common import write_readme
+from common import size_px, write_readme
 from polar_bench.grounds import REAL, RENDERED
 from polar_bench.rows import Row, Task, honesty_rows, known_rows, unknown_rows
 from polar_bench.tables import tables
@@ -56,12 +56,11 @@ def main() -> None:
     add("--out", type=Path, required=True)
     args = parser.parse_args()
     cv2.setNumThreads(args.threads)
-    width, height = (int(part) for part in args.size.split("x"))
     args.out.mkdir(parents=True, exist_ok=True)
     kinds = tuple(args.kinds.split(",")) if args.kinds else (*RENDERED, *(REAL if args.data else ()))
     if args.data is None and (real := [kind for kind in kinds if kind not in RENDERED]):
         parser.error(f"{', '.join(real)}: real blocks need --data")
-    task = Task(kinds, (width, height), args.images, args.seed, args.data, args.out / "grounds")
+    task = Task(kinds, size_px(args.size), args.images, args.seed, args.data, args.out / "grounds")
     made = {"known": args.pairs, "unknown": args.unknown, "honesty": args.negatives}
     path = args.out / "results.json"
     old: list[Row] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import write_readme
+from common import errors_as_exits, fill_in, publish, size_px
 from methods.base import Options, Scene
 from methods.goal_tables import markdown
 from methods.ours import Preset
@@ -37,14 +37,13 @@ from methods.sources import code_digest
 from methods.worker import limit_threads
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
-from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.evaluate import BlockTruth, open_truth
 from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.synthetic import Truth, load_truth
-from aeromatch_cli.workspace import stable_hash, write_text
+from aeromatch_cli.workspace import stable_hash
 
 LARGEST_SCALE, LARGEST_TURN_DEG, GOAL = 1.25, 10.0, 0.9
 FULL = {"scenes": "city,suburb,hills", "pairs": 12, "images": 25, "size": "480x360"}
@@ -237,9 +236,7 @@ def parse() -> argparse.Namespace:
     add("--readme", action="store_true", help="write the table into the README")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    for key, value in (QUICK if args.quick else FULL).items():
-        if getattr(args, key) is None:
-            setattr(args, key, value)
+    fill_in(args, QUICK if args.quick else FULL)
     return args
 
 
@@ -257,9 +254,7 @@ def main() -> None:
     (args.out / "scenes").mkdir(parents=True, exist_ok=True)
     (args.out / "rectification").mkdir(exist_ok=True)
     rows: list[Row] = []
-    width, _, height = args.size.partition("x")
-    size_px = int(width), int(height)
-    try:
+    with errors_as_exits():
         for scene in filter(None, args.scenes.split(",")):
             print(scene, file=sys.stderr, flush=True)
             folder = rendered_block(
@@ -267,21 +262,16 @@ def main() -> None:
                 scene,
                 args.seed,
                 "oblique",
-                size_px=size_px,
+                size_px=size_px(args.size),
                 images=args.images,
                 jobs=THREADS,
                 code=code_digest("synthetic"),
             )
             rows += rows_of(folder, scene, args)
             write_rows(args.out / "rectification" / "results.json", [row.listed() for row in rows])
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
     text = table(rows) + "\n"
-    write_text(args.out / "rectification" / "table.md", text)
-    print(text)
-    if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_rectification")
+    markers = "bench_rectification" if args.readme else None
+    publish(text, args.out / "rectification" / "table.md", markers, command(args))
 
 
 if __name__ == "__main__":

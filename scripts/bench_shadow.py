@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import peak_mb, write_readme
+from common import peak_mb, publish, size_px
 from numpy.typing import NDArray
 
 from aeromatch_cli.errors import AeromatchError
@@ -69,7 +69,7 @@ def scene_rows(folder: Path, scene: str) -> Iterator[dict[str, Any]]:
 
 def rendered_rows(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Rows of all pictures of all scenes; blocks are rendered unless they are there."""
-    width, _, height = args.size.partition("x")
+    width_px, height_px = size_px(args.size)
     rows: list[dict[str, Any]] = []
     wanted = [(preset, "mixed", None) for preset in filter(None, args.scenes.split(","))]
     wanted += [(preset, "nadir", (180.0, 89.0)) for preset in filter(None, args.open.split(","))]
@@ -78,7 +78,7 @@ def rendered_rows(args: argparse.Namespace) -> list[dict[str, Any]]:
         folder = args.out / "scenes" / f"{preset}-{flight}-{args.size}-{images}-seed{args.seed}"
         if not (folder / "truth.json").is_file():
             render_block(
-                folder, preset, seed=args.seed, width_px=int(width), height_px=int(height), images=images,
+                folder, preset, seed=args.seed, width_px=width_px, height_px=height_px, images=images,
                 flight=flight, sun_deg=sun_deg,
             )  # fmt: skip
         rows += scene_rows(folder, preset if sun_deg is None else f"{preset}, sun at 89°")
@@ -207,10 +207,7 @@ def main() -> None:
         raise SystemExit(f"error: {error}") from error
     write_text(args.out / "results.json", json.dumps(results, indent=1) + "\n")
     text = tables(results)
-    write_text(args.out / "table.md", text)
-    print(text)
-    if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_shadow")
+    publish(text, args.out / "table.md", "bench_shadow" if args.readme else None, command(args))
 
 
 if __name__ == "__main__":

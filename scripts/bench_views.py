@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from common import write_readme
+from common import errors_as_exits, publish, size_px
 from methods import worker
 from methods.base import Options
 from methods.scenes import Judged, Selection, rendered
@@ -20,20 +20,17 @@ from methods.sources import code_digest
 from methods.table import method, named_methods
 from methods.view_costs import cost_table, view_costs
 
-from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.synthetic import PRESETS
-from aeromatch_cli.workspace import write_text
 
 THREADS = 2
 
 
 def scenes(args: argparse.Namespace) -> Iterator[Judged]:
     """One after the other, rendered unless they are there."""
-    width, _, height = args.size.partition("x")
     folder = args.out / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     selection = Selection(args.condition, args.pairs, args.seed)
-    code, size = code_digest("synthetic"), (int(width), int(height))
+    code, size = code_digest("synthetic"), size_px(args.size)
     for preset in filter(None, args.scenes.split(",")):
         print(preset, file=sys.stderr, flush=True)
         yield rendered(folder, preset, selection, size_px=size, images=args.images, jobs=THREADS, code=code)
@@ -75,17 +72,11 @@ def main() -> None:
     args = parse()
     worker.limit_threads(THREADS)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
-    try:
+    with errors_as_exits():
         for name in named_methods(args.methods):
             method(name.spec)
         text = measure(args) + "\n"
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from error
-    write_text(args.out / "views.md", text)
-    print(text)
-    if args.readme:
-        write_readme(f"    {command(args)}\n\n{text}", "bench_views")
+    publish(text, args.out / "views.md", "bench_views" if args.readme else None, command(args))
 
 
 if __name__ == "__main__":
