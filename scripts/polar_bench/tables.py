@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from methods.goal_tables import markdown
 
 from polar_bench.rows import RIGHT_PX, Row
 
@@ -31,9 +32,7 @@ def _values(rows: Sequence[Row], name: str, section: str) -> list[str]:
 def _table(columns: str, lines: Sequence[Sequence[object]]) -> str:
     if not lines:
         return ""
-    head = columns.split("|")
-    cells = ["| " + " | ".join(str(cell).strip() for cell in line) + " |" for line in (head, *lines)]
-    return "\n".join([cells[0], "|" + "---|" * len(head), *cells[1:]])
+    return markdown([column.strip() for column in columns.split("|")], [[str(cell) for cell in line] for line in lines])
 
 
 def _groups(rows: Sequence[Row], section: str) -> Iterator[tuple[str, str, list[Row]]]:
