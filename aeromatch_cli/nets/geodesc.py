@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.patches import Convolution, Precision, answers, load_folded, standardised
+from aeromatch_cli.nets.patches import Convolution, answers, load_folded, standardised
+from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import SHIPPED_FOLDER
 
 SHIPPED_GEODESC = SHIPPED_FOLDER / "geodesc.safetensors"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.precision import has_bfloat16
+from aeromatch_cli.nets.precision import Precision, layer_type
 from aeromatch_cli.nets.weights import read_tensors
 
 SIDE_PX = 32
 # Patches at once: what a layer answers to so many stays in a core's cache.
 BATCH = 64
 _MAX_NAMED = 3
-Precision = Literal["auto", "float32", "bfloat16"]
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -91,9 +90,7 @@ def load_folded(network: Network, path: Path, precision: Precision = "auto") -> 
     if problems:
         raise ConfigError(f"weights file {path} is not a {type(network).__name__}: {'; '.join(problems)}")
     network.load_state_dict(given, strict=True)
-    native = precision == "auto" and has_bfloat16()
-    kind = torch.bfloat16 if precision == "bfloat16" or native else torch.float32
-    network = network.to(dtype=kind).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = network.to(dtype=layer_type(precision)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network.eval().requires_grad_(False)
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.strategies.extractors.detection import Raw
 
 # Descriptors of unit length as bytes: 128 and so many steps a unit. Their distances stay what they are, to 1 %.
@@ -28,15 +29,15 @@ def with_context(
     descriptors: NDArray[np.float32],
     raw: Raw,
     gray: NDArray[np.uint8],
-    precision: Literal["auto", "float32", "bfloat16"] = "auto",
+    precision: Precision = "auto",
 ) -> NDArray[np.float32]:
     """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them."""
     import torch
 
     from aeromatch_cli.nets.context import shipped_context
-    from aeromatch_cli.nets.precision import has_bfloat16
+    from aeromatch_cli.nets.precision import layer_type
 
-    half = precision == "bfloat16" or (precision == "auto" and has_bfloat16())
+    half = layer_type(precision) == torch.bfloat16
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
         found = shipped_context()(*context_inputs(descriptors, raw, gray))
     return np.asarray(found.float().numpy())

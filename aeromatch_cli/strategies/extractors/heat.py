@@ -62,12 +62,10 @@ def heat_keypoints(
 
 def _shipped() -> Any:
     """The shipped Detector in the type that is fast here."""
-    import torch
-
     from aeromatch_cli.nets.detector import shipped_detector
-    from aeromatch_cli.nets.precision import has_bfloat16
+    from aeromatch_cli.nets.precision import layer_type
 
-    return shipped_detector(torch.bfloat16 if has_bfloat16() else torch.float32)
+    return shipped_detector(layer_type("auto"))
 
 
 def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_AREA_PX) -> Logits:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
 from aeromatch_cli.strategies.extractors.described import Described
@@ -46,7 +47,7 @@ class Learned(Described):
         "axes follow the world's.",
     )
     context: bool = Field(False, description="Descriptors know what is around them: picture and other keypoints.")
-    precision: Literal["auto", "float32", "bfloat16"] = Field(
+    precision: Precision = Field(
         "auto",
         description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
         "one for shards on different processors.",
@@ -113,13 +114,10 @@ class Learned(Described):
         return as_bytes(found)
 
     def _detector(self) -> Any:
-        import torch
-
         from aeromatch_cli.nets.detector import shipped_detector
-        from aeromatch_cli.nets.precision import has_bfloat16
+        from aeromatch_cli.nets.precision import layer_type
 
-        half = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16())
-        return shipped_detector(torch.bfloat16 if half else torch.float32)
+        return shipped_detector(layer_type(self.precision))
 
 
 def _patches(view: ViewPixels, raw: Raw) -> NDArray[np.uint8]:

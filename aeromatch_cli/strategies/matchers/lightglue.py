@@ -19,6 +19,7 @@ from pydantic import Field
 from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.nets.precision import Device, Precision, device_of, layer_type
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
 from aeromatch_cli.strategies.matchers.evidence import most_evident
@@ -72,12 +73,12 @@ class LightGlue(Search):
     max_keypoints: int = Field(
         2048, ge=1, description="Strongest descriptors kept per view; time grows with its square."
     )
-    precision: Literal["auto", "float32", "bfloat16"] = Field(
+    precision: Precision = Field(
         "auto",
         description="Of the network's layers; auto is bfloat16 where the processor has it. Matches "
         "depend on it: name one for shards on different processors.",
     )
-    device: Literal["cpu", "auto"] = Field("cpu", description="`auto` takes CUDA where there is one.")
+    device: Device = Field("cpu", description="`auto` takes CUDA where there is one.")
 
     def reads(self) -> frozenset[str]:
         """The cameras, in which a pair's matches are judged; more where guided or limited to the overlap."""
@@ -229,15 +230,10 @@ def _content_stamp(path: str) -> tuple[int, int]:
 @lru_cache(maxsize=2)
 def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _Matcher:
     """The network, built once per process; the stamp makes a replaced file load again."""
-    import torch
-
     from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
-    from aeromatch_cli.nets.precision import has_bfloat16
 
-    device = "cuda" if recipe.device == "auto" and torch.cuda.is_available() else "cpu"
-    network = load_lightglue(Path(path), device=device)
-    if recipe.precision == "bfloat16" or (recipe.precision == "auto" and has_bfloat16(device)):
-        network = network.with_layers_in(torch.bfloat16)
+    device = device_of(recipe.device)
+    network = load_lightglue(Path(path), device=device).with_layers_in(layer_type(recipe.precision, device))
     calibration = read_calibration(Path(path))
     options = {name: getattr(recipe, name) for name in ("depth_confidence", "width_confidence")}
     options["threshold"] = calibration.score_of(recipe.threshold)
