@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.patches import Convolution, answers, load_folded, standardised
+from aeromatch_cli.nets.patches import Convolution, answers, convolutions, load_folded, standardised
 from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import SHIPPED_FOLDER
 
@@ -32,12 +32,8 @@ class GeoDesc(nn.Module):
 
     def __init__(self, *, folded: bool = False) -> None:
         super().__init__()
-        inside, layers = 1, []
-        for outside, stride in _LAYERS:
-            layers.append(Convolution(inside, outside, 3, stride=stride, folded=folded))
-            inside = outside
-        self.layers = nn.ModuleList(layers)
-        self.last = Convolution(inside, LENGTH, _LAST_SIDE, folded=folded)
+        self.layers = convolutions(_LAYERS, folded=folded)
+        self.last = Convolution(_LAYERS[-1][0], LENGTH, _LAST_SIDE, folded=folded)
 
     def forward(self, patches: Tensor) -> Tensor:
         """(N, 1, 32, 32) gray patches of any type and scale -> (N, 128) float32 of unit length."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.patches import Convolution, answers, load_folded, standardised
+from aeromatch_cli.nets.patches import Convolution, answers, convolutions, load_folded, standardised
 from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import SHIPPED_FOLDER
 
@@ -39,12 +39,8 @@ class OrientationNet(nn.Module):
 
     def __init__(self, *, folded: bool = False) -> None:
         super().__init__()
-        inside, layers = 1, []
-        for outside, stride in _LAYERS:
-            layers.append(Convolution(inside, outside, 3, stride=stride, folded=folded))
-            inside = outside
-        self.layers = nn.ModuleList(layers)
-        self.hidden = Convolution(inside, _HIDDEN, _LAST_SIDE, folded=folded)
+        self.layers = convolutions(_LAYERS, folded=folded)
+        self.hidden = Convolution(_LAYERS[-1][0], _HIDDEN, _LAST_SIDE, folded=folded)
         self.out = nn.Linear(_HIDDEN, BINS // _QUARTERS)
 
     def scores(self, patches: Tensor) -> Tensor:

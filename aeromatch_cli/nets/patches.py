@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,6 +51,15 @@ class Convolution(nn.Module):
         with torch.no_grad():
             other.convolution.weight.copy_(self.convolution.weight * scale[:, None, None, None])
             other.convolution.get_parameter("bias").copy_(bias)
+
+
+def convolutions(layers: Sequence[tuple[int, int]], *, folded: bool) -> nn.ModuleList:
+    """3 x 3 convolutions one after the other, from one channel; layers: channels and stride of each."""
+    inside = [1, *(channels for channels, _ in layers)]
+    return nn.ModuleList(
+        Convolution(before, channels, 3, stride=stride, folded=folded)
+        for before, (channels, stride) in zip(inside, layers, strict=False)
+    )
 
 
 def fold(trained: nn.Module, folded: Network) -> Network:
