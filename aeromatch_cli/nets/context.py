@@ -21,7 +21,6 @@ from aeromatch_cli.nets.weights import load_shipped
 DESCRIPTOR, VISUAL, GEOMETRIC = 128, 64, 64
 NEIGHBOURS = 12
 REDUCED = 4  # view pixels along each side of a pixel of the coarse picture
-_STRIDE = 4  # of the visual network
 _LOCAL_PX = 31  # of the coarse picture: within it, brightness and contrast are made even
 _LOOKS = 32
 
@@ -88,7 +87,10 @@ class Context(nn.Module):
 
 
 def evened(picture: Tensor) -> Tensor:
-    """(1, 1, h, w) without local brightness and contrast."""
+    """(1, 1, h, w) without brightness and contrast of the square of _LOCAL_PX around each pixel, cut at the edge.
+
+    The detector's are smoothed means of cells, edges repeated; the weights of each depend on its own.
+    """
     mean = _blurred(picture)
     spread = (_blurred(picture**2) - mean**2).clamp_min(0.0).sqrt()
     return (picture - mean) / (spread + 0.02)

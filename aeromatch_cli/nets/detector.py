@@ -68,7 +68,11 @@ class Detector(nn.Module):
 
 
 def evened(gray: Tensor) -> Tensor:
-    """Gray (N, 1, H, W) free of local brightness and contrast: gain and offset of the light change nothing."""
+    """Gray (N, 1, H, W) free of local brightness and contrast: gain and offset of the light change nothing.
+
+    Both are smoothed means of cells, edges repeated; the context network's are of squares around each pixel. The
+    weights of each depend on its own.
+    """
     height, width = gray.shape[-2:]
     padded = F.pad(gray, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
     # Less a mean: the difference of large squares would lose the contrast of faint pictures.

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from lightglue_training.blocks import extracted, partnered
 from lightglue_training.data import save_arrays
@@ -18,8 +17,8 @@ from lightglue_training.sides import Partners, Seen
 from numpy.typing import NDArray
 
 from aeromatch_cli.evaluate import open_truth
-from aeromatch_cli.nets.context import REDUCED
 from aeromatch_cli.stages import simulate
+from aeromatch_cli.strategies.extractors.context import coarse_of
 from aeromatch_cli.synthetic import load_truth
 
 _LEARNED = ("extract=learned", "extract.context=false")
@@ -75,7 +74,7 @@ def _write(folder: Path, path: Path) -> None:
         known: dict[str, Seen] = {}
         for name, side, task in extracted(folder, recipe, KEYPOINTS):
             numbers[name], known[name] = views, side
-            arrays[f"view.{views}.coarse"] = _coarse(simulate.render(task.views)[0][0].gray)
+            arrays[f"view.{views}.coarse"] = coarse_of(simulate.render(task.views)[0][0].gray)
             arrays |= {f"view.{views}.{key}": value for key, value in side.arrays().items()}
             views += 1
         for name0, name1, mates in partnered(truth, known, LEAST_PARTNERS):
@@ -84,9 +83,3 @@ def _write(folder: Path, path: Path) -> None:
             arrays |= {f"pair.{pairs}.of0": mates.of0, f"pair.{pairs}.of1": mates.of1}
             pairs += 1
     save_arrays(path, arrays | {"views": np.array(views), "pairs": np.array(pairs)})
-
-
-def _coarse(gray: Array) -> Array:
-    height, width = gray.shape
-    small = max(8, width // REDUCED), max(8, height // REDUCED)
-    return np.asarray(cv2.resize(gray, small, interpolation=cv2.INTER_AREA))

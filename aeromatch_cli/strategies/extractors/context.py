@@ -43,16 +43,21 @@ def with_context(
     return np.asarray(found.float().numpy())
 
 
-def context_inputs(descriptors: NDArray[np.float32], raw: Raw, gray: NDArray[np.uint8]) -> tuple[Any, ...]:
-    """What `nets.context.Context` is asked about features (N,) of one view (H, W): tensors in its order."""
+def coarse_of(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A view (H, W) as the context network sees it: area means, REDUCED times smaller, no side below 8 pixels."""
     import cv2
 
     from aeromatch_cli.nets.context import REDUCED
 
     height, width = gray.shape
     small = max(8, width // REDUCED), max(8, height // REDUCED)
-    coarse = np.asarray(cv2.resize(gray, small, interpolation=cv2.INTER_AREA), np.uint8)
-    return context_inputs_of_coarse(descriptors, raw, coarse, (width, height))
+    return np.asarray(cv2.resize(gray, small, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def context_inputs(descriptors: NDArray[np.float32], raw: Raw, gray: NDArray[np.uint8]) -> tuple[Any, ...]:
+    """What `nets.context.Context` is asked about features (N,) of one view (H, W): tensors in its order."""
+    height, width = gray.shape
+    return context_inputs_of_coarse(descriptors, raw, coarse_of(gray), (width, height))
 
 
 def context_inputs_of_coarse(
