@@ -10,8 +10,8 @@ import torch
 from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.detector import FIELD_PX, REACH_PX, Detector, evened, load_detector, shipped_detector
-from aeromatch_cli.nets.weights import SHIPPED_DETECTOR
+from aeromatch_cli.nets.detector import FIELD_PX, REACH_PX, Detector, evened, load_detector
+from aeromatch_cli.nets.weights import shipped_path
 
 
 @pytest.fixture(scope="module")
@@ -52,18 +52,18 @@ def test_what_is_farther_away_than_the_field_changes_nothing(network: Detector) 
 
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     save_file({"first.weight": torch.zeros(16, 1, 5, 5)}, tmp_path / "half.safetensors")
-    with pytest.raises(ConfigError, match="not a detector"):
+    with pytest.raises(ConfigError, match=r"half\.safetensors is not a Detector: missing: first\.bias.*more"):
         load_detector(tmp_path / "half.safetensors")
 
 
 def test_shipped_weights_are_small_and_shared_by_a_process() -> None:
-    assert SHIPPED_DETECTOR.stat().st_size < 1_000_000
-    assert shipped_detector() is shipped_detector()
-    assert not any(parameter.requires_grad for parameter in shipped_detector().parameters())
+    assert shipped_path("detector").stat().st_size < 1_000_000
+    assert load_detector() is load_detector()
+    assert not any(parameter.requires_grad for parameter in load_detector().parameters())
 
 
 def test_bfloat16_agrees_with_float32() -> None:
     picture = noise(96, 96)
-    exact, fast = (shipped_detector(dtype)(picture) for dtype in (torch.float32, torch.bfloat16))
+    exact, fast = (load_detector(precision=kind)(picture) for kind in ("float32", "bfloat16"))
     assert exact.dtype == fast.dtype == torch.float32
     assert np.corrcoef(exact.flatten(), fast.flatten())[0, 1] > 0.999

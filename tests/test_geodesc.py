@@ -13,8 +13,9 @@ from patch_training.validation import Pair, pairs_of, sift, table
 from safetensors.torch import load_file, save_file
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.geodesc import LENGTH, SHIPPED_GEODESC, GeoDesc, describe, load_geodesc
+from aeromatch_cli.nets.geodesc import LENGTH, GeoDesc, describe, load_geodesc
 from aeromatch_cli.nets.patches import SIDE_PX, fold, standardised
+from aeromatch_cli.nets.weights import shipped_path
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,8 +87,8 @@ def test_bfloat16_is_close_to_float32(unseen: list[Pair]) -> None:
 
 
 def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
-    tensors = load_file(SHIPPED_GEODESC)
-    assert SHIPPED_GEODESC.stat().st_size <= 3_000_000
+    tensors = load_file(shipped_path("geodesc"))
+    assert shipped_path("geodesc").stat().st_size <= 3_000_000
     del tensors["last.convolution.bias"]
     save_file(tensors, tmp_path / "less.safetensors")
     with pytest.raises(ConfigError, match=r"is not a GeoDesc: missing: last\.convolution\.bias"):

@@ -14,8 +14,9 @@ from safetensors.torch import load_file, save_file
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.orientation import SHIPPED_ORIENTATION, OrientationNet, directions, load_orientation
+from aeromatch_cli.nets.orientation import OrientationNet, directions, load_orientation
 from aeromatch_cli.nets.patches import SIDE_PX, fold
+from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 
 
@@ -84,8 +85,8 @@ def test_bfloat16_is_close_to_float32(unseen: TurnedPairs) -> None:
 
 
 def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
-    tensors = load_file(SHIPPED_ORIENTATION)
-    assert SHIPPED_ORIENTATION.stat().st_size <= 3_000_000
+    tensors = load_file(shipped_path("orientation"))
+    assert shipped_path("orientation").stat().st_size <= 3_000_000
     tensors["out.weight"] = tensors["out.weight"][:1].clone()
     save_file(tensors, tmp_path / "one.safetensors")
     with pytest.raises(ConfigError, match=r"is not a OrientationNet: wrong shape: out\.weight"):

@@ -11,12 +11,14 @@ its geometric one from a PointNet over all keypoints of a picture, here from the
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import torch
 import torch.nn.functional as nnf
 from torch import Tensor, nn
 
-from aeromatch_cli.nets.weights import load_shipped
+from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.weights import shipped_path
 
 DESCRIPTOR, VISUAL, GEOMETRIC = 128, 64, 64
 NEIGHBOURS = 12
@@ -116,9 +118,10 @@ def layout_of(points: Tensor, sizes: Tensor, angles: Tensor, neighbours: Tensor)
     return torch.stack([x / mean, y / mean, distance, (sizes[neighbours] / sizes[:, None]).log()], dim=2)
 
 
-@lru_cache(maxsize=1)
-def shipped_context() -> Context:
-    """With the weights that ship, once per process."""
-    network = Context()
-    load_shipped(network, "context")
-    return network
+@lru_cache(maxsize=2)
+def load_context(path: Path | None = None, device: str = "cpu") -> Context:
+    """The network of a weights file, by default the one that ships, once per process, in float32.
+
+    Raises ConfigError where the file is missing or holds another.
+    """
+    return load_network(Context, path or shipped_path("context"), "float32", device)

@@ -9,6 +9,7 @@ scripts/train_detector.py documents the training, trained/detector.md the weight
 
 from __future__ import annotations
 
+import copy
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,8 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.weights import SHIPPED_DETECTOR, read_tensors
+from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.precision import Precision
+from aeromatch_cli.nets.weights import shipped_path
 
 CHANNELS = 16
 _GAPS = (1, 1, 2, 2, 1)
@@ -62,9 +64,8 @@ class Detector(nn.Module):
             return F.conv2d(x.float(), self.last.weight.float(), None if bias is None else bias.float(), padding=1)
 
     def in_bfloat16(self) -> Detector:
-        """Itself, layers changed for faster arithmetic where the processor has it."""
-        self.to(dtype=torch.bfloat16)
-        return self
+        """A copy, layers changed for faster arithmetic where the processor has it."""
+        return copy.deepcopy(self).to(dtype=torch.bfloat16)
 
 
 def evened(gray: Tensor) -> Tensor:
@@ -94,24 +95,16 @@ def _enlarged(cells: Tensor) -> Tensor:
     return F.interpolate(cells, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
 
 
-def load_detector(path: Path) -> Detector:
-    """The network with the weights of a file, float32, for inference. Raises ConfigError where they are another's."""
-    tensors = read_tensors(path)
-    with torch.random.fork_rng(devices=[]):
-        network = Detector()
-    try:
-        network.load_state_dict({name: value.float() for name, value in tensors.items()}, strict=True)
-    except RuntimeError as error:
-        raise ConfigError(f"weights file {path} is not a detector: {error}") from error
-    # As the pictures between the layers lie in memory: another order costs several times the seconds.
+@lru_cache(maxsize=4)
+def load_detector(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> Detector:
+    """The network of a weights file, by default the one that ships, once per process; layers in `precision`.
+
+    Raises ConfigError where the file is missing or holds another.
+    """
+    network = load_network(Detector, path or shipped_path("detector"), precision, device)
+    # As the pictures between the layers lie in memory: another order costs several times the seconds. Unlike
+    # `.to(memory_format=...)`, this leaves the one-channel weights as they are: float32 sums differ in the last digit.
     for parameter in network.parameters():
         if parameter.ndim == 4:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
-    return network.eval().requires_grad_(False)
-
-
-@lru_cache(maxsize=2)
-def shipped_detector(dtype: torch.dtype = torch.float32) -> Detector:
-    """The shipped weights, once per process and type; bfloat16 is for processors that have it."""
-    network = load_detector(SHIPPED_DETECTOR)
-    return network.in_bfloat16() if dtype == torch.bfloat16 else network
+    return network

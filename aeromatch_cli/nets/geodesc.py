@@ -7,7 +7,7 @@ scripts/train_descriptor.py documents the recipe of the weights that ship.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.patches import Convolution, answers, convolutions, load_folded, standardised
+from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
-from aeromatch_cli.nets.weights import SHIPPED_FOLDER
+from aeromatch_cli.nets.weights import shipped_path
 
-SHIPPED_GEODESC = SHIPPED_FOLDER / "geodesc.safetensors"
 LENGTH = 128
 # Channels and stride of the 3 x 3 convolutions: 32 x 32 pixels become 8 x 8.
 _LAYERS = ((32, 1), (32, 1), (64, 2), (64, 1), (128, 2), (128, 1))
@@ -44,9 +44,13 @@ class GeoDesc(nn.Module):
 
 
 @lru_cache(maxsize=4)
-def load_geodesc(path: Path = SHIPPED_GEODESC, precision: Precision = "auto") -> GeoDesc:
-    """The folded network of a weights file, once per process. Raises ConfigError where the file holds another."""
-    return load_folded(GeoDesc(folded=True), path, precision)
+def load_geodesc(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> GeoDesc:
+    """The folded network of a weights file, by default the one that ships, once per process; layers in `precision`.
+
+    Raises ConfigError where the file is missing or holds another.
+    """
+    make = partial(GeoDesc, folded=True)
+    return in_channels_last(load_network(make, path or shipped_path("geodesc"), precision, device))
 
 
 def describe(patches: NDArray[Any], network: GeoDesc | None = None) -> NDArray[np.float32]:

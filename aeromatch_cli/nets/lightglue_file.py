@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.loading import check_same_tensors
 from aeromatch_cli.nets.weights import read_tensors
 
 # kornia's constructor makes it from the number of layers, so a file may have it or leave it out.
@@ -24,7 +24,6 @@ _LAYER_KEY = re.compile(r"^transformers\.(\d+)\.")
 _POSITION_KEY = "posenc.Wr.weight"
 _WIDTH_KEY = "transformers.0.self_attn.out_proj.weight"
 _PROJECTION_KEY = "input_proj.weight"
-_MAX_NAMED = 3
 # Entry of a safetensors file's metadata: slope and offset, separated by a space.
 CALIBRATION_KEY = "calibration"
 
@@ -127,25 +126,8 @@ def load_lightglue(path: Path, *, device: str = "cpu") -> LightGlue:
         tensors = canonical_keys(source)
         with torch.random.fork_rng(devices=[]):
             network = LightGlue(infer_dimensions(tensors))
-        _check_same_tensors(network.state_dict(), tensors)
+        check_same_tensors(network.state_dict(), tensors, _DERIVED)
     except ValueError as error:
         raise ConfigError(f"weights file {path} is not a LightGlue: {error}") from error
     network.load_state_dict({key: tensors[key] for key in network.state_dict()}, strict=True)
     return network.to(device=device, dtype=torch.float32).eval().requires_grad_(False)
-
-
-def _check_same_tensors(expected: dict[str, Any], given: dict[str, Tensor]) -> None:
-    missing = sorted(expected.keys() - given.keys() - _DERIVED)
-    unexpected = sorted(given.keys() - expected.keys() - _DERIVED)
-    shapes = [
-        f"{key} {tuple(given[key].shape)} instead of {tuple(expected[key].shape)}"
-        for key in sorted(expected.keys() & given.keys())
-        if expected[key].shape != given[key].shape
-    ]
-    problems = [
-        f"{what}: {', '.join(keys[:_MAX_NAMED])}" + (f" and {len(keys) - _MAX_NAMED} more" * (len(keys) > _MAX_NAMED))
-        for what, keys in (("missing", missing), ("unexpected", unexpected), ("wrong shape", shapes))
-        if keys
-    ]
-    if problems:
-        raise ValueError("; ".join(problems))

@@ -8,7 +8,7 @@ scripts/train_orientation.py documents the recipe of the weights that ship.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.patches import Convolution, answers, convolutions, load_folded, standardised
+from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
-from aeromatch_cli.nets.weights import SHIPPED_FOLDER
+from aeromatch_cli.nets.weights import shipped_path
 
-SHIPPED_ORIENTATION = SHIPPED_FOLDER / "orientation.safetensors"
 BINS = 36
 _QUARTERS = 4
 # Channels and stride of the 3 x 3 convolutions: 32 x 32 pixels become 8 x 8.
@@ -78,9 +78,13 @@ def bin_angles() -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def load_orientation(path: Path = SHIPPED_ORIENTATION, precision: Precision = "auto") -> OrientationNet:
-    """The folded network of a weights file, once per process. Raises ConfigError where the file holds another."""
-    return load_folded(OrientationNet(folded=True), path, precision)
+def load_orientation(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> OrientationNet:
+    """The folded network of a weights file, by default the one that ships, once per process; layers in `precision`.
+
+    Raises ConfigError where the file is missing or holds another.
+    """
+    make = partial(OrientationNet, folded=True)
+    return in_channels_last(load_network(make, path or shipped_path("orientation"), precision, device))
 
 
 def directions(patches: NDArray[Any], network: OrientationNet | None = None) -> NDArray[np.float32]:

@@ -1,25 +1,20 @@
-"""What the networks that look at patches share: standardised input, convolutions that fold, weights files, batches."""
+"""What the networks that look at patches share: standardised input, convolutions that fold, batches."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.precision import Precision, layer_type
-from aeromatch_cli.nets.weights import read_tensors
+from aeromatch_cli.nets.loading import Network
 
 SIDE_PX = 32
 # Patches at once: what a layer answers to so many stays in a core's cache.
 BATCH = 64
-_MAX_NAMED = 3
-Network = TypeVar("Network", bound=nn.Module)
 
 
 class Convolution(nn.Module):
@@ -83,25 +78,10 @@ def standardised(patches: Tensor) -> Tensor:
     return values / deviation.clamp(min=1e-4)
 
 
-def load_folded(network: Network, path: Path, precision: Precision = "auto") -> Network:
-    """The folded network with the weights of a file, for evaluation on a CPU, channels last.
-
-    precision: of weights and layers; auto is bfloat16 where the processor multiplies it itself. Every tensor comes from
-    the file and every tensor of the file is used; raises ConfigError otherwise.
-    """
-    given, expected = read_tensors(path), network.state_dict()
-    shapes = sorted(key for key in expected.keys() & given.keys() if expected[key].shape != given[key].shape)
-    kinds = {
-        "missing": sorted(expected.keys() - given.keys()),
-        "unexpected": sorted(given.keys() - expected.keys()),
-        "wrong shape": shapes,
-    }
-    problems = [f"{kind}: {', '.join(keys[:_MAX_NAMED])}" for kind, keys in kinds.items() if keys]
-    if problems:
-        raise ConfigError(f"weights file {path} is not a {type(network).__name__}: {'; '.join(problems)}")
-    network.load_state_dict(given, strict=True)
-    network = network.to(dtype=layer_type(precision)).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return network.eval().requires_grad_(False)
+def in_channels_last(network: Network) -> Network:
+    """Itself, with weights in the memory order that is fastest with BATCH patches."""
+    moved: Network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return moved
 
 
 @torch.inference_mode()

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-WEIGHTS_PATH = Path(__file__).parent / "trained" / "shadow.safetensors"
+from aeromatch_cli.nets.weights import shipped_path
+
 SCALES = 5
 MULTIPLE_PX = 2**SCALES  # the first scale works on 2 x 2 pixels at once
 
@@ -24,10 +24,13 @@ Array = NDArray[np.float32]
 
 @lru_cache(maxsize=1)
 def network_weights() -> Mapping[str, Array]:
-    """The shipped weights, once per process: NAME.weight (9 * C_in, C_out) and NAME.bias (C_out,), float32."""
+    """The shipped weights, once per process: NAME.weight (9 * C_in, C_out) and NAME.bias (C_out,), float32.
+
+    Raises ConfigError where the file is missing.
+    """
     from safetensors.numpy import load_file
 
-    return {name: array.astype(np.float32) for name, array in load_file(WEIGHTS_PATH).items()}
+    return {name: array.astype(np.float32) for name, array in load_file(shipped_path("shadow")).items()}
 
 
 def shadow_logits(inputs: Array, weights: Mapping[str, Array]) -> Array:

@@ -20,12 +20,10 @@ from aeromatch_cli.errors import ConfigError, WorkspaceError
 
 if TYPE_CHECKING:
     from torch import Tensor
-    from torch.nn import Module
 
 # Weights that come with the package, each beside its model card.
 SHIPPED_FOLDER = Path(__file__).parent / "trained"
 SHIPPED_LIGHTGLUE = SHIPPED_FOLDER / "lightglue.safetensors"
-SHIPPED_DETECTOR = SHIPPED_FOLDER / "detector.safetensors"
 _SUMS = "SHA256SUMS"  # of what ships, as sha256sum writes and checks them
 SUFFIXES = (".safetensors", ".pth", ".pt")
 
@@ -104,12 +102,6 @@ def shipped_path(name: str) -> Path:
     if not path.is_file():
         raise ConfigError(f"{path} is missing: install aeromatch again (`aeromatch weights verify` lists what ships)")
     return path
-
-
-def load_shipped(network: Module, name: str) -> None:
-    """Fill a network with the weights that ship for it, strictly, in float32, and make it ready for use."""
-    network.load_state_dict({key: value.float() for key, value in read_tensors(shipped_path(name)).items()})
-    network.eval().requires_grad_(False)
 
 
 def shipped_weights() -> tuple[WeightsEntry, ...]:

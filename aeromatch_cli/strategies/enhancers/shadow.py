@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.nets.shadow import WEIGHTS_PATH
+from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.strategies import Enhanced
 from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.relight import relit
@@ -52,8 +52,8 @@ class ShadowEnhancement(Beside):
     )
 
     def fingerprint_files(self) -> tuple[str, ...]:
-        """The network's weights, which ship with the package."""
-        return (str(WEIGHTS_PATH),)
+        """The network's weights, which ship with the package. Raises ConfigError where they are missing."""
+        return (str(shipped_path("shadow")),)
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
         """pixels (H, W) or (H, W, C) uint8 or uint16 -> the same with shadow lifted; mask 255 = shadow.

@@ -34,12 +34,12 @@ def with_context(
     """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them."""
     import torch
 
-    from aeromatch_cli.nets.context import shipped_context
+    from aeromatch_cli.nets.context import load_context
     from aeromatch_cli.nets.precision import layer_type
 
     half = layer_type(precision) == torch.bfloat16
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
-        found = shipped_context()(*context_inputs(descriptors, raw, gray))
+        found = load_context()(*context_inputs(descriptors, raw, gray))
     return np.asarray(found.float().numpy())
 
 

@@ -47,7 +47,9 @@ def heat_keypoints(
     valid: (H, W) where the picture shows something; keypoints whose size reaches beyond are left out.
     network: a Detector, by default the shipped one. The result does not depend on tiles.
     """
-    network = network or _shipped()
+    from aeromatch_cli.nets.detector import load_detector
+
+    network = network or load_detector()
     levels = levels_of(gray)
     maps = [heat(level.gray, network) for level in levels]
     points, sizes, logits = maxima(levels, maps, network.offset_px.double().numpy())
@@ -60,22 +62,14 @@ def heat_keypoints(
     return points[order], sizes[order], 1.0 / (1.0 + np.exp(-ranks[order]))
 
 
-def _shipped() -> Any:
-    """The shipped Detector in the type that is fast here."""
-    from aeromatch_cli.nets.detector import shipped_detector
-    from aeromatch_cli.nets.precision import layer_type
-
-    return shipped_detector(layer_type("auto"))
-
-
 def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_AREA_PX) -> Logits:
     """Log odds (H, W) of the heat of a gray picture (H, W), computed in tiles, then smoothed."""
     import cv2
     import torch
 
-    from aeromatch_cli.nets.detector import CELL_PX
+    from aeromatch_cli.nets.detector import CELL_PX, load_detector
 
-    network = network or _shipped()
+    network = network or load_detector()
     height, width = gray.shape
     out = np.empty((height, width), np.float32)
     with torch.inference_mode():

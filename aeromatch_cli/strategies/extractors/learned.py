@@ -114,10 +114,9 @@ class Learned(Described):
         return as_bytes(found)
 
     def _detector(self) -> Any:
-        from aeromatch_cli.nets.detector import shipped_detector
-        from aeromatch_cli.nets.precision import layer_type
+        from aeromatch_cli.nets.detector import load_detector
 
-        return shipped_detector(layer_type(self.precision))
+        return load_detector(precision=self.precision)
 
 
 def _patches(view: ViewPixels, raw: Raw) -> NDArray[np.uint8]:

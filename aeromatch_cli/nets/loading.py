@@ -1,0 +1,59 @@
+"""Weights files into networks: strictly, for evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.precision import Precision, layer_type
+from aeromatch_cli.nets.weights import read_tensors
+
+_MAX_NAMED = 3
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def load_network(
+    make: Callable[[], Network], path: Path, precision: Precision = "float32", device: str = "cpu"
+) -> Network:
+    """What `make` makes, with the weights of a file in this precision, on "cpu" or "cuda", for evaluation.
+
+    Every tensor comes from the file and every tensor of the file is used; raises ConfigError otherwise. The global
+    generator stays as it was.
+    """
+    given = read_tensors(path)
+    with torch.random.fork_rng(devices=[]):
+        network = make()
+    try:
+        check_same_tensors(network.state_dict(), given)
+    except ValueError as error:
+        raise ConfigError(f"weights file {path} is not a {type(network).__name__}: {error}") from error
+    network.load_state_dict(given, strict=True)
+    return network.to(device=device, dtype=layer_type(precision, device)).eval().requires_grad_(False)
+
+
+def check_same_tensors(
+    expected: Mapping[str, Tensor], given: Mapping[str, Tensor], optional: Collection[str] = ()
+) -> None:
+    """Raises ValueError that names what a network wants and was not given, or the other way round, and other shapes.
+
+    optional: names that either may have or leave out.
+    """
+    missing = sorted(expected.keys() - given.keys() - set(optional))
+    unexpected = sorted(given.keys() - expected.keys() - set(optional))
+    shapes = [
+        f"{key} {tuple(given[key].shape)} instead of {tuple(expected[key].shape)}"
+        for key in sorted(expected.keys() & given.keys())
+        if expected[key].shape != given[key].shape
+    ]
+    problems = [
+        f"{what}: {', '.join(keys[:_MAX_NAMED])}" + (f" and {len(keys) - _MAX_NAMED} more" * (len(keys) > _MAX_NAMED))
+        for what, keys in (("missing", missing), ("unexpected", unexpected), ("wrong shape", shapes))
+        if keys
+    ]
+    if problems:
+        raise ValueError("; ".join(problems))
