@@ -134,19 +134,18 @@ class Settings(_Section):
 
     @model_validator(mode="after")
     def _descriptors_for_matchers(self) -> Settings:
-        if not self.extract.descriptor_length and not self.match.reads_pixels:
-            readers = [name for name, strategy in MATCHERS.items() if strategy.reads_pixels]
+        made, wanted = self.extract.descriptors, self.match.reads_descriptors
+        if not self.match.reads_pixels and (not made or wanted not in ("", made)):
+            # What has no descriptors only pixels can compare; what has them need not be measured anew.
+            readers = [
+                name
+                for name, one in MATCHERS.items()
+                if one.reads_pixels != bool(made) and one.reads_descriptors in ("", made)
+            ]
+            makers = [name for name, one in EXTRACTORS.items() if one.descriptors and wanted in ("", one.descriptors)]
             raise ValueError(
-                f"extract {self.extract.name} describes nothing that match {self.match.name} could compare; "
-                f"use match {' or '.join(readers)}, or another extract"
-            )
-        wanted = self.match.reads_descriptors
-        if wanted and wanted != self.extract.descriptors:
-            makers = [name for name, strategy in EXTRACTORS.items() if getattr(strategy, "descriptors", "") == wanted]
-            readers = [name for name, s in MATCHERS.items() if not s.reads_descriptors and not s.reads_pixels]
-            raise ValueError(
-                f"match {self.match.name} was made for {wanted} descriptors, extract {self.extract.name} makes "
-                f"{self.extract.descriptors or 'none'}; use match {' or '.join(readers)}, or extract {'/'.join(makers)}"
+                f"match {self.match.name} compares {wanted or 'any'} descriptors, extract {self.extract.name} makes "
+                f"{made or 'none'}; use match {' or '.join(readers)}, or extract {' or '.join(makers)}"
             )
         return self
 

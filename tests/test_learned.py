@@ -87,6 +87,14 @@ def test_flat_picture_has_no_features() -> None:
     assert flat.descriptors.shape == (0, 128)
 
 
-def test_matcher_for_other_descriptors_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"made for RootSIFT descriptors.*use match nearest"):
-        load("baseline", ["extract=learned", "match=lightglue"])
+@pytest.mark.parametrize(
+    ("extract", "match", "message"),
+    [
+        ("learned", "lightglue", "compares RootSIFT descriptors, extract learned makes GeoDesc; use match nearest or "),
+        ("lattice", "lightglue", "RootSIFT descriptors, extract lattice makes none; use match polar, or extract sift$"),
+        ("lattice", "nearest", "any descriptors, extract lattice makes none; use match polar, or extract sift or "),
+    ],
+)
+def test_matcher_for_other_descriptors_is_refused(extract: str, match: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load("baseline", [f"extract={extract}", f"match={match}"])

@@ -32,6 +32,7 @@ class Strategy(BaseModel):
     "neighbours" (cameras, poses and ground of the images it is paired with); only that enters the fingerprint, so that
     a change re-does exactly the stages that depend on it. A filter that reads "colour" needs extract.colours.
     reads_pixels: True for a matcher that is also given both images' rasters.
+    descriptors: what those of an extractor are called, "" where it makes none.
     reads_descriptors: the descriptors that a matcher was made for, "" where any will do.
     verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
     """
@@ -40,6 +41,7 @@ class Strategy(BaseModel):
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
     reads_pixels: ClassVar[bool] = False
+    descriptors: ClassVar[str] = ""
     reads_descriptors: ClassVar[str] = ""
     verifies: ClassVar[bool] = True
 

@@ -28,7 +28,6 @@ class Described(Strategy):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 128
-    descriptors: ClassVar[str] = ""
     name: str  # a strategy's own, first in every listing
     keypoints: int = Field(
         4000,

@@ -36,7 +36,6 @@ class Lattice(Strategy):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 0
-    descriptors: ClassVar[str] = ""
     follows_north: ClassVar[bool] = False
     colours: ClassVar[bool] = False
     name: Literal["lattice"] = "lattice"
