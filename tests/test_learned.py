@@ -7,11 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
@@ -74,6 +76,28 @@ def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: f
 def test_upright_features_are_not_turned(picture: NDArray[np.uint8]) -> None:
     assert not extract(picture, orientation="upright").view_orientation_deg.any()
     assert extract(picture).view_orientation_deg.std() > 30.0
+
+
+def test_without_cuda_auto_is_the_cpu(picture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    first, second = (extract(picture, device=device) for device in ("cpu", "auto"))
+    np.testing.assert_array_equal(first.descriptors, second.descriptors)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert [device_of(device) for device in ("cpu", "auto")] == ["cpu", "cuda"]
+
+
+@pytest.mark.parametrize("key", ["extract=learned", "match=lightglue"])
+def test_devices_have_the_same_words_for_every_network(key: str) -> None:
+    place = key.partition("=")[0]
+    with pytest.raises(ConfigError, match=rf"{place}\.device: must be 'cpu' or 'auto' \(got 'cuda'\)"):
+        load("baseline", [key, f"{place}.device=cuda"])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_finds_what_the_cpu_finds(picture: NDArray[np.uint8]) -> None:
+    count, share = share_right(extract(picture), extract(picture, device="auto"), np.eye(2, 3))
+    assert count >= 300
+    assert share > 0.95
 
 
 def test_masked_ground_has_no_keypoints(picture: NDArray[np.uint8]) -> None:

@@ -88,15 +88,17 @@ def in_channels_last(network: Network) -> Network:
 def answers(network: nn.Module, patches: NDArray[Any], length: int) -> NDArray[np.float32]:
     """(N, length) float32 that a network says of patches (N, SIDE_PX, SIDE_PX).
 
-    Always BATCH at a time, the last filled up with zeros: a patch has the same answer whatever goes with it.
+    Always BATCH at a time, the last filled up with zeros: a patch has the same answer whatever goes with it. Computed
+    where the network is.
     """
     if patches.shape[1:] != (SIDE_PX, SIDE_PX):
         raise ValueError(f"patches are of shape {patches.shape}, must be (N, {SIDE_PX}, {SIDE_PX})")
+    device = next(network.parameters()).device
     out = np.empty((len(patches), length), np.float32)
     batch = np.zeros((BATCH, 1, SIDE_PX, SIDE_PX), patches.dtype)
     for start in range(0, len(patches), BATCH):
         count = len(patches[start : start + BATCH])
         batch[:count, 0] = patches[start : start + BATCH]
         batch[count:] = 0
-        out[start : start + count] = network(torch.from_numpy(batch))[:count].numpy()
+        out[start : start + count] = network(torch.from_numpy(batch).to(device))[:count].cpu().numpy()
     return out

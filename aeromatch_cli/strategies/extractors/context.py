@@ -30,17 +30,22 @@ def with_context(
     raw: Raw,
     gray: NDArray[np.uint8],
     precision: Precision = "auto",
+    device: str = "cpu",
 ) -> NDArray[np.float32]:
-    """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them."""
+    """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them.
+
+    Computed on "cpu" or "cuda".
+    """
     import torch
 
     from aeromatch_cli.nets.context import load_context
     from aeromatch_cli.nets.precision import layer_type
 
-    half = layer_type(precision) == torch.bfloat16
-    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
-        found = load_context()(*context_inputs(descriptors, raw, gray))
-    return np.asarray(found.float().numpy())
+    half = layer_type(precision, device) == torch.bfloat16
+    inputs = [values.to(device) for values in context_inputs(descriptors, raw, gray)]
+    with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=half):
+        found = load_context(device=device)(*inputs)
+    return np.asarray(found.float().cpu().numpy())
 
 
 def coarse_of(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:

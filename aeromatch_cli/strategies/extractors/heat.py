@@ -52,7 +52,7 @@ def heat_keypoints(
     network = network or load_detector()
     levels = levels_of(gray)
     maps = [heat(level.gray, network) for level in levels]
-    points, sizes, logits = maxima(levels, maps, network.offset_px.double().numpy())
+    points, sizes, logits = maxima(levels, maps, network.offset_px.double().cpu().numpy())
     inside = _within(valid, points, sizes)
     points, sizes, logits = points[inside], sizes[inside], logits[inside]
     ranks = logits - _FINER * 2.0 * np.log2(sizes / SIZE_PX)
@@ -70,6 +70,7 @@ def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_
     from aeromatch_cli.nets.detector import CELL_PX, load_detector
 
     network = network or load_detector()
+    device = network.offset_px.device
     height, width = gray.shape
     out = np.empty((height, width), np.float32)
     with torch.inference_mode():
@@ -77,7 +78,7 @@ def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_
             assert tile.x0 % CELL_PX == 0
             assert tile.y0 % CELL_PX == 0
             piece = torch.from_numpy(np.ascontiguousarray(gray[tile.y0 : tile.y1, tile.x0 : tile.x1]))
-            found = network(piece.float()[None, None] / 255.0)[0, 0].numpy()
+            found = network(piece.to(device).float()[None, None] / 255.0)[0, 0].cpu().numpy()
             left, top, right, bottom = tile.core
             x0, x1 = int(np.ceil(max(left, tile.x0))), int(np.ceil(min(right, tile.x1)))
             y0, y1 = int(np.ceil(max(top, tile.y0))), int(np.ceil(min(bottom, tile.y1)))

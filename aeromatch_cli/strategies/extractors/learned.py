@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.nets.precision import Precision
+from aeromatch_cli.nets.precision import Device, Precision, device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
 from aeromatch_cli.strategies.extractors.described import Described
@@ -52,6 +52,7 @@ class Learned(Described):
         description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
         "one for shards on different processors.",
     )
+    device: Device = Field("cpu", description="`auto` takes CUDA where there is one.")
 
     @property
     def follows_north(self) -> bool:
@@ -95,8 +96,8 @@ class Learned(Described):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
             upright = self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
             if len(of_view) and not upright:
-                patches = _patches(view, raw.take(of_view))
-                cosine, sine = directions(patches, load_orientation(precision=self.precision)).T
+                network = load_orientation(precision=self.precision, device=device_of(self.device))
+                cosine, sine = directions(_patches(view, raw.take(of_view)), network).T
                 angles[of_view] = np.rad2deg(np.arctan2(sine, cosine))
         return replace(raw, orientations_deg=angles)
 
@@ -104,19 +105,23 @@ class Learned(Described):
         """Descriptor bytes (N, 128), see `context.as_bytes`."""
         from aeromatch_cli.nets.geodesc import describe, load_geodesc
 
+        device = device_of(self.device)
+        network = load_geodesc(precision=self.precision, device=device)
         found = np.zeros((len(raw.view_idx), self.descriptor_length), np.float32)
         for view_idx, view in enumerate(views):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
             if len(of_view):
                 there = raw.take(of_view)
-                plain = describe(_patches(view, there), load_geodesc(precision=self.precision))
-                found[of_view] = with_context(plain, there, view.gray, self.precision) if self.context else plain
+                plain = describe(_patches(view, there), network)
+                if self.context:
+                    plain = with_context(plain, there, view.gray, self.precision, device)
+                found[of_view] = plain
         return as_bytes(found)
 
     def _detector(self) -> Any:
         from aeromatch_cli.nets.detector import load_detector
 
-        return load_detector(precision=self.precision)
+        return load_detector(precision=self.precision, device=device_of(self.device))
 
 
 def _patches(view: ViewPixels, raw: Raw) -> NDArray[np.uint8]:
