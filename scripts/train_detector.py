@@ -342,7 +342,7 @@ def main() -> None:
     unseen = prepared_views(args, numbers(args.unseen))
     if args.validate is not None:
         pairs = thinned(pairs_of(unseen), MOST_PAIRS)
-        for name, find in (("sift", by_sift), ("heat", by_heat(load_detector(args.validate).in_bfloat16()))):
+        for name, find in (("sift", by_sift), ("heat", by_heat(load_detector(args.validate, "bfloat16")))):
             print(json.dumps({name: table(scores(pairs, find, args.keypoints))}), flush=True)
         return
     blocks = prepared_views(args, numbers(args.blocks))

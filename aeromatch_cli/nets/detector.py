@@ -9,7 +9,6 @@ scripts/train_detector.py documents the training, trained/detector.md the weight
 
 from __future__ import annotations
 
-import copy
 from functools import lru_cache
 from pathlib import Path
 
@@ -62,10 +61,6 @@ class Detector(nn.Module):
         with torch.autocast(gray.device.type, enabled=False):
             bias = self.last.bias
             return F.conv2d(x.float(), self.last.weight.float(), None if bias is None else bias.float(), padding=1)
-
-    def in_bfloat16(self) -> Detector:
-        """A copy, layers changed for faster arithmetic where the processor has it."""
-        return copy.deepcopy(self).to(dtype=torch.bfloat16)
 
 
 def evened(gray: Tensor) -> Tensor:
