@@ -169,7 +169,8 @@ def test_support_equals_loops(seed, count, neighbours):
         for first in range(len(a)):
             for second in range(first):
                 longer = max(a[first] @ a[first], a[second] @ a[second])
-                if abs(a[second, 0] * a[first, 1] - a[second, 1] * a[first, 0]) > 0.1 * longer:
+                area0, area1 = (m[second, 0] * m[first, 1] - m[second, 1] * m[first, 0] for m in (a, b))
+                if abs(area0) > 0.1 * longer and area0 * area1 > 0.0:
                     affinity = np.linalg.solve(a[[second, first]], b[[second, first]])
                     squared = ((a @ affinity - b) ** 2).sum(axis=1)
                     expected[i] = max(expected[i], np.maximum(1.0 - squared / 9.0, 0.0).sum() - 2.0)
@@ -183,3 +184,30 @@ def test_neighbours_of_matches_at_one_place_are_others():
     assert around.shape == (8, 3)
     assert (around != np.arange(8)[:, None]).all()
     assert nearest_matches(places[:1], 3).shape == (1, 0)
+
+
+def among_true(places0, places1):
+    """600 true matches, and such places besides."""
+    rng = np.random.default_rng(5)
+    true = rng.uniform([0, 0], [1000, 750], (600, 2))
+    there = true + np.array([30.0, 10.0]) + rng.normal(0, 0.5, true.shape)
+    return np.concatenate([true, places0]), np.concatenate([there, places1])
+
+
+def test_what_falls_together_on_one_spot_goes_whichever_image_comes_first():
+    rng = np.random.default_rng(0)
+    scattered, spot = rng.uniform([300, 200], [550, 450], (100, 2)), rng.uniform([700, 600], [712, 612], (100, 2))
+    points0, points1 = among_true(scattered, spot)
+    assert kept(points0, points1)[600:].mean() < 0.05
+    assert kept(points0, points1)[:600].mean() > 0.98
+    assert np.array_equal(kept(points0, points1), kept(points1, points0))
+
+
+def test_mirrored_neighbourhoods_go():
+    there = np.random.default_rng(0).uniform([300, 200], [400, 300], (60, 2))
+    assert not kept(*among_true(there, there * [-1, 1] + [1200, 300]))[600:].any()
+
+
+def test_support_that_cannot_be_had_is_refused():
+    with pytest.raises(ValueError, match="least 10 is never reached: 12 neighbours support by at most 10"):
+        Graph(least=10)

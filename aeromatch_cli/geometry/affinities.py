@@ -49,8 +49,9 @@ def local_support(
 ) -> tuple[FloatArray, FloatArray]:
     """How many of its neighbours around (M, n) move with each match by one affinity.
 
-    Every two neighbours propose an affinity through the match; each neighbour counts 1 - (distance / threshold)^2, the
-    two that define it not. Returns the support (M,) of the best, 0 to n - 2, and the weights (M, n) behind it.
+    Every two neighbours propose an affinity through the match, unless it mirrors: no surface is seen from behind. Each
+    neighbour counts 1 - (distance / threshold)^2, distances in image 1, the two that define it not. Returns the support
+    (M,) of the best, 0 to n - 2, and the weights (M, n) behind it.
     """
     support, weights = np.zeros(len(around)), np.zeros(around.shape)
     if around.shape[1] < 2:
@@ -73,9 +74,11 @@ def _best_affinity(move0: FloatArray, move1: FloatArray, threshold_px: float) ->
     a, b = move0[:, pairs[:, 0]], move0[:, pairs[:, 1]]
     area = a[0] * b[1] - a[1] * b[0]
     usable = np.abs(area) > np.maximum(_FLATTEST * np.maximum((a**2).sum(axis=0), (b**2).sum(axis=0)), _LEAST_AREA_PX)
+    to_a, to_b = move1[:, pairs[:, 0]], move1[:, pairs[:, 1]]
+    usable &= area * (to_a[0] * to_b[1] - to_a[1] * to_b[0]) > 0.0
     over = np.divide(1.0, area, out=np.zeros_like(area), where=usable)
     # Rows of the affinity that maps the moves a, b of a pair to theirs in image 1.
-    of_a, of_b = move1[:, pairs[:, 0]] * over, move1[:, pairs[:, 1]] * over
+    of_a, of_b = to_a * over, to_b * over
     along_x, along_y = of_a * b[1] - of_b * a[1], of_b * a[0] - of_a * b[0]
     votes = np.empty((count, len(pairs), len(rows)), np.float32)
     for n in range(count):
@@ -96,7 +99,7 @@ def fit_affinities(points0: FloatArray, points1: FloatArray, around: IntArray, w
     x, y = points0[which] - origin0[:, None], points1[which] - origin1[:, None]
     design = np.concatenate([x, np.ones((*x.shape[:2], 1))], axis=2)
     weighted = (design * weights[..., None]).transpose(0, 2, 1)
-    # The square of a pixel on the diagonal keeps a match without supporters solvable; its affinity is never the best.
+    # Next to nothing on the diagonal keeps a match without supporters solvable; its affinity is never the best.
     normal = weighted @ design + 1e-6 * np.eye(3)
     solved = np.linalg.solve(normal, weighted @ y).transpose(0, 2, 1)
     solved[:, :, 2] += origin1 - (solved[:, :, :2] @ origin0[..., None])[..., 0]

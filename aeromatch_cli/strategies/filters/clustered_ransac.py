@@ -31,7 +31,7 @@ class ClusteredRansac(Strategy):
     by: everything is left to the filters after this one, and the verdict is "not verifiable".
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["clustered-ransac"] = "clustered-ransac"
     clusters: int = Field(0, ge=0, description="Clusters at most; 0 = as many as dominant colours.")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from aeromatch_cli.data import BoolArray, Candidates, FloatArray, IntArray, PairGeometry, Verdict
 from aeromatch_cli.geometry.affinities import joint_places, local_support, nearest_matches
@@ -21,18 +21,18 @@ class Graph(Strategy):
     """Keeps the matches that enough of their neighbours move with.
 
     Matches are the nodes of a graph, joined with those nearest by where they lie in both images. A match is supported
-    by the neighbours that one affinity through it explains: some of them, for at a depth step the others lie on another
-    surface. How many it needs follows from how many those half of its neighbours have that have least: sparse parts and
-    strips are not held to the support of open ground, a wrong match among true ones is. Two rounds: the first drops
-    what next to nothing supports, the second compares what is left. Where they would leave fewer than min_matches there
-    is too little to compare by, and everything passes. The graph limits matches and is no evidence for them: the
-    verdict is "not verifiable" with the others kept.
+    by the neighbours that one affinity through it explains, from either image alike: some of them, for at a depth step
+    the others lie on another surface. How many it needs follows from how many those half of its neighbours have that
+    have least: sparse parts and strips are not held to the support of open ground, a wrong match among true ones is.
+    Two rounds: the first drops what next to nothing supports, the second compares what is left. Where they would leave
+    fewer than min_matches there is too little to compare by, and everything passes. The graph limits matches and is no
+    evidence for them: the verdict is "not verifiable" with the others kept.
 
     Source: the graph constraint of J. Geo-inf. Sci. 2021(10), 1823-1837; neighbours as evidence after Aguilar et al.,
     GTM, Image and Vision Computing 27(7), 2009, and Bian et al., GMS, CVPR 2017.
     """
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     verifies: ClassVar[bool] = False
     name: Literal["graph"] = "graph"
@@ -40,7 +40,7 @@ class Graph(Strategy):
     threshold_px: float = Field(
         3.0,
         gt=0.0,
-        description="Largest distance of a neighbour to where it would move, undistorted pixels of image 1.",
+        description="Largest distance of a neighbour to where it would move, undistorted pixels of either image.",
     )
     least: float = Field(
         0.9,
@@ -49,12 +49,21 @@ class Graph(Strategy):
         "well.",
     )
     share: float = Field(
-        0.65,
+        0.6,
         ge=0.0,
         le=1.0,
         description="Support that a match needs, of the mean support of those half of its neighbours with least.",
     )
     min_matches: int = Field(20, ge=8, description="With fewer matches, or where fewer would be left, all pass.")
+
+    @model_validator(mode="after")
+    def _can_be_had(self) -> Self:
+        if self.least >= self.neighbours - 2:
+            raise ValueError(
+                f"least {self.least:g} is never reached: {self.neighbours} neighbours support by at most "
+                f"{self.neighbours - 2}; lower least"
+            )
+        return self
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """errors_px stay unknown: support has no pixels. Nothing is drawn at random."""
@@ -74,7 +83,9 @@ class Graph(Strategy):
         """Which of the matches (M, 2) have support enough."""
         around: IntArray = nearest_matches(joint_places(points0, points1), self.neighbours)
         threshold_px = self.threshold_px if fine else _COARSE * self.threshold_px
-        support, _ = local_support(points0, points1, around, threshold_px)
+        # One way alone, whatever falls together on one spot of image 1 would move with its neighbours.
+        ways = ((points0, points1), (points1, points0))
+        support = np.minimum(*(local_support(*way, around, threshold_px)[0] for way in ways))
         least = np.sort(support[around], axis=1)[:, : around.shape[1] // 2].mean(axis=1)
         return np.asarray(support >= np.maximum(self.share * least if fine else 0.0, self.least))
 
