@@ -6,7 +6,7 @@ top-left pixel of the stored raster.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -288,6 +288,7 @@ class Verdict:
     x1^T M x0 = 0 or x1 ~ H x0, zeros without a model.
     errors_px: (M,) float32 error to the model, NaN where none. rejected: filter name -> matches it dropped.
     relative_rotation: (3, 3) cam1_from_cam0 of the model where it has one, else None.
+    doubt: why those of the matches (M,) bool that later filters leave no longer support the model, "" where they do.
     """
 
     keep: BoolArray
@@ -298,3 +299,4 @@ class Verdict:
     errors_px: FloatArray | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     relative_rotation: FloatArray | None = None
+    doubt: Callable[[BoolArray], str] | None = None

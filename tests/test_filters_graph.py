@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from make_matches import GEOMETRY, chance, houses
 
-from aeromatch_cli.data import Camera, Candidates
+from aeromatch_cli.data import Camera, Candidates, Verdict
 from aeromatch_cli.geometry.affinities import joint_places, local_support, nearest_matches
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.graph import Graph
@@ -211,3 +211,27 @@ def test_mirrored_neighbourhoods_go():
 def test_support_that_cannot_be_had_is_refused():
     with pytest.raises(ValueError, match="least 10 is never reached: 12 neighbours support by at most 10"):
         Graph(least=10)
+
+
+class First:
+    """Leaves so many of the matches, and says nothing of the pair."""
+
+    name = "first"
+
+    def __init__(self, count):
+        self.count = count
+
+    def __call__(self, candidates, geometry, seed):
+        return Verdict(keep=np.arange(len(candidates)) < self.count, state="not verifiable")
+
+
+def test_what_later_filters_leave_must_be_beyond_chance_too():
+    candidates = houses(1400, wrong=0.5, seed=5).candidates
+    few = apply_chain([Poselib(), First(20)], candidates, GEOMETRY, 0)
+    assert few.state == "rejected"
+    assert few.reason == "20 inliers of 1400 matches are no more than chance gives"
+    assert not few.keep.any()
+    assert sum(few.rejected.values()) == 1400
+    enough = apply_chain([Poselib(), First(60)], candidates, GEOMETRY, 0)
+    assert enough.state == "verified"
+    assert enough.keep.sum() == 60

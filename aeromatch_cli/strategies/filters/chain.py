@@ -12,7 +12,7 @@ from aeromatch_cli.data import BoolArray, Candidates, IntArray, PairGeometry, Ve
 from aeromatch_cli.strategies.filters.gate import shortage
 
 # Part of the fingerprint of every verdict; raised when composing changes results.
-VERSION = 1
+VERSION = 2
 
 
 class Filter(Protocol):
@@ -25,7 +25,7 @@ def apply_chain(filters: Sequence[Filter], candidates: Candidates, geometry: Pai
     """One verdict on the matches: each filter sees what those before it left.
 
     A refusal ends the chain and drops everything. Otherwise the last model wins, with its errors, and the pair is
-    verified if the filters after it leave as many matches as the filter of that model asks for inliers; without a model
+    verified if what the filters after it leave would verify it too, as many inliers and beyond chance; without a model
     it is not verifiable, and what the filters left is kept. Reject counts are summed by filter name.
     """
     alive = np.arange(len(candidates))
@@ -43,13 +43,21 @@ def apply_chain(filters: Sequence[Filter], candidates: Candidates, geometry: Pai
             return _refusal(len(candidates), verdict, rejected)
         if verdict.state == "verified" or found.state != "verified":
             found, judged, judge = verdict, given, one
-    if found.state == "verified" and judge is not None and (few := _shortage(judge, len(alive), len(judged))):
+    if judge is not None and (reason := _doubt(found, judge, _mask(len(candidates), alive)[judged])):
         rejected[judge.name] += len(alive)
-        return _refusal(len(candidates), replace(found, state="rejected", reason=few), rejected)
+        return _refusal(len(candidates), replace(found, state="rejected", reason=reason), rejected)
     errors = np.full(len(candidates), np.nan, dtype=np.float32)
     if found.errors_px is not None:
         errors[judged] = found.errors_px
-    return replace(found, keep=_mask(len(candidates), alive), errors_px=errors, rejected=rejected)
+    return replace(found, keep=_mask(len(candidates), alive), errors_px=errors, rejected=rejected, doubt=None)
+
+
+def _doubt(found: Verdict, judge: Filter, left: BoolArray) -> str:
+    """Why what is left (M,) of the matches given to the filter that verified the pair does not verify it."""
+    if found.state != "verified" or bool((left == found.keep).all()):
+        return ""
+    few = _shortage(judge, int(left.sum()), len(left))
+    return few if few or found.doubt is None else found.doubt(left)
 
 
 def _shortage(judge: Filter | None, left: int, matches: int) -> str:

@@ -44,9 +44,9 @@ class Gated(Strategy):
         distance_px: Distance,
         points0_px: FloatArray,
         points1_px: FloatArray,
-        inliers: BoolArray,
         threshold_px: float,
         sample: int,
+        inliers: BoolArray,
     ) -> str:
         """Why inliers (N,) of the matches (N, 2) do not verify the pair, "" if they do."""
         count = int(inliers.sum())
@@ -65,15 +65,15 @@ class Gated(Strategy):
         self,
         usable: BoolArray,
         inliers: BoolArray,
-        refusal: str,
+        refused: Callable[[BoolArray], str],
         kind: Literal["E", "F", "H"],
         model: FloatArray,
         errors_px: FloatArray,
         rotation: FloatArray | None = None,
     ) -> Verdict:
-        """On the M matches given, from what is known of the usable ones (N,)."""
+        """On the M matches given, from what is known of the usable ones (N,). refused: `refusal` of inliers (N,)."""
         keep = np.zeros(len(usable), dtype=bool)
-        if refusal:
+        if refusal := refused(inliers):
             return Verdict(keep=keep, state="rejected", reason=refusal)
         keep[usable] = inliers
         errors = np.full(len(usable), np.nan, dtype=np.float32)
@@ -85,6 +85,7 @@ class Gated(Strategy):
             model=model,
             errors_px=errors,
             relative_rotation=rotation,
+            doubt=lambda left: refused(inliers & left[usable]),
         )
 
     def epipolar_verdict(
@@ -92,6 +93,6 @@ class Gated(Strategy):
     ) -> Verdict:
         """Of an epipolar geometry found in the usable matches (N, 2), its inliers within the threshold."""
         distance = partial(sampson_distance_px, found.pixel_model)
-        refusal = self.refusal(distance, points0_px, points1_px, found.inliers, threshold_px, found.sample)
+        refused = partial(self.refusal, distance, points0_px, points1_px, threshold_px, found.sample)
         errors = distance(points0_px, points1_px)
-        return self.verdict(usable, found.inliers, refusal, found.kind, found.model, errors, found.rotation)
+        return self.verdict(usable, found.inliers, refused, found.kind, found.model, errors, found.rotation)

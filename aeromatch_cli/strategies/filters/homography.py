@@ -40,8 +40,8 @@ class Homography(Gated):
         distance = partial(_distance_px, matrix)
         errors = distance(points0, points1)
         inliers = errors <= self.threshold_px
-        refusal = self.refusal(distance, points0, points1, inliers, self.threshold_px, H_SAMPLE)
-        return self.verdict(usable, inliers, refusal, "H", matrix, errors)
+        doubt = partial(self.refusal, distance, points0, points1, self.threshold_px, H_SAMPLE)
+        return self.verdict(usable, inliers, doubt, "H", matrix, errors)
 
 
 def _distance_px(matrix: FloatArray, points0_px: FloatArray, points1_px: FloatArray) -> FloatArray:
