@@ -78,7 +78,7 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
 
 
 def described_by(run: Run) -> Describe:
-    """The averaged network as it is used, in bfloat16 where the processor has it."""
+    """The averaged network as it is used, in bfloat16."""
     network = fold(run.average.eval(), GeoDesc(folded=True)).to(torch.bfloat16)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return lambda patches: describe(patches, network)

@@ -87,9 +87,9 @@ class Run:
         save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
-    def begin(cls, path: Path, rate: float) -> Run:
+    def begin(cls, path: Path, rate: float, seed: int) -> Run:
         """Where the state file left it, else from nothing."""
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         network = Detector().to(memory_format=torch.channels_last)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
         with torch.no_grad():
@@ -111,7 +111,7 @@ def train(args: argparse.Namespace, sources: Sources, unseen: list[list[Sight]])
     plan = phases(args.scale)
     total = sum(phase.steps for phase in plan)
     state, started = args.out / "state.pt", time.monotonic()
-    run = Run.begin(state, args.rate)
+    run = Run.begin(state, args.rate, args.seed)
     pairs = thinned(pairs_of(unseen), MOST_PAIRS)
     if not run.log:
         run.log.append({"step": 0, "phase": "sift", "unseen": table(scores(pairs, by_sift, args.keypoints))})

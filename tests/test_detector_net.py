@@ -52,7 +52,7 @@ def test_what_is_farther_away_than_the_field_changes_nothing(network: Detector) 
 
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     save_file({"first.weight": torch.zeros(16, 1, 5, 5)}, tmp_path / "half.safetensors")
-    with pytest.raises(ConfigError, match=r"half\.safetensors is not a Detector: missing: first\.bias.*more"):
+    with pytest.raises(ConfigError, match=r"half\.safetensors does not fit Detector: missing: first\.bias.*more"):
         load_detector(tmp_path / "half.safetensors")
 
 

@@ -91,7 +91,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
     assert shipped_path("geodesc").stat().st_size <= 3_000_000
     del tensors["last.convolution.bias"]
     save_file(tensors, tmp_path / "less.safetensors")
-    with pytest.raises(ConfigError, match=r"is not a GeoDesc: missing: last\.convolution\.bias"):
+    with pytest.raises(ConfigError, match=r"does not fit GeoDesc: missing: last\.convolution\.bias"):
         load_geodesc(tmp_path / "less.safetensors")
 
 

@@ -336,7 +336,7 @@ def test_a_replaced_file_is_loaded_again(tmp_path: Path) -> None:
     matcher = LightGlue(weights=str(write(path, seeded_tensors(SIFT))))
     assert len(matcher(features(50), features(50), GEOMETRY).indices) > 20
     write(path, {"conv1.weight": torch.zeros(3, 3)})
-    with pytest.raises(ConfigError, match="not a LightGlue"):
+    with pytest.raises(ConfigError, match="does not fit LightGlue"):
         matcher(features(50), features(50), GEOMETRY)
 
 

@@ -143,7 +143,9 @@ def test_wrong_shapes_are_named(tmp_path: Path) -> None:
 
 def test_other_networks_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "weights.pth"
-    with pytest.raises(ConfigError, match=r"not a LightGlue: it has no posenc\.Wr\.weight and no transformers\.0"):
+    with pytest.raises(
+        ConfigError, match=r"does not fit LightGlue: it has no posenc\.Wr\.weight and no transformers\.0"
+    ):
         load_lightglue(write(path, {"conv1.weight": torch.zeros(3, 3)}))
     six = seeded_tensors(SIFT) | {"posenc.Wr.weight": torch.zeros(16, 6)}  # corners of affine frames
     with pytest.raises(ConfigError, match="keypoints have 6 coordinates"):

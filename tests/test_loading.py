@@ -43,7 +43,9 @@ def test_a_missing_shipped_file_is_named(
 def test_another_networks_file_is_named(load: Callable[..., Any], network: str, tmp_path: Path) -> None:
     path = tmp_path / "linear.safetensors"
     save_file({"weight": torch.zeros(2, 2)}, path)
-    with pytest.raises(ConfigError, match=rf"linear\.safetensors is not a {network}: missing: .*unexpected: weight"):
+    with pytest.raises(
+        ConfigError, match=rf"linear\.safetensors does not fit {network}: missing: .*unexpected: weight"
+    ):
         load(path)
 
 

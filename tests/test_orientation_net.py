@@ -89,7 +89,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
     assert shipped_path("orientation").stat().st_size <= 3_000_000
     tensors["out.weight"] = tensors["out.weight"][:1].clone()
     save_file(tensors, tmp_path / "one.safetensors")
-    with pytest.raises(ConfigError, match=r"is not a OrientationNet: wrong shape: out\.weight"):
+    with pytest.raises(ConfigError, match=r"does not fit OrientationNet: wrong shape: out\.weight"):
         load_orientation(tmp_path / "one.safetensors")
 
 

@@ -117,7 +117,7 @@ def test_a_taken_name_is_not_overwritten(lightglue_file: Path, tmp_path: Path) -
 def test_what_no_network_takes_is_not_added(tmp_path: Path) -> None:
     path = tmp_path / "linear.safetensors"
     save_file({"weight": torch.zeros(2, 2)}, path)
-    with pytest.raises(ConfigError, match="is not a LightGlue"):
+    with pytest.raises(ConfigError, match="does not fit LightGlue"):
         add_weights(path)
     assert not weights_folder().exists()
 

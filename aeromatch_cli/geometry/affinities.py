@@ -16,7 +16,7 @@ from aeromatch_cli.data import FloatArray, IntArray
 _FLATTEST = 0.1
 # Neighbours closer than float32 tells apart span no affinity; its terms would overflow.
 _LEAST_AREA_PX = 1e-6
-_CHUNK = 4096
+_VOTES_AT_ONCE = 3_500_000  # float32, of every neighbour on every two of them
 _TINY = 1e-12
 
 
@@ -56,8 +56,10 @@ def local_support(
     support, weights = np.zeros(len(around)), np.zeros(around.shape)
     if around.shape[1] < 2:
         return support, weights
-    for start in range(0, len(around), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    count = around.shape[1]
+    chunk = max(1, _VOTES_AT_ONCE // (count * count * (count - 1) // 2))
+    for start in range(0, len(around), chunk):
+        part = slice(start, start + chunk)
         # Float32 is exact to 1e-4 px here and twice as fast; matches run along the last axis.
         move0, move1 = (
             np.ascontiguousarray((p[around[part]] - p[part, None]).transpose(2, 1, 0), np.float32)

@@ -31,7 +31,7 @@ _FLAT = 1.0 / 255.0
 
 
 class Detector(nn.Module):
-    """Heat of gray pictures; layers may run in bfloat16, the entrance and the last layer are float32 always.
+    """Heat of gray pictures; layers may run in bfloat16, but the entrance and the last layer's sums are float32 always.
 
     offset_px: (2,) x and y, how far from its place in the picture the top of the heat is on the average: as far as it
     changes sides when the picture is turned by half. What reads places from the heat takes it off.

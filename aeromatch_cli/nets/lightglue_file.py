@@ -128,6 +128,6 @@ def load_lightglue(path: Path, *, device: str = "cpu") -> LightGlue:
             network = LightGlue(infer_dimensions(tensors))
         check_same_tensors(network.state_dict(), tensors, _DERIVED)
     except ValueError as error:
-        raise ConfigError(f"weights file {path} is not a LightGlue: {error}") from error
+        raise ConfigError(f"weights file {path} does not fit LightGlue: {error}") from error
     network.load_state_dict({key: tensors[key] for key in network.state_dict()}, strict=True)
     return network.to(device=device, dtype=torch.float32).eval().requires_grad_(False)

@@ -31,7 +31,7 @@ def load_network(
     try:
         check_same_tensors(network.state_dict(), given)
     except ValueError as error:
-        raise ConfigError(f"weights file {path} is not a {type(network).__name__}: {error}") from error
+        raise ConfigError(f"weights file {path} does not fit {type(network).__name__}: {error}") from error
     network.load_state_dict(given, strict=True)
     return network.to(device=device, dtype=layer_type(precision, device)).eval().requires_grad_(False)
 

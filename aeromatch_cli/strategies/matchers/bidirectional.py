@@ -15,6 +15,8 @@ from aeromatch_cli.strategies.matchers.search import Search
 class Bidirectional(Search):
     """Mutual nearest neighbours whose ratio holds from either image. Scores are 1 - the larger of both ratios.
 
+    Guided, a second search around the places that the verified ones predict follows, as in every `Search`: by place and
+    likeness, without ratio.
     At 0.85 from either image SIFT finds a little more correct matches than at 0.8 from one, as few of them wrong.
     Source: the purification of J. Geo-inf. Sci. 2021(10), 1823-1837.
     """
