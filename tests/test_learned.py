@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -36,10 +37,12 @@ def picture() -> NDArray[np.uint8]:
     return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.8))
 
 
-def extract(gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None, **settings: Any) -> Features:
+def extract(
+    gray: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None, north_up: bool = False, **settings: Any
+) -> Features:
     height, width = gray.shape
     camera = Camera("PINHOLE", width, height, (500.0, 500.0, (width - 1) / 2, (height - 1) / 2))
-    view = View("source", width, height, np.eye(3), is_source=True, angle_deg=0.0)
+    view = View("source", width, height, np.eye(3), is_source=True, angle_deg=0.0, north_up=north_up)
     return Learned(**{"keypoints": 400, **settings})(camera, (ViewPixels(view, gray, valid),))
 
 
@@ -76,6 +79,33 @@ def test_matches_survive_turns_and_light(picture: NDArray[np.uint8], turn_deg: f
 def test_upright_features_are_not_turned(picture: NDArray[np.uint8]) -> None:
     assert not extract(picture, orientation="upright").view_orientation_deg.any()
     assert extract(picture).view_orientation_deg.std() > 30.0
+
+
+def test_where_north_is_up_nothing_is_turned_unless_asked(picture: NDArray[np.uint8]) -> None:
+    assert not extract(picture, north_up=True).view_orientation_deg.any()
+    assert extract(picture, north_up=True, orientation="network").view_orientation_deg.std() > 30.0
+
+
+def test_a_small_budget_buys_the_surest_and_spreads_them(picture: NDArray[np.uint8]) -> None:
+    every = extract(picture, keypoints=100_000)
+    surest = np.sort(every.responses)[::-1]
+    one_cell = extract(picture, keypoints=40, per_cell=100_000)
+    # Of the 160 surest, which the budget chooses from; blobs that answer twice are one.
+    np.testing.assert_allclose(np.sort(one_cell.responses)[::-1], surest[:40], atol=0.02)
+    cells = {tuple(cell) for cell in (extract(picture, keypoints=160, per_cell=10).keypoints_px // 80).astype(int)}
+    assert len(cells) == 16
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({}, ["detector", "geodesc", "orientation"]),
+        ({"detector": "sift", "orientation": "upright"}, ["geodesc"]),
+        ({"context": True}, ["context", "detector", "geodesc", "orientation"]),
+    ],
+)
+def test_the_weights_that_are_asked_are_part_of_the_recipe(settings: dict[str, Any], names: list[str]) -> None:
+    assert [Path(path).stem for path in Learned(**settings).fingerprint_files()] == names
 
 
 def test_without_cuda_auto_is_the_cpu(picture: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch) -> None:
