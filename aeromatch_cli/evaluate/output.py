@@ -106,7 +106,10 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
     if "skipped" in consumer:
         rows.append(("mapping", f"skipped: {consumer['skipped']}"))
     else:
-        rows.append(("mapping", f"{consumer['registered']} of {evaluation.images} images in one model"))
+        why = (
+            "" if consumer["registered"] else ": COLMAP found no pair to begin with (points of two images do not count)"
+        )
+        rows.append(("mapping", f"{consumer['registered']} of {evaluation.images} images in one model{why}"))
         if "points" in consumer:
             length, error = _shown(consumer["track_length"]), _shown(consumer["reprojection_error_px"])
             rows.append(("mapped points", f"{consumer['points']}, track length {length}, error {error} px"))

@@ -24,7 +24,7 @@ def manage_weights(action: str, path: str | None) -> Result:
         return Result(lines, facts, wrong)
     entries, shipped = weights.list_weights(), weights.shipped_weights()
     table = [(e, "  (ships, used without a setting)") for e in shipped] + [(e, "") for e in entries]
-    listed = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e6:.1f} MB  {e.sha256}{note}" for e, note in table)
+    listed = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e3:,.0f} kB  {e.sha256}{note}" for e, note in table)
     return Result(
         (*listed, *(() if entries else (nothing,))),
         {"weights": [e.name for e in entries], "shipped": [e.name for e in shipped]},
