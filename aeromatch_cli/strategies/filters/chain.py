@@ -9,7 +9,6 @@ from typing import Protocol
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Candidates, IntArray, PairGeometry, Verdict
-from aeromatch_cli.strategies.filters.gate import shortage
 
 # Part of the fingerprint of every verdict; raised when composing changes results.
 VERSION = 2
@@ -31,20 +30,20 @@ def apply_chain(filters: Sequence[Filter], candidates: Candidates, geometry: Pai
     alive = np.arange(len(candidates))
     rejected: dict[str, int] = {}
     found, judged = Verdict(keep=_mask(len(alive), alive), state="not verifiable", reason="no filter was given"), alive
-    judge: Filter | None = None
+    judge = ""
     for one in filters:
         verdict, given = one(candidates.take(alive), geometry, seed), alive
         alive = given[verdict.keep]
         rejected[one.name] = rejected.get(one.name, 0) + len(given) - len(alive)
         if verdict.state == "rejected" or len(alive) == 0:
             if verdict.state == "not verifiable" and found.state == "verified":
-                reason = _shortage(judge, len(given), len(judged)) or f"{one.name} left no match"
+                reason = _doubt(found, _mask(len(candidates), given)[judged]) or f"{one.name} left no match"
                 verdict = replace(verdict, state="rejected", reason=reason)
             return _refusal(len(candidates), verdict, rejected)
         if verdict.state == "verified" or found.state != "verified":
-            found, judged, judge = verdict, given, one
-    if judge is not None and (reason := _doubt(found, judge, _mask(len(candidates), alive)[judged])):
-        rejected[judge.name] += len(alive)
+            found, judged, judge = verdict, given, one.name
+    if reason := _doubt(found, _mask(len(candidates), alive)[judged]):
+        rejected[judge] += len(alive)
         return _refusal(len(candidates), replace(found, state="rejected", reason=reason), rejected)
     errors = np.full(len(candidates), np.nan, dtype=np.float32)
     if found.errors_px is not None:
@@ -52,17 +51,11 @@ def apply_chain(filters: Sequence[Filter], candidates: Candidates, geometry: Pai
     return replace(found, keep=_mask(len(candidates), alive), errors_px=errors, rejected=rejected, doubt=None)
 
 
-def _doubt(found: Verdict, judge: Filter, left: BoolArray) -> str:
+def _doubt(found: Verdict, left: BoolArray) -> str:
     """Why what is left (M,) of the matches given to the filter that verified the pair does not verify it."""
-    if found.state != "verified" or bool((left == found.keep).all()):
+    if found.state != "verified" or found.doubt is None or bool((left == found.keep).all()):
         return ""
-    few = _shortage(judge, int(left.sum()), len(left))
-    return few if few or found.doubt is None else found.doubt(left)
-
-
-def _shortage(judge: Filter | None, left: int, matches: int) -> str:
-    """Why what is left of its inliers is too few for the filter that verified the pair, "" if it is not."""
-    return shortage(left, matches, getattr(judge, "min_inliers", 0))
+    return found.doubt(left)
 
 
 def _refusal(count: int, verdict: Verdict, rejected: dict[str, int]) -> Verdict:

@@ -15,6 +15,7 @@ from aeromatch_cli.geometry.planes import Planes, fit_planes
 from aeromatch_cli.geometry.two_view import undistorted
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.colour import dominant_colours
+from aeromatch_cli.strategies.filters.gate import shortage
 
 # Without colours: matches for each cluster.
 _MATCHES_PER_CLUSTER = 64
@@ -65,6 +66,7 @@ class ClusteredRansac(Strategy):
             model_kind="H",
             model=found.homographies[largest],
             errors_px=errors,
+            doubt=lambda left: shortage(int((keep & left).sum()), len(keep), self.min_inliers),
         )
 
     def _explained(self, found: Planes) -> BoolArray:

@@ -69,7 +69,8 @@ def _paint(s: Samples) -> Painted:
     sand = shades((0.40, 0.335, 0.235), 1.0 + 0.07 * fine + 0.05 * patch + 0.05 * broad)
     # The last waves' drift lies in lines along the shore; below them the sand is wet.
     line = np.abs(s.z_m - LEVEL_M - 0.42 - 0.07 * broad)
-    drift = np.clip(1.0 - line / (0.035 + 0.02 * fine), 0.0, 1.0) * np.clip(0.3 + 0.6 * patch, 0.0, 1.0)
+    width = np.maximum(0.035 + 0.02 * fine, 0.005)
+    drift = np.clip(1.0 - line / width, 0.0, 1.0) * np.clip(0.3 + 0.6 * patch, 0.0, 1.0)
     wet = np.clip((0.30 + 0.06 * broad - height) / 0.16, 0.0, 1.0)
     colour = mix(sand, (0.12, 0.095, 0.06), 0.6 * drift) * (1.0 - 0.52 * wet)[:, None]
     relief = slopes(s.u_m, s.v_m, s.footprint_m, ((0.11, 0.10), (0.4, 0.10), (1.3, 0.07)), s.seed, 149)
