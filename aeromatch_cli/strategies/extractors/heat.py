@@ -16,8 +16,9 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.strategies.extractors.pyramid import Level, levels_of
 from aeromatch_cli.strategies.extractors.tiles import tiles
 
-# Diameter of a keypoint in pixels of its level: its patch is then 32 of them (pyramid.SUPPORT).
-SIZE_PX = 5.0
+# Diameter of a keypoint in pixels of its level: its patch is then 48 of them (pyramid.SUPPORT). 32 give 3 % more
+# correct matches on renders and 4 to 14 % fewer on photographs, whose finest detail is the camera's own.
+SIZE_PX = 7.5
 # Pixels of a level that the network works on at once: what its layers hold stays small.
 TILE_AREA_PX = 500_000
 _TILE_MARGIN_PX = 64

@@ -35,7 +35,7 @@ _CHOICE = 4
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(
