@@ -1,8 +1,8 @@
 """Seconds that an image takes to have its features, by extractor; decoding is not counted.
 
 One rendered oblique picture, --keypoints descriptors, one process with --threads threads; a row is the median of --runs
-calls of the strategy after one that warms it up. Upright: as in views with north up, where no angle is asked for.
-Writes OUT/extraction/results.json and OUT/extraction/table.md.
+calls of the strategy after one that warms it up; with a CUDA device the networks have rows there, too. Upright: as in
+views with north up, where no angle is asked for. Writes OUT/extraction/results.json and OUT/extraction/table.md.
 """
 
 from __future__ import annotations
@@ -63,7 +63,11 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
     views = (ViewPixels(view, gray, None),)
     cv2.setNumThreads(args.threads)
     torch.set_num_threads(args.threads)
-    for name, settings in VARIANTS.items():
+    variants = dict(VARIANTS)
+    if torch.cuda.is_available():
+        learned = {name: s for name, s in VARIANTS.items() if s["name"] == "learned"}
+        variants |= {f"{name}, CUDA": settings | {"device": "auto"} for name, settings in learned.items()}
+    for name, settings in variants.items():
         extractor: Any = EXTRACTORS[settings["name"]](**settings, keypoints=args.keypoints)
         seconds, found = timed(lambda extractor=extractor: extractor(camera, views), args.runs)
         row = {"extractor": name, "size": args.size, "descriptors": len(found.descriptors)}
@@ -81,8 +85,11 @@ def timed(call: Callable[[], Any], runs: int) -> tuple[float, Any]:
 
 
 def table(rows: list[Row]) -> str:
-    lines = [[row["extractor"], str(row["descriptors"]), f"{row['seconds']:.2f}"] for row in rows]
-    return markdown(("extractor", "descriptors", "seconds"), lines)
+    lines = [
+        [row["extractor"], str(row["descriptors"]), f"{row['seconds']:.2f}", f"{1.0 / row['seconds']:.2f}"]
+        for row in rows
+    ]
+    return markdown(("extractor", "descriptors", "seconds", "images a second"), lines)
 
 
 def main() -> None:

@@ -7,9 +7,9 @@ learned temperature). Keypoints are dropped, and coarse pictures' brightness cha
 along a cosine; what is kept is a moving average. Validation: the blocks that training_blocks leaves out, with and
 without context.
 
-In bfloat16 where the processor has it, else in float32. OUT/data and OUT/state.pt are kept: a killed run, or one ended
-by --minutes, goes on where it was; OUT/recipe.json makes sure that it is the same run. Writes OUT/context.safetensors
-(float16), OUT/log.json and OUT/curves.png.
+In bfloat16 where the processor has it, else in float32; on a CUDA device where there is one. OUT/data and OUT/state.pt
+are kept: a killed run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it is the same
+run. Writes OUT/context.safetensors (float16), OUT/log.json and OUT/curves.png.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
 
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.nets.precision import has_bfloat16
@@ -53,8 +53,8 @@ class Run(torch.nn.Module):
         super().__init__()
         torch.manual_seed(0)
         # Channels last: 1.6 times as fast in bfloat16.
-        self.network = Context().to(memory_format=torch.channels_last)
-        self.sharpness = torch.nn.Parameter(torch.tensor(math.log(15.0)))
+        self.network = Context().to(training_device(), memory_format=torch.channels_last)
+        self.sharpness = torch.nn.Parameter(torch.tensor(math.log(15.0), device=training_device()))
         self.average = copy.deepcopy(self.network).requires_grad_(False)
 
 
@@ -76,17 +76,22 @@ def inputs(view: ViewSeen, rng: np.random.Generator | None) -> tuple[tuple[Tenso
     return context_inputs_of_coarse(descriptors, raw, coarse, size), rows
 
 
+def on(given: tuple[Tensor, ...], device: torch.device) -> tuple[Tensor, ...]:
+    return tuple(part.to(device) for part in given)
+
+
 def loss_of(run: Run, pair: ContextPair, rng: np.random.Generator) -> Tensor:
     (in0, rows0), (in1, rows1) = (inputs(view, rng) for view in (pair.view0, pair.view1))
-    with torch.autocast("cpu", torch.bfloat16, enabled=has_bfloat16()):
-        found0, found1 = run.network(*in0).float(), run.network(*in1).float()
+    device = run.sharpness.device
+    with torch.autocast(device.type, torch.bfloat16, enabled=has_bfloat16(device.type)):
+        found0, found1 = (run.network(*on(given, device)).float() for given in (in0, in1))
     truth = pair.truth.take(rows0, rows1)
     parts = []
     for own, others, mates in ((found0, found1, truth.of0), (found1, found0, truth.of1)):
         known = np.flatnonzero(mates >= 0)
         if len(known):
             similar = run.sharpness.exp() * own[known] @ others.T
-            parts.append(torch.nn.functional.cross_entropy(similar, torch.from_numpy(mates[known]).long()))
+            parts.append(torch.nn.functional.cross_entropy(similar, torch.from_numpy(mates[known]).long().to(device)))
     return torch.stack(parts).mean() if parts else found0.sum() * 0.0
 
 
@@ -95,7 +100,8 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
     run, started = Run(), time.monotonic()
     optimiser = torch.optim.AdamW([*run.network.parameters(), run.sharpness], RATE, weight_decay=1e-3)
     state = args.out / "state.pt"
-    seen, log = load_state(state, run, optimiser)
+    device = run.sharpness.device
+    seen, log = load_state(state, run, optimiser, device=device.type)
     plain = compared(unseen, lambda view: inputs(view, None)[0][0].numpy())
     losses: list[float] = []
     while seen < args.pairs:
@@ -111,7 +117,7 @@ def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Na
         ended = bool(args.minutes) and time.monotonic() - started > 60.0 * args.minutes
         if seen // REPORT_EVERY > before // REPORT_EVERY or seen >= args.pairs or ended:
             with torch.inference_mode():
-                found = compared(unseen, lambda view: run.average(*inputs(view, None)[0]).numpy())
+                found = compared(unseen, lambda view: run.average(*on(inputs(view, None)[0], device)).cpu().numpy())
             minutes = round((time.monotonic() - started) / 60.0, 1)
             row = {"seen": seen, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
             log.append(row | {"context": found, "plain": plain})

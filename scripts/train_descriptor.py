@@ -14,9 +14,9 @@ average.
 Validation knows neither the scenes nor the flights: pairs of pictures of rendered blocks of other seeds. Beside it
 stand RootSIFT and, with --reference, TFeat and HardTFeat on the same patches.
 
-OUT/state.pt is kept: a killed run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it
-is the same run. Writes OUT/geodesc.safetensors (float16, batch norm folded in), OUT/log.json, OUT/table.json and
-OUT/curves.png.
+On the CPU, and on a CUDA device where there is one. OUT/state.pt is kept: a killed run, or one ended by --minutes, goes
+on where it was; OUT/recipe.json makes sure that it is the same run. Writes OUT/geodesc.safetensors (float16, batch norm
+folded in), OUT/log.json, OUT/table.json and OUT/curves.png.
 """
 
 from __future__ import annotations
@@ -59,8 +59,9 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
         first, second = (torch.cat([side[i] for side in sides]) for i in (0, 1))
         run.network.train()
         # Both sides of a pair go through together.
-        both = answered(run.network, torch.stack([first, second], dim=1).flatten(0, 1)).view(len(first), 2, -1)
-        loss = descriptor_loss(both[:, 0], both[:, 1], distinct(groups))
+        both = answered(run.network, torch.stack([first, second], dim=1).flatten(0, 1), run.device)
+        both = both.view(len(first), 2, -1)
+        loss = descriptor_loss(both[:, 0], both[:, 1], distinct(groups).to(run.device))
         run.learn(loss, rate_at(run.step, args.steps, args.rate))
         losses.append(float(loss.detach()))
         if run.step % REPORT_EVERY == 0 or run.step == args.steps:
@@ -79,7 +80,7 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
 
 def described_by(run: Run) -> Describe:
     """The averaged network as it is used, in bfloat16."""
-    network = fold(run.average.eval(), GeoDesc(folded=True)).to(torch.bfloat16)
+    network = fold(run.average.eval(), GeoDesc(folded=True)).to(run.device, torch.bfloat16)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return lambda patches: describe(patches, network)
 

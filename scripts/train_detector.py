@@ -12,9 +12,9 @@ directly: what counts is how many keypoints of the one, within a budget, the oth
 Validation: rendered blocks that are left out, by view angle, exactly --keypoints keypoints in the
 overlap, one-to-one at 3 and 1 px, beside the project's SIFT on the same views.
 
-On the CPU with layers in bfloat16. OUT/views and OUT/state.pt are kept: a killed run, or one ended by --minutes, goes
-on where it was; OUT/recipe.json makes sure that it is the same run. Writes OUT/detector.safetensors (float16),
-OUT/log.json and OUT/curves.png.
+With layers in bfloat16, on the CPU and on a CUDA device where there is one. OUT/views and OUT/state.pt are kept: a
+killed run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it is the same run. Writes
+OUT/detector.safetensors (float16), OUT/log.json and OUT/curves.png.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from detector_training.validation import by_heat, by_sift, pairs_of, scores, tab
 from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
@@ -87,14 +87,14 @@ class Run:
         save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
-    def begin(cls, path: Path, rate: float, seed: int) -> Run:
+    def begin(cls, path: Path, rate: float, seed: int, device: str) -> Run:
         """Where the state file left it, else from nothing."""
         torch.manual_seed(seed)
-        network = Detector().to(memory_format=torch.channels_last)
+        network = Detector().to(device, memory_format=torch.channels_last)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
         with torch.no_grad():
             network.last.bias.fill_(-3.0)
-        run.step, run.log = load_state(path, run.network, run.average, run.optimiser)
+        run.step, run.log = load_state(path, run.network, run.average, run.optimiser, device=device)
         return run
 
 
@@ -111,7 +111,7 @@ def train(args: argparse.Namespace, sources: Sources, unseen: list[list[Sight]])
     plan = phases(args.scale)
     total = sum(phase.steps for phase in plan)
     state, started = args.out / "state.pt", time.monotonic()
-    run = Run.begin(state, args.rate, args.seed)
+    run = Run.begin(state, args.rate, args.seed, training_device())
     pairs = thinned(pairs_of(unseen), MOST_PAIRS)
     if not run.log:
         run.log.append({"step": 0, "phase": "sift", "unseen": table(scores(pairs, by_sift, args.keypoints))})
@@ -175,7 +175,7 @@ def step(run: Run, phase: Phase, batch: int, sources: Sources, rng: np.random.Ge
 def shapes_loss(network: Detector, count: int, rng: np.random.Generator) -> tuple[Tensor, Counter[str]]:
     made = [shape(SIDE_PX, rng) for _ in range(count)]
     logits = forward(network, torch.from_numpy(np.stack([gray for gray, _ in made])))
-    target = drawn([corners for _, corners in made], SIDE_PX)
+    target = drawn([corners for _, corners in made], SIDE_PX).to(logits.device)
     loss = label_loss(logits, target, _inner(torch.ones_like(logits)))
     return loss, Counter({"shapes": float(loss.detach())})
 
@@ -197,7 +197,7 @@ def views_loss(network: Detector, phase: Phase, made: list[Group]) -> tuple[Tens
     views, figures = phase.views, Counter[str]()
     grays = torch.from_numpy(np.stack([group.grays for group in made]))
     logits = forward(network, grays.flatten(0, 1)).unflatten(0, (len(made), views))
-    places = torch.from_numpy(np.stack([group.places for group in made]))
+    places = torch.from_numpy(np.stack([group.places for group in made])).to(logits.device)
     seen = torch.isfinite(places[..., 0])[:, :, None].float()
     places = places.nan_to_num(nan=-1e4)
     loss = logits.new_zeros(())
@@ -233,12 +233,13 @@ def adapted(heat: Tensor, places: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]
         peaks(average[None], max(1, round(float(area) / LABEL_PX2)))[0]
         for average, area in zip(averages, areas, strict=True)
     ]
-    return drawn(points, SIDE_PX), _inner(shown)
+    return drawn(points, SIDE_PX).to(heat.device), _inner(shown)
 
 
 def forward(network: Detector, grays: Tensor) -> Tensor:
     """Logits (N, 1, S, S) of grays (N, S, S) uint8."""
-    with torch.autocast("cpu", dtype=torch.bfloat16):
+    grays = grays.to(next(network.parameters()).device)
+    with torch.autocast(grays.device.type, dtype=torch.bfloat16):
         return network(grays[:, None].float() / 255.0).float()
 
 

@@ -34,7 +34,7 @@ from lightglue_training.data import SHARD, prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import Found, compared, fitted, report, thinned, together
 from training_blocks import LEFT_OUT
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
@@ -272,7 +272,7 @@ def main() -> None:
     add("--only-data", action="store_true", help="make the data and stop")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = training_device()
     args.batch = args.batch or (96 if device == "cuda" else 16)
     args.rendered = args.rendered or args.out / "blocks"
     torch.set_num_threads(args.jobs)

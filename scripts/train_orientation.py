@@ -9,9 +9,9 @@ the chance that two draws from both histograms differ by the turn.
 Validation knows neither the scenes nor the flights. Beside it stand SIFT's gradient histogram and, with --reference,
 OriNet, on the same patches.
 
-OUT/state.pt is kept: a killed run, or one ended by --minutes, goes on where it was; OUT/recipe.json makes sure that it
-is the same run. Writes OUT/orientation.safetensors (float16, batch norm folded in), OUT/log.json, OUT/table.json,
-OUT/curves.png and OUT/errors.png.
+On the CPU, and on a CUDA device where there is one. OUT/state.pt is kept: a killed run, or one ended by --minutes, goes
+on where it was; OUT/recipe.json makes sure that it is the same run. Writes OUT/orientation.safetensors (float16, batch
+norm folded in), OUT/log.json, OUT/table.json, OUT/curves.png and OUT/errors.png.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def turn_loss(first: Tensor, second: Tensor, turn_deg: Tensor) -> Tensor:
     spectra = (torch.fft.rfft(side.exp(), dim=1) for side in (first, second))
     along, other = spectra
     differences = torch.fft.irfft(along.conj() * other, n=BINS, dim=1)  # (N, 36) chances of 0, 10, ... 350 degrees
-    steps = torch.arange(BINS) * (360.0 / BINS)
+    steps = torch.arange(BINS, device=turn_deg.device) * (360.0 / BINS)
     off = torch.deg2rad(steps - turn_deg[:, None])
     near = torch.exp((torch.cos(off) - 1.0) / np.deg2rad(TOLERANCE_DEG) ** 2)
     return -torch.log((differences * near).sum(dim=1).clamp(min=0.0) + FLOOR).mean()
@@ -80,8 +80,9 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
         first, second = (torch.cat([developed(side[i], rng) for side in sides]) for i in (0, 1))
         turn = torch.from_numpy(np.concatenate([side[2] for side in sides])).float()
         run.network.train()
-        both = answered(run.network.scores, torch.stack([first, second], dim=1).flatten(0, 1)).view(len(first), 2, BINS)
-        loss = turn_loss(both[:, 0], both[:, 1], turn)
+        both = answered(run.network.scores, torch.stack([first, second], dim=1).flatten(0, 1), run.device)
+        both = both.view(len(first), 2, BINS)
+        loss = turn_loss(both[:, 0], both[:, 1], turn.to(run.device))
         run.learn(loss, rate_at(run.step, args.steps, args.rate))
         losses.append(float(loss.detach()))
         if run.step % REPORT_EVERY == 0 or run.step == args.steps:
@@ -99,7 +100,7 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
 
 def oriented_by(run: Run) -> Orient:
     """The averaged network as it is used, in bfloat16."""
-    network = fold(run.average.eval(), OrientationNet(folded=True)).to(torch.bfloat16)
+    network = fold(run.average.eval(), OrientationNet(folded=True)).to(run.device, torch.bfloat16)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def orient(patches: Any) -> Any:

@@ -16,6 +16,11 @@ Log = list[dict[str, Any]]
 Part = nn.Module | torch.optim.Optimizer
 
 
+def training_device() -> str:
+    """CUDA where there is one."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
 def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, names: Sequence[str]) -> None:
     """Refuses to go on with a run of other arguments; OUT/recipe.json remembers them.
 

@@ -54,7 +54,7 @@ def peaks(heat: Tensor, count: int) -> list[Points]:
     """The at most `count` largest maxima (M, 2) of each heat map (N, 1, H, W), refined below the pixel."""
     found = []
     tops = F.max_pool2d(heat, 5, stride=1, padding=2)
-    for values, top in zip(heat[:, 0].numpy(), tops[:, 0].numpy(), strict=True):
+    for values, top in zip(heat[:, 0].cpu().numpy(), tops[:, 0].cpu().numpy(), strict=True):
         peak = (values == top) & (values > 1e-3)
         peak[:2], peak[-2:], peak[:, :2], peak[:, -2:] = False, False, False, False
         y, x = np.nonzero(peak)
@@ -67,7 +67,7 @@ def peaks(heat: Tensor, count: int) -> list[Points]:
 
 def at(maps: Tensor, places: Tensor) -> Tensor:
     """Bilinear values (N, 1, h, w) of maps (N, 1, H, W) at places (N, h, w, 2), x and y in pixels; 0 outside."""
-    size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=places.dtype)
+    size = torch.tensor([maps.shape[-1], maps.shape[-2]], dtype=places.dtype, device=places.device)
     return F.grid_sample(maps, (places + 0.5) / size * 2.0 - 1.0, align_corners=False)
 
 
@@ -99,7 +99,7 @@ def repeat_loss(logits0: Tensor, logits1: Tensor, places: Tensor, seen: Tensor) 
     share0, within0, peak0 = named(logits0, seen)
     share1, within1, peak1 = named(logits1, torch.ones_like(logits1))
     near = torch.cat([share1 * within1, (peak1 * within1).detach()], dim=1)
-    near = F.conv2d(near, _tolerance().expand(2, 1, -1, -1), padding=_REACH_PX, groups=2)
+    near = F.conv2d(near, _tolerance().to(near.device).expand(2, 1, -1, -1), padding=_REACH_PX, groups=2)
     again, truly = at(near, places).clamp(max=1.0).split(1, dim=1)
     mass = seen * share0
     # Rank: log odds of maxima become those of being found again. What is near the budget's line counts most.

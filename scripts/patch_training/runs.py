@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped
+from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
 
 DECAY, CLIP = 0.998, 5.0
 # Patches at once through a network: their answers stay in the cache, and batch norm's statistics are of so many.
@@ -62,11 +62,16 @@ class Run:
     def begin(cls, path: Path, make: Callable[[], nn.Module], rate: float, seed: int) -> Run:
         """Where the state file `path` left it, else from nothing."""
         torch.manual_seed(seed)
-        network = make().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        device = training_device()
+        network = make().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
         run = cls(network, copy.deepcopy(network), optimiser, 0, [])
-        run.step, run.log = load_state(path, run.network, run.average, run.optimiser)
+        run.step, run.log = load_state(path, run.network, run.average, run.optimiser, device=device)
         return run
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.network.parameters()).device
 
     def save(self, path: Path) -> None:
         save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
@@ -80,10 +85,10 @@ class Run:
         self.step += 1
 
 
-def answered(network: Callable[[Tensor], Tensor], patches: Tensor) -> Tensor:
-    """What a network in training says of patches (N, 1, 32, 32), CHUNK at a time, in bfloat16."""
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        return torch.cat([network(part) for part in patches.split(CHUNK)])
+def answered(network: Callable[[Tensor], Tensor], patches: Tensor, device: torch.device) -> Tensor:
+    """What a network in training says on its device of patches (N, 1, 32, 32), CHUNK at a time, in bfloat16."""
+    with torch.autocast(device.type, dtype=torch.bfloat16):
+        return torch.cat([network(part) for part in patches.to(device).split(CHUNK)])
 
 
 def rate_at(step: int, total: int, largest: float) -> float:
