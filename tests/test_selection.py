@@ -1,5 +1,7 @@
 """Which features are kept: exact budgets, cells anchored in the world, shares by area, each blob once."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -85,6 +87,19 @@ def test_cells_get_shares_by_the_area_that_is_seen_of_them():
     chosen = even_selection(views, np.zeros(len(points), np.int64), points, np.ones(len(points)), 250, 200)
     assert len(chosen) == 250
     assert (points[chosen, 0] >= 100).sum() == pytest.approx(50, abs=2)
+
+
+def test_a_stretched_distance_gets_no_more_than_the_picture_has_of_it():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, [199, 399], (8000, 2))
+    # Down the view each of its pixels shows less of the picture: 1 at the top, 1 / 27 at the bottom.
+    tilted = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 2.0 / 399, 1.0]])
+    flat = ground(blank(200, 400))
+    view = ViewPixels(replace(flat.view, undistorted_from_view=tilted), flat.gray, None)
+    shown = (1.0 + 2.0 * np.linspace(0, 1, 1001)) ** -3.0
+    for one, upper in ((flat, 0.5), (view, shown[:500].sum() / shown.sum())):
+        chosen = even_selection([one], np.zeros(len(points), np.int64), points, np.ones(len(points)), 1000, 5)
+        assert (points[chosen, 1] < 199.5).mean() == pytest.approx(upper, abs=0.03)
 
 
 def test_views_share_the_budget_by_what_they_show_and_leave_what_they_cannot_use():

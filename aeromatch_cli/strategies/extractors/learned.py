@@ -29,13 +29,13 @@ from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from aeromatch_cli.strategies.extractors.sift import Sift
 
 # Keypoints of a view that the even spread chooses from, for each that it may keep.
-_CHOICE = 4
+_CHOICE = 8
 
 
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(

@@ -17,6 +17,8 @@ from aeromatch_cli.strategies import ViewPixels
 
 # The visible area of a cell is counted on about so many samples of its view.
 _AREA_SAMPLES = 40_000
+# Of a cell that no sample hit, in samples.
+_LEAST_SHOWN = 0.05
 
 
 def distinct(points_px: FloatArray, sizes_px: FloatArray, strengths: FloatArray, radius_px: float) -> BoolArray:
@@ -47,10 +49,12 @@ def even_selection(
 ) -> IntArray:
     """Indices (ascending, int64) of the features that a budget buys; points_px (N, 2) in the frames of their views.
 
-    Every cell gives its strongest feature, then its second strongest, and so on, each at a pace in proportion to the
-    area that its view sees of it, in view pixels: views share the budget by what they show, and what one cannot use
-    goes to the others. Cells hold about per_cell of `budget` features: squares of a power of two metres along the
-    world's axes where the view's ground is known, else squares of view pixels. Equal features go by their order.
+    Every cell gives its strongest feature, then its second strongest, and so on, each at a pace in proportion to what
+    its view shows of it: the pixels of the picture as taken that went into it, or view pixels where these are fewer
+    (distortion is left aside). Distance that a tilted picture squeezes and a ground view stretches so gets no more than
+    it had. Views share the budget by what they show, and what one cannot use goes to the others. Cells hold about
+    per_cell of `budget` features: squares of a power of two metres along the world's axes where the view's ground is
+    known, else squares of view pixels. Equal features go by their order.
     """
     if len(points_px) <= budget:
         return np.arange(len(points_px))
@@ -61,7 +65,8 @@ def even_selection(
         of_view = np.flatnonzero(view_idx == number)
         if len(of_view):
             cells, seen_cells = _cells(view, cell_px2, points_px[of_view], seen)
-            turn[of_view] = _turns(cells, strengths[of_view], seen_cells) / step**2
+            shown = np.minimum(area_scale(view.view.undistorted_from_view, seen) ** 2, 1.0)
+            turn[of_view] = _turns(cells, strengths[of_view], seen_cells, shown) / step**2
     return np.sort(np.lexsort((-strengths, turn))[:budget])
 
 
@@ -87,13 +92,14 @@ def _cells(view: ViewPixels, cell_px2: float, points_px: FloatArray, seen_px: Fl
     return points, seen
 
 
-def _turns(cells: IntArray, strengths: FloatArray, seen_cells: IntArray) -> FloatArray:
-    """When each feature (N,) is taken: its rank by strength within its cell over the samples seen of the cell."""
+def _turns(cells: IntArray, strengths: FloatArray, seen_cells: IntArray, shown: FloatArray) -> FloatArray:
+    """When each feature (N,) is taken: its rank by strength within its cell over what the cell's samples show (S,)."""
     order = np.lexsort((-strengths, cells))
     starts = np.flatnonzero(np.concatenate([[True], np.diff(cells[order]) != 0]))
     rank = np.empty(len(order))
     rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
-    known, counts = np.unique(np.append(cells, seen_cells), return_counts=True)
-    own, points = np.unique(cells, return_counts=True)
-    samples = counts[np.searchsorted(known, own)] - points
-    return (rank + 0.5) / np.maximum(samples, 1)[np.searchsorted(own, cells)]
+    own, of_feature = np.unique(cells, return_inverse=True)
+    place = np.minimum(np.searchsorted(own, seen_cells), len(own) - 1)
+    inside = own[place] == seen_cells
+    sums = np.bincount(place[inside], shown[inside], len(own))
+    return (rank + 0.5) / np.maximum(sums, _LEAST_SHOWN)[of_feature]

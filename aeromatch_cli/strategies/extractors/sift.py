@@ -25,7 +25,7 @@ _STABLE_SIZE_PX = 6.0
 class Sift(Described):
     """SIFT keypoints and RootSIFT descriptors of all views of one image."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["sift"] = "sift"
     orientation: Literal["auto", "gradient", "upright"] = Field(
