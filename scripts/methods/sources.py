@@ -9,7 +9,7 @@ from pathlib import Path
 import aeromatch_cli
 from aeromatch_cli.workspace import file_digest, fingerprint
 
-_PEERS = ("aliked", "base", "colmap", "keynet", "matching", "opencv_asift", "opencv_sift", "worker")
+_PEERS = ("aliked", "base", "colmap", "keynet", "matching", "opencv_asift", "opencv_sift", "superpoint", "worker")
 # Source that answers depend on, below the package or scripts. Peers read no more of the package than lens models.
 PEER_CODE = ("geometry/cameras.py", "geometry/frames.py", *(f"methods/{module}.py" for module in _PEERS))
 OUR_CODE = (

@@ -20,12 +20,21 @@ from methods.ours import Preset
 
 Make = Callable[[Scene, Options], Method]
 
+
+def _superpoint(scene: Scene, options: Options) -> Method:
+    """Its class needs torch as soon as it is read; names are needed without."""
+    from methods.superpoint import SuperPoint
+
+    return SuperPoint(scene, options)
+
+
 _FROM_PICTURES: Mapping[str, Make] = {
     "opencv-sift": OpenCvSift,
     "opencv-asift": OpenCvAsift,
     "aliked": Aliked,
     "keynet": KeyNet,
     "keynet-tfeat": partial(KeyNet, descriptor="tfeat-liberty.params"),
+    "superpoint": _superpoint,
 }
 ON_GROUND = "@ground"
 PEERS: Mapping[str, Make] = {
@@ -34,7 +43,7 @@ PEERS: Mapping[str, Make] = {
     "pycolmap-guided": partial(Colmap, guided=True),
     **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in _FROM_PICTURES.items()},
 }
-_NETWORKS = ("aliked", "keynet", "keynet-tfeat")
+_NETWORKS = ("aliked", "keynet", "keynet-tfeat", "superpoint")
 NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _NETWORKS)
 # What --methods stands for where it is not given: whatever needs no weights, on the pictures as they are.
 CLASSICAL = tuple(name for name in PEERS if name not in NEED_WEIGHTS and not name.endswith(ON_GROUND))
