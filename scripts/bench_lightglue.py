@@ -30,6 +30,7 @@ from lightglue_training.data import pictures as pictures_of
 from lightglue_training.data import read_block, read_groups, write_block, write_groups
 from lightglue_training.validation import Found, compared, together
 from training_blocks import render
+from training_runs import check_recipe
 
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration, load_lightglue, read_calibration
@@ -37,6 +38,7 @@ from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import write_text
 
+PARTS = ("accuracy", "speed")
 TIMED_KEYPOINTS = 2048
 FIRST_BLOCK = 1000  # numbers of the blocks, far from those trained on
 
@@ -118,6 +120,16 @@ def rendered_block(args: argparse.Namespace) -> Path:
     return folder
 
 
+def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Refuses unknown parts, half a README, and a folder that holds other pairs."""
+    parts = args.parts.split(",")
+    if unknown := set(parts) - set(PARTS):
+        parser.error(f"--parts: {', '.join(sorted(unknown))} is none of {', '.join(PARTS)}")
+    if args.readme and set(parts) != set(PARTS):
+        parser.error(f"--readme needs all --parts: {','.join(PARTS)}")
+    check_recipe(parser, args, ("data", "unseen", "groups", "blocks", "seed"))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -128,22 +140,23 @@ def main() -> None:
     add("--blocks", type=int, default=8, help="rendered blocks")
     add("--seed", type=int, default=1, help="another seed gives other groups and blocks")
     add("--threads", type=int, default=2)
-    add("--parts", default="accuracy,speed", help="comma-separated")
+    add("--parts", default=",".join(PARTS), help=f"comma-separated: {', '.join(PARTS)}")
     add("--readme", action="store_true", help="write the tables into the README")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
+    check(parser, args)
     os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
     torch.set_num_threads(args.threads)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = load_lightglue(args.weights, device=device)
     sets = pairs_of(args)
-    text, facts = [], {}
-    if "accuracy" in args.parts:
+    parts, text, facts = args.parts.split(","), [], {}
+    if "accuracy" in parts:
         facts["accuracy"], found = accuracy_rows(network, sets)
         text += [accuracy_table(facts["accuracy"]), "Whether scores mean what they say:"]
         text += [reliability_table(found, read_calibration(args.weights))]
         print("\n\n".join(text), flush=True)
-    if "speed" in args.parts:
+    if "speed" in parts:
         where = f"{args.threads} threads" if device == "cpu" else torch.cuda.get_device_name()
         text += [f"Seconds a pair with {TIMED_KEYPOINTS} keypoints on either side ({where}):"]
         text += [forward_table(network, full_pair(sets), device)]
@@ -151,7 +164,8 @@ def main() -> None:
         text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
         if device == "cpu":
             text += [jobs_table(args.weights, full_pair(sets))]
-    write_text(args.out / "lightglue.json", json.dumps(facts, indent=1) + "\n")
+    if facts:
+        write_text(args.out / "lightglue.json", json.dumps(facts, indent=1) + "\n")
     whole = "\n\n".join(text) + "\n"
     write_text(args.out / "lightglue.md", whole)
     if args.readme:

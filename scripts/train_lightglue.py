@@ -30,12 +30,23 @@ import numpy as np
 import torch
 from lightglue_training.batches import Batch, batch_of, piece
 from lightglue_training.blocks import LEAST_PARTNERS, Pair
-from lightglue_training.data import SHARD, prepare, read_block, read_groups
+from lightglue_training.data import SHARD, pictures, prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import Found, compared, fitted, report, thinned, together
 from training_blocks import LEFT_OUT
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
+from training_runs import (
+    Log,
+    at_least_one,
+    check_recipe,
+    descend,
+    follow,
+    load_state,
+    save_state,
+    shipped,
+    training_device,
+)
 
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, load_lightglue
 
@@ -100,9 +111,9 @@ class Run:
         save_state(path, self.seen, self.log, self.network, self.average, self.optimiser)
 
     @classmethod
-    def begin(cls, path: Path, device: str, rate: float, start: Path | None = None) -> Run:
+    def begin(cls, path: Path, device: str, rate: float, seed: int, start: Path | None = None) -> Run:
         """Where the state file `path` left it, else from the weights `start`, else from nothing."""
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         network = load_lightglue(start) if start else LightGlue(DIMENSIONS)
         network = network.to(device).requires_grad_(True)
         run = cls(network, copy.deepcopy(network), torch.optim.AdamW(network.parameters(), rate), 0, [])
@@ -119,7 +130,7 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
     stage1, stage2 = ([pair for pair in pairs if usable(pair)] for pairs in (stage1, stage2))
     sets = validation_sets(args.out / "data")
     state, started = args.out / "state.pt", time.monotonic()
-    run = Run.begin(state, device, args.rate, args.start)
+    run = Run.begin(state, device, args.rate, args.seed, args.start)
     print(f"{len(stage1)} homography pairs, {len(stage2)} rendered pairs, {run.seen} of {total} pairs seen", flush=True)
     losses: list[tuple[float, float, float]] = []
     while run.seen < total:
@@ -139,8 +150,9 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
             draw_curves(run.log, args.out / "curves.png")
         elif run.seen // SAVE_EVERY > before // SAVE_EVERY:
             run.save(state)
-        if args.minutes and time.monotonic() - started > 60.0 * args.minutes:
+        if args.minutes and run.seen < total and time.monotonic() - started > 60.0 * args.minutes:
             run.save(state)
+            print(f"{run.seen} of {total} pairs seen; the same command goes on from here", flush=True)
             return None
     return run
 
@@ -239,6 +251,16 @@ def draw_reliability(ways: dict[str, Calibration], found: Found, path: Path) -> 
     figure.savefig(path)
 
 
+def check_start(parser: argparse.ArgumentParser, start: Path) -> None:
+    """Before hours of data are made: the weights are there, and of this input."""
+    try:
+        found = load_lightglue(start).dimensions
+    except (ConfigError, OSError) as error:
+        parser.error(f"--start {start}: {error}")
+    if (found.input_dim, found.add_scale_ori) != (DIMENSIONS.input_dim, DIMENSIONS.add_scale_ori):
+        parser.error(f"--start {start}: descriptors of {found.input_dim}, SIFT with scale and orientation is trained")
+
+
 def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     """Refuses what cannot be trained on, and to go on with another run's data or state."""
     if args.blocks <= max(LEFT_OUT):
@@ -247,9 +269,19 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
         )
     if args.groups < 4 * SHARD or args.groups % SHARD:
         parser.error(f"--groups {args.groups}: give a multiple of {SHARD}, at least {4 * SHARD}")
-    for name in (*args.trained_on.split(","), *args.unseen.split(",")):
+    for name in ("scale", "rate"):
+        if not 0.0 < getattr(args, name) < math.inf:
+            parser.error(f"--{name} {getattr(args, name)}: give a positive number")
+    known, unseen = args.trained_on.split(","), args.unseen.split(",")
+    if both := set(known) & set(unseen):
+        parser.error(f"{', '.join(sorted(both))}: in --trained-on and --unseen; validation must not know it")
+    for name in (*known, *unseen):
         if not (args.data / name / "images").is_dir():
             parser.error(f"{args.data / name} has no folder images; see --data, --trained-on and --unseen")
+        if not pictures([args.data / name]):
+            parser.error(f"{args.data / name / 'images'} holds no picture")
+    if args.start is not None:
+        check_start(parser, args.start)
     check_recipe(parser, args, OF_DATA if args.only_data else (*OF_DATA, *OF_RUN))
 
 
@@ -259,15 +291,20 @@ def main() -> None:
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
     add("--trained-on", default="sheffield,caliterra,brighton", help="real blocks whose pictures are warped")
     add("--unseen", default="ochota,lewis,seneca", help="real blocks for validation only")
-    add("--groups", type=int, default=2400, help="groups of four homography views")
+    add("--groups", type=at_least_one, default=2400, help="groups of four homography views")
     add("--blocks", type=int, default=60, help="rendered blocks, at least 19")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--start", type=Path, help="weights to go on from; the first phase, of homographies alone, is left out then")
-    add("--seed", type=int, default=0, help="of the homography groups and of what is drawn; rendered blocks stay")
+    add(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the first weights, the homography groups and what is drawn; rendered blocks stay",
+    )
     add("--scale", type=float, default=1.0, help="of the number of pairs of every phase")
-    add("--batch", type=int, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
+    add("--batch", type=at_least_one, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
     add("--rate", type=float, default=6e-4, help="largest learning rate")
-    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--jobs", type=at_least_one, default=2, help="processes that make the data, threads that train")
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--only-data", action="store_true", help="make the data and stop")
     add("--out", type=Path, required=True)

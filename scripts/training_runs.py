@@ -21,6 +21,14 @@ def training_device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
+def at_least_one(text: str) -> int:
+    """For argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    return value
+
+
 def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, names: Sequence[str]) -> None:
     """Refuses to go on with a run of other arguments; OUT/recipe.json remembers them.
 
@@ -28,7 +36,12 @@ def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, name
     """
     asked = {name: str(getattr(args, name)) for name in names}
     path = args.out / "recipe.json"
-    known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    if args.out.exists() and not args.out.is_dir():
+        parser.error(f"--out {args.out} is no folder")
+    try:
+        known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except json.JSONDecodeError:
+        parser.error(f"{path} is damaged: delete it if {args.out} holds this very run, or give another --out")
     other = [f"{name} {known[name]}" for name in names if known.get(name, asked[name]) != asked[name]]
     if other:
         parser.error(f"{args.out} holds another run ({', '.join(other)}); give another --out")

@@ -17,6 +17,7 @@ from lightglue_training.homographies import SIZE_PX, make_group
 from lightglue_training.loss import loss_of
 from lightglue_training.sides import NONE, UNKNOWN, Partners, Seen, partners
 from lightglue_training.validation import Found, by_ratio, fitted, judged, thinned
+from make_lightglue import seeded_tensors, write
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration
@@ -179,8 +180,11 @@ def test_a_calibration_is_found_again():
 
 
 def test_a_run_is_not_mixed_with_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("a", "b"):
+    for name in ("a", "b", "empty"):
         (tmp_path / "data" / name / "images").mkdir(parents=True)
+    for name in ("a", "b"):
+        (tmp_path / "data" / name / "images" / "1.jpg").touch()
+    other = write(tmp_path / "other.pth", seeded_tensors(Dimensions(32, 32, 2, 1, add_scale_ori=True)))
     parser = argparse.ArgumentParser()
     plain = {"trained_on": "a", "unseen": "b", "groups": 200, "blocks": 19, "start": None, "scale": 1.0, "batch": 16}
     args = argparse.Namespace(data=tmp_path / "data", out=tmp_path / "out", only_data=True, rate=1e-3, seed=0, **plain)
@@ -195,8 +199,19 @@ def test_a_run_is_not_mixed_with_another(tmp_path: Path, capsys: pytest.CaptureF
         ("groups", 130, "multiple of 50"),
         ("blocks", 4, "give at least 19"),
         ("unseen", "c", "c has no folder images"),
+        ("unseen", "empty", "holds no picture"),
+        ("unseen", "a", "a: in --trained-on and --unseen"),
+        ("scale", -1.0, "--scale -1.0: give a positive number"),
+        ("rate", np.nan, "--rate nan: give a positive number"),
+        ("start", tmp_path / "none.safetensors", "none.safetensors"),
+        ("start", other, "descriptors of 32"),
+        ("out", tmp_path / "other.pth", "is no folder"),
     ):
         with pytest.raises(SystemExit) as refused:
             train_lightglue.check(parser, argparse.Namespace(**(vars(args) | {name: value})))
         assert refused.value.code == 2
         assert said in capsys.readouterr().err
+    (tmp_path / "out" / "recipe.json").write_text("{", encoding="utf-8")
+    with pytest.raises(SystemExit):
+        train_lightglue.check(parser, args)
+    assert "recipe.json is damaged" in capsys.readouterr().err

@@ -12,14 +12,19 @@ import pytest
 import torch
 import train_descriptor
 import train_detector
+import train_lightglue
 import train_orientation
 from detector_training.scenes import sights
+from lightglue_training.blocks import Pair
+from lightglue_training.data import write_block
+from lightglue_training.sides import Partners, Seen
 from patch_training.draws import sources_of
 from patch_training.runs import Run
 from patch_training.sources import homography
 from torch import nn
 
 from aeromatch_cli.nets.geodesc import GeoDesc
+from aeromatch_cli.nets.lightglue import Dimensions
 from aeromatch_cli.nets.orientation import OrientationNet
 
 STEPS = 3
@@ -88,4 +93,45 @@ def test_the_detectors_training_goes_on_where_it_was(
         assert run is not None
         assert [row["phase"] for row in run.log] == ["sift", "shapes", "adaptation", "pairs"]
         weights.append(run.average)
+    assert same(*weights)
+
+
+def shifted_pair(count: int = 80) -> Pair:
+    """Keypoints and the same 5 px further right."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, (300, 200), (count, 2)).astype(np.float32)
+    rest = (
+        rng.uniform(2, 9, count).astype(np.float32),
+        rng.uniform(-3, 3, count).astype(np.float32),
+        rng.integers(0, 100, (count, 128)).astype(np.uint8),
+        np.float32([320, 240]),
+    )
+    first, second = (Seen(places, *rest, places) for places in (points, points + np.float32((5.0, 0.0))))
+    return Pair(first, second, Partners(np.arange(count), np.arange(count)), False)
+
+
+def test_lightglues_training_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(train_lightglue, "DIMENSIONS", Dimensions(128, 32, 2, 2, add_scale_ori=True))
+    monkeypatch.setattr(train_lightglue, "report", lambda *_: {})
+    monkeypatch.setattr(train_lightglue, "draw_curves", lambda *_: None)
+    plan = (
+        train_lightglue.Phase("blocks", 16, 32, 1.0),
+        train_lightglue.Phase("many", 8, 64, 1.0, confidence=True),
+    )
+    monkeypatch.setattr(train_lightglue, "phases", lambda *_, **__: plan)
+    weights = []
+    for minutes, calls in ((0.0, 1), (1e-9, 4)):
+        args = options(tmp_path / str(minutes), scale=1.0, start=None)
+        args.minutes, args.batch = minutes, 1  # one of 256 keypoints: eight and four of these
+        (args.out / "data" / "stage2").mkdir(parents=True)
+        write_block(args.out / "data" / "stage2" / "block.npz", lambda: [shifted_pair()])
+        for call in range(calls):
+            run = train_lightglue.train(args, "cpu")
+            assert (run is None) == (call < calls - 1)
+        assert run is not None
+        assert run.seen == 24
+        weights.append(run.average)
+    assert "8 of 24 pairs seen; the same command goes on from here" in capsys.readouterr().out
     assert same(*weights)

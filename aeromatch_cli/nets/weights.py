@@ -34,7 +34,7 @@ _INDEX_NAME = "index.json"
 class WeightsEntry:
     """A file of the weights folder as it was when it was added, or one that ships.
 
-    architecture: "lightglue", "shadow" or "detector".
+    architecture: the network's, such as "lightglue", which is the only one that can be added.
     """
 
     name: str
@@ -77,6 +77,8 @@ def resolve_weights(name_or_path: str) -> Path:
     path = Path(name_or_path).expanduser()
     if path.is_file():
         return path.resolve()
+    if path.is_dir():
+        raise ConfigError(f"weights {name_or_path!r} is a folder; give the path of a {', '.join(SUFFIXES)} file in it")
     known = ", ".join(entry.name for entry in list_weights()) or "none yet"
     raise ConfigError(
         f"weights {name_or_path!r}: no such file, and no such name in {folder} (there: {known}); give the path of a "

@@ -49,7 +49,7 @@ class LightGlue(Search):
         250,
         ge=1,
         description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
-        "asked: it takes five times as long. For it everywhere, raise this and `ample` above `extract.keypoints`.",
+        "asked: it takes half a second a pair. For it everywhere, raise this and `ample` above `extract.keypoints`.",
     )
     weights: str | None = Field(
         None,
