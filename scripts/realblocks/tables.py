@@ -14,14 +14,15 @@ Row = dict[str, Any]
 def blocks_table(rows: Sequence[Row]) -> str:
     """A line per block, thinning and method: matches, and what mapping makes of them."""
     columns = (
-        "block", "every", "method", "keypoints", "seconds", "pairs", "matches", "unique", "within 3 px", "cells filled",
-        "registered", "points", "track length", "error px",
+        "block", "every", "method", "keypoints", "seconds", "pairs", "matches", "unique", "within 3 px", "within 5 px",
+        "cells filled", "registered", "points", "track length", "error px",
     )  # fmt: skip
     lines = []
     for row in rows:
         cells = [row["block"], str(row["every"]), f"`{row['method']}`", f"{row['keypoints_mean']:.0f}"]
         cells += [_seconds(row), str(row["pairs"]), str(row["matches"]), str(row["unique_matches"])]
-        cells += [str(row["within_3px"]), percent(row["filled_cells"]) if "filled_cells" in row else "-"]
+        cells += [str(row["within_3px"]), str(row["within_5px"])]
+        cells += [percent(row["filled_cells"]) if "filled_cells" in row else "-"]
         cells += [f"{row['registered']} of {row['images']}" if "registered" in row else "-"]
         cells += [str(row.get("points", "-"))]
         cells += [number(row.get(key, float("nan")), 2) for key in ("track_length", "reprojection_error_px")]
