@@ -306,6 +306,8 @@ def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.Monk
         LightGlue().fingerprint_files()
     with pytest.raises(ConfigError, match=r"no such file.*aeromatch weights add"):
         LightGlue(weights=str(tmp_path / "absent.pth"))(features(3), features(3), GEOMETRY)
+    with pytest.raises(ConfigError, match="is a folder"):
+        LightGlue(weights=str(tmp_path)).fingerprint_files()
 
 
 def test_weights_of_a_user_are_found_wanting_before_anything_is_matched(weights: str, tmp_path: Path) -> None:
