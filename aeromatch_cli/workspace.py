@@ -226,12 +226,16 @@ def fingerprint(*parts: Any) -> str:
     return hashlib.sha256(text.encode("utf-8")).hexdigest()
 
 
+# Marks of a field's json_schema_extra that keep its value out of the fingerprint.
+_NO_RECIPE = frozenset({"path", "fingerprint"})
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, Strategy):
-        # Contents, not places: another folder, or another machine's, makes no other recipe.
+        # Contents, not places: another folder, or another machine's, makes no other recipe, nor does its device.
         files = [file_digest(Path(path)) for path in value.fingerprint_files()]
         extras = {name: field.json_schema_extra for name, field in type(value).model_fields.items()}
-        places = {name for name, extra in extras.items() if isinstance(extra, dict) and "path" in extra}
+        places = {name for name, extra in extras.items() if isinstance(extra, dict) and _NO_RECIPE & extra.keys()}
         recipe = value.model_dump(exclude=places)
         return {"class": type(value).__name__, "version": value.version, "files": files, **recipe}
     if hasattr(value, "tolist"):

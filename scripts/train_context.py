@@ -33,7 +33,17 @@ from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
+from training_runs import (
+    Log,
+    at_least_one,
+    check_recipe,
+    descend,
+    follow,
+    load_state,
+    save_state,
+    shipped,
+    training_device,
+)
 
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.nets.precision import has_bfloat16
@@ -160,9 +170,9 @@ def main() -> None:
     add = parser.add_argument
     add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; validation is on those left out")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--pairs", type=int, default=24_000, help="to be seen")
+    add("--pairs", type=at_least_one, default=24_000, help="to be seen")
     add("--seed", type=int, default=0, help="of what is drawn")
-    add("--jobs", type=int, default=2, help="processes that make the data, threads that train")
+    add("--jobs", type=at_least_one, default=2, help="processes that make the data, threads that train")
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--out", type=Path, required=True)
     args = parser.parse_args()

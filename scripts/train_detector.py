@@ -38,7 +38,17 @@ from detector_training.validation import by_heat, by_sift, pairs_of, scores, tab
 from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
+from training_runs import (
+    Log,
+    at_least_one,
+    check_recipe,
+    descend,
+    follow,
+    load_state,
+    save_state,
+    shipped,
+    training_device,
+)
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
@@ -330,9 +340,9 @@ def main() -> None:
     add("--keypoints", type=int, default=400, help="of validation, in the overlap")
     add("--seed", type=int, default=0)
     add("--scale", type=float, default=1.0, help="of the number of steps of every phase")
-    add("--batch", type=int, default=8, help="groups of views at once")
+    add("--batch", type=at_least_one, default=8, help="groups of views at once")
     add("--rate", type=float, default=2e-3, help="largest learning rate")
-    add("--jobs", type=int, default=1, help="threads")
+    add("--jobs", type=at_least_one, default=1, help="threads")
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--validate", type=Path, help="weights to validate, beside SIFT; nothing is trained")
     add("--out", type=Path, required=True)

@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from lightglue_training.batches import Batch, batch_of, piece
 from lightglue_training.blocks import LEAST_PARTNERS, Pair
-from lightglue_training.data import SHARD, pictures, prepare, read_block, read_groups
+from lightglue_training.data import SHARD, OutOfTime, pictures, prepare, read_block, read_groups
 from lightglue_training.loss import loss_of
 from lightglue_training.validation import Found, compared, fitted, report, thinned, together
 from training_blocks import LEFT_OUT
@@ -121,8 +121,8 @@ class Run:
         return run
 
 
-def train(args: argparse.Namespace, device: str) -> Run | None:
-    """The finished run, or None where --minutes ended it before."""
+def train(args: argparse.Namespace, device: str, spent_s: float = 0.0) -> Run | None:
+    """The finished run, or None where --minutes, of which so much is spent, ended it before."""
     plan = phases(args.scale, anew=args.start is None)
     total = sum(phase.pairs for phase in plan)
     stage1 = [p for path in sorted((args.out / "data" / "stage1").glob("*.npz")) for p in read_groups(path)]
@@ -150,7 +150,7 @@ def train(args: argparse.Namespace, device: str) -> Run | None:
             draw_curves(run.log, args.out / "curves.png")
         elif run.seen // SAVE_EVERY > before // SAVE_EVERY:
             run.save(state)
-        if args.minutes and run.seen < total and time.monotonic() - started > 60.0 * args.minutes:
+        if args.minutes and run.seen < total and time.monotonic() - started > 60.0 * args.minutes - spent_s:
             run.save(state)
             print(f"{run.seen} of {total} pairs seen; the same command goes on from here", flush=True)
             return None
@@ -314,8 +314,14 @@ def main() -> None:
     args.rendered = args.rendered or args.out / "blocks"
     torch.set_num_threads(args.jobs)
     check(parser, args)
-    prepare(args.out / "data", args.data, args.trained_on.split(","), args.unseen.split(","), args)
-    run = None if args.only_data else train(args, device)
+    began = time.time()
+    try:
+        until = began + 60.0 * args.minutes if args.minutes else math.inf
+        prepare(args.out / "data", args.data, args.trained_on.split(","), args.unseen.split(","), args, until)
+    except OutOfTime:
+        print("the data is not all made; the same command goes on from here", flush=True)
+        return
+    run = None if args.only_data else train(args, device, time.time() - began)
     if run is not None:
         finish(run, args.out)
 

@@ -29,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 from training_blocks import IMAGES, LEFT_OUT, render
-from training_runs import load_state, save_state
+from training_runs import at_least_one, load_state, save_state
 
 from aeromatch_cli.strategies.enhancers.shadow_mask import Overview, network_inputs
 from aeromatch_cli.strategies.enhancers.tone import Tone
@@ -258,7 +258,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--blocks", type=int, default=41, help=f"rendered blocks of {IMAGES} pictures, at least 19")
-    parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--steps", type=at_least_one, default=6000)
     parser.add_argument("--rate", type=float, default=2e-3, help="learning rate, falls to nothing over the steps")
     parser.add_argument("--start", type=Path, metavar="STATE", help="state.pt of another run to start from")
     parser.add_argument("--out", type=Path, required=True)

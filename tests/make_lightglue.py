@@ -1,15 +1,18 @@
-"""Small LightGlue networks of seeded random weights, and SIFT-like features for them."""
+"""Small LightGlue networks of seeded random weights, a stand-in for one, and SIFT-like features for them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 from aeromatch_cli.data import Features
-from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue, Side
+from aeromatch_cli.nets.lightglue_file import Calibration
+from aeromatch_cli.strategies.matchers import inference, lightglue
 
 SIFT = Dimensions(input_dim=128, descriptor_dim=64, n_layers=3, num_heads=2, add_scale_ori=True)
 
@@ -57,3 +60,21 @@ def features(count: int, seed: int = 0) -> Features:
         view_gsd_m=np.full(1, np.nan, np.float32),
         view_enhanced=np.zeros(1, bool),
     )
+
+
+class Answers:
+    """Stands for the network: keeps what it is given, and answers the first keypoints with each other."""
+
+    def __init__(self, scores: tuple[float, ...] = (), dimensions: Dimensions = SIFT) -> None:
+        self.scores, self.dimensions = scores, dimensions
+        self.given: list[tuple[Side, Side, dict[str, float]]] = []
+
+    def match(self, side0: Side, side1: Side, **options: float) -> tuple[Tensor, Tensor]:
+        self.given.append((side0, side1, options))
+        rows = torch.arange(len(self.scores))
+        return torch.stack([rows, rows], dim=1), torch.tensor(self.scores)
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, network: Answers) -> None:
+    """The matcher asks this instead of its weights."""
+    monkeypatch.setattr(lightglue, "ready", lambda _: inference.Asked(network, Calibration(), "cpu", {}))

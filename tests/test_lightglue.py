@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from make_lightglue import SIFT, features, seeded_tensors, write
+from make_lightglue import SIFT, Answers, features, seeded_tensors, stand_in, write
 from pydantic import ValidationError
 from safetensors.torch import save_file
-from torch import Tensor
 
 from aeromatch_cli.data import Camera, Features, FloatArray, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.lightglue import Dimensions, Side
-from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, Calibration, read_calibration
-from aeromatch_cli.strategies.matchers import lightglue
+from aeromatch_cli.nets.lightglue import Side
+from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, read_calibration
 from aeromatch_cli.strategies.matchers.comparison import Found, joined
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue, wrapped_rad
+from aeromatch_cli.strategies.matchers.inference import wrapped_rad
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
@@ -241,26 +240,14 @@ def by_hand() -> Features:
     )
 
 
-class Recorder:
-    """Stands for the network: keeps what it is given, matches nothing."""
-
-    def __init__(self, dimensions: Dimensions) -> None:
-        self.dimensions = dimensions
-        self.given: list[tuple[Side, Side]] = []
-
-    def match(self, side0: Side, side1: Side, **options: float) -> tuple[Tensor, Tensor]:
-        self.given.append((side0, side1))
-        return torch.zeros((0, 2), dtype=torch.int64), torch.zeros(0)
-
-
-def given_to(recorder: Recorder, weights: str, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Side, Side]]:
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, Calibration(), "cpu", {}))
+def given_to(network: Answers, weights: str, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Side, Side]]:
+    stand_in(monkeypatch, network)
     recipe(weights)(by_hand(), by_hand(), GEOMETRY)
-    return recorder.given
+    return [(side0, side1) for side0, side1, _ in network.given]
 
 
 def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = given_to(Recorder(SIFT), weights, monkeypatch)
+    given = given_to(Answers(), weights, monkeypatch)
     assert len(given) == 4  # every view with every view
     first, last = given[0][0], given[3][1]
     # From the corner of the picture, clipped to it, middle 0, half the longer side 1.
@@ -279,8 +266,8 @@ def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch
 def test_the_network_is_asked_where_the_ratio_test_leaves_few(
     weights: str, monkeypatch: pytest.MonkeyPatch, count: int, asked: bool
 ) -> None:
-    recorder = Recorder(SIFT)
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(recorder, Calibration(), "cpu", {}))
+    recorder = Answers()
+    stand_in(monkeypatch, recorder)
     matches = LightGlue(weights=weights)(features(count), noisy(features(count), 2.0), GEOMETRY)
     assert bool(recorder.given) == asked
     # The ratio test's stay where the network finds nothing.
@@ -288,7 +275,7 @@ def test_the_network_is_asked_where_the_ratio_test_leaves_few(
 
 
 def test_networks_without_scale_and_orientation_get_none(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = given_to(Recorder(dataclasses.replace(SIFT, add_scale_ori=False)), weights, monkeypatch)
+    given = given_to(Answers(dimensions=dataclasses.replace(SIFT, add_scale_ori=False)), weights, monkeypatch)
     assert given[0][0].places.shape == (1, 2, 2)
 
 

@@ -8,43 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from make_lightglue import SIFT, features, seeded_tensors, write
+from make_lightglue import SIFT, Answers, features, seeded_tensors, stand_in, write
 from torch import Tensor
 
 from aeromatch_cli.data import Camera, Pair, PairGeometry
 from aeromatch_cli.nets.lightglue import LightGlue as Network
 from aeromatch_cli.nets.lightglue import Side, log_assignment, mutual_best
-from aeromatch_cli.nets.lightglue_file import Calibration
 from aeromatch_cli.strategies.matchers import lightglue
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.lightglue import FRAME_PX, LightGlue
+from aeromatch_cli.strategies.matchers.inference import FRAME_PX
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue
+from aeromatch_cli.strategies.matchers.search import finished
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
 
 
-class Answers:
-    """Stands for the network: keeps what it is given, and answers the first keypoints with each other."""
-
-    dimensions = SIFT
-
-    def __init__(self, scores: tuple[float, ...] = ()) -> None:
-        self.scores = scores
-        self.given: list[tuple[Side, Side, dict[str, float]]] = []
-
-    def match(self, side0: Side, side1: Side, **options: float) -> tuple[Tensor, Tensor]:
-        self.given.append((side0, side1, options))
-        rows = torch.arange(len(self.scores))
-        return torch.stack([rows, rows], dim=1), torch.tensor(self.scores)
-
-
 def asked_of(count: int = 40) -> Comparison:
     sides = features(count), features(count, seed=1)
     return Comparison(*sides, GEOMETRY, np.ones((1, 1), bool))
-
-
-def stand_in(monkeypatch: pytest.MonkeyPatch, network: Answers) -> None:
-    monkeypatch.setattr(lightglue, "_matcher", lambda *_: lightglue._Matcher(network, Calibration(), "cpu", {}))
 
 
 def found_before(*costs: float) -> Found:
@@ -57,7 +39,7 @@ def test_what_is_left_of_a_view_gets_a_frame_of_its_own(monkeypatch: pytest.Monk
     network, asked = Answers((0.9, 0.8)), asked_of()
     stand_in(monkeypatch, network)
     shown = asked.features0.keypoints_px[:, 0] > 400, np.ones(40, bool)
-    found = LightGlue().by_network(asked, shown)
+    found = finished(LightGlue().by_network(asked, shown), LightGlue().answers)
     side0, side1, _ = network.given[0]
     rows = np.flatnonzero(shown[0])
     assert 5 < len(rows) < 35
@@ -78,7 +60,8 @@ def test_only_the_overlap_goes_in_where_asked(monkeypatch: pytest.MonkeyPatch, o
     stand_in(monkeypatch, network)
     half = np.arange(40) < 20
     monkeypatch.setattr(lightglue, "in_overlap", lambda *_: (half, half))
-    LightGlue(overlap=overlap).look_closer(asked, joined([]), None)
+    matcher = LightGlue(overlap=overlap)
+    finished(matcher.look_closer(asked, joined([]), None), matcher.answers)
     side0, side1, _ = network.given[0]
     assert side0.places.shape[1] == side1.places.shape[1] == (20 if overlap else 40)
 
@@ -101,7 +84,7 @@ def test_sets_of_surer_matches_compete_and_the_winner_leads_the_search(monkeypat
     monkeypatch.setattr(lightglue, "most_evident", most_evident)
     matcher = LightGlue(threshold=0.1, overlap=False)
     second: Any = again
-    found = matcher.look_closer(asked_of(), before, second)
+    found = finished(matcher.look_closer(asked_of(), before, second), matcher.answers)
     # At 0.1, 0.3, 0.5 and 0.8, each with the two from before, whose cost says that the network did not find them.
     probabilities = [1.0 - part.costs for part in competing[0]]
     doubtful = [0.3, 0.1]
@@ -112,7 +95,8 @@ def test_sets_of_surer_matches_compete_and_the_winner_leads_the_search(monkeypat
     np.testing.assert_array_equal(calls[0][0].costs, competing[0][2].costs)
     assert len(found.rows) == 1
     # Without a second search the winner is the answer.
-    np.testing.assert_array_equal(matcher.look_closer(asked_of(), before, None).costs, competing[1][2].costs)
+    plain = finished(matcher.look_closer(asked_of(), before, None), matcher.answers)
+    np.testing.assert_array_equal(plain.costs, competing[1][2].costs)
 
 
 def test_the_settings_reach_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,7 +110,8 @@ def test_the_settings_reach_the_network(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(Network, "match", spy)
     settings = {"threshold": 0.25, "depth_confidence": 0.7, "width_confidence": 0.6}
-    LightGlue(weights=str(path), **settings).by_network(asked_of())
+    matcher = LightGlue(weights=str(path), **settings)
+    finished(matcher.by_network(asked_of()), matcher.answers)
     assert options == [settings]
 
 

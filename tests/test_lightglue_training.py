@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 
 import cv2
@@ -12,11 +13,11 @@ import torch
 import train_lightglue
 from lightglue_training.batches import batch_of, piece
 from lightglue_training.blocks import Pair
-from lightglue_training.data import read_groups, write_groups
+from lightglue_training.data import OutOfTime, mapped, read_groups, write_groups
 from lightglue_training.homographies import SIZE_PX, make_group
 from lightglue_training.loss import loss_of
 from lightglue_training.sides import NONE, UNKNOWN, Partners, Seen, partners
-from lightglue_training.validation import Found, by_ratio, fitted, judged, thinned
+from lightglue_training.validation import Found, by_ratio, fitted, judged, of_like_look, recalls, thinned
 from make_lightglue import seeded_tensors, write
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
@@ -67,6 +68,35 @@ def test_of_places_described_twice_those_that_look_most_alike_are_partners() -> 
     indices = np.array([[0, 1], [1, 0], [2, 4], [3, 4]])
     assert judged([(pair, indices, np.ones(4))]).right.tolist() == [True, True, False, False]
     assert judged([(pair, np.array([[0, 0]]), np.ones(1))]).right.tolist() == [True]
+
+
+def test_partners_of_other_size_or_turn_are_told_apart() -> None:
+    places = np.array([[10.0 + 40.0 * n, 10.0] for n in range(6)])
+    first, second = side(places), side(places, 1)
+    first.sizes_px[:], second.sizes_px[:] = 4.0, 8.0  # twice the size is usual here
+    first.angles_rad[:], second.angles_rad[:] = 3.0, -3.0  # and 16 degrees, across the wrap
+    second.sizes_px[1] *= 1.5
+    second.angles_rad[2] += 0.7
+    pair = Pair(first, second, partners(first, second, places, places), False)
+    assert of_like_look(pair).tolist() == [True, False, False, True, True, True]
+    # Of the like ones 0 and 3 are found surely, 4 doubtfully, 5 wrongly; of the others 1.
+    answer = (pair, np.array([[0, 0], [1, 1], [3, 3], [4, 4], [5, 2]]), np.array([0.9, 0.9, 0.9, 0.2, 0.9]))
+    assert recalls([answer], 0.5) == pytest.approx((4 / 6, 2 / 4, 1 / 2))
+    assert recalls([answer], -np.inf) == pytest.approx((4 / 6, 3 / 4, 1 / 2))
+
+
+def test_the_least_score_is_where_the_precision_ends() -> None:
+    found = Found(np.array([0.9, 0.5, 0.8, 0.3]), np.array([True, True, False, False]), 4)
+    assert found.least_score_at(0.6) == 0.5
+    assert found.least_score_at(1.0) == 0.9
+    assert Found(np.array([0.9]), np.array([False]), 4).least_score_at(0.5) == np.inf
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_nothing_is_begun_when_the_time_is_over(jobs: int) -> None:
+    assert mapped(abs, [-1, 2], jobs, time.time() + 1000.0) == [1, 2]
+    with pytest.raises(OutOfTime):
+        mapped(abs, [-1, 2], jobs, time.time() - 1.0)
 
 
 def test_homography_truth_joins_places_of_the_same_point(picture: Path) -> None:

@@ -82,11 +82,14 @@ def _turned(x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
     return x * code[0] + crossed * code[1]
 
 
-def attended(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+def attended(query: Tensor, key: Tensor, value: Tensor, there: Tensor | None = None) -> Tensor:
     """Softmax of query . key / sqrt(head_dim), over the keys, of the values: (B, H, M, head_dim).
 
-    In bfloat16 a CPU is twice as fast this way as in torch's fused kernel, which does not use its matrix instructions.
+    there: (B, N) bool, which keys count; None for all. In bfloat16 a CPU is twice as fast this way as in torch's fused
+    kernel, which does not use its matrix instructions.
     """
+    if there is not None:
+        return functional.scaled_dot_product_attention(query, key, value, attn_mask=there[:, None, None])
     if value.dtype is not torch.bfloat16 or value.device.type != "cpu":
         return functional.scaled_dot_product_attention(query, key, value)
     columns = key.to(value.dtype).transpose(-1, -2)
@@ -110,11 +113,11 @@ class SelfBlock(nn.Module):
         self.out_proj = nn.Linear(dim, dim)
         self.ffn = _mixer(dim)
 
-    def forward(self, x: Tensor, code: tuple[Tensor, Tensor]) -> Tensor:
-        """x (B, N, dim) -> the same."""
+    def forward(self, x: Tensor, code: tuple[Tensor, Tensor], there: Tensor | None = None) -> Tensor:
+        """x (B, N, dim) -> the same. there: (B, N) bool, which keypoints are there; None for all."""
         query, key, value = self.Wqkv(x).unflatten(-1, (self.heads, -1, 3)).transpose(1, 2).unbind(-1)
         query, key = _turned(query, code), _turned(key, code)
-        message = attended(query, key, value.contiguous())
+        message = attended(query, key, value.contiguous(), there)
         message = self.out_proj(message.transpose(1, 2).flatten(-2))
         return x + self.ffn(torch.cat([x, message], dim=-1))
 
@@ -130,16 +133,18 @@ class CrossBlock(nn.Module):
         self.to_out = nn.Linear(dim, dim)
         self.ffn = _mixer(dim)
 
-    def forward(self, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor]:
-        """x0 (B, M, dim), x1 (B, N, dim) -> the same."""
+    def forward(
+        self, x0: Tensor, x1: Tensor, there0: Tensor | None = None, there1: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """x0 (B, M, dim), x1 (B, N, dim) -> the same. there: (B, M), (B, N) bool; None for all."""
         key0, key1, value0, value1 = (self._by_head(of(x)) for of in (self.to_qk, self.to_v) for x in (x0, x1))
-        return self._mixed(x0, key0, key1, value1), self._mixed(x1, key1, key0, value0)
+        return self._mixed(x0, key0, key1, value1, there1), self._mixed(x1, key1, key0, value0, there0)
 
     def _by_head(self, x: Tensor) -> Tensor:
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2).contiguous()
 
-    def _mixed(self, x: Tensor, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        message = attended(query, key, value)
+    def _mixed(self, x: Tensor, query: Tensor, key: Tensor, value: Tensor, there: Tensor | None) -> Tensor:
+        message = attended(query, key, value, there)
         message = self.to_out(message.transpose(1, 2).flatten(-2))
         return x + self.ffn(torch.cat([x, message], dim=-1))
 
@@ -229,6 +234,16 @@ class LightGlue(nn.Module):
             x0, x1 = layer.cross_attn(layer.self_attn(x0, code0), layer.self_attn(x1, code1))
             yield x0, x1
 
+    def certain(self, index: int, x: Tensor) -> Tensor:
+        """Which keypoints (B, N) of the states x (B, N, dim) after layer `index` count as certain."""
+        least = 0.8 + 0.1 * math.exp(-4.0 * index / len(self.transformers))
+        return torch.sigmoid(self.confidence(index).logits(x).float()) >= least
+
+    def staying(self, index: int, x: Tensor, certain: Tensor, width_confidence: float) -> Tensor:
+        """Which keypoints (B, N) are worth a further layer after layer `index`; certain: (B, N)."""
+        partnered = torch.sigmoid(self.assignment(index).logits(x).float())
+        return (partnered > 1.0 - width_confidence) | ~certain
+
     @torch.inference_mode()
     def match(
         self, side0: Side, side1: Side, *, threshold: float, depth_confidence: float, width_confidence: float
@@ -250,8 +265,7 @@ class LightGlue(nn.Module):
                 break
             certain = [torch.ones(x.shape[:2], dtype=torch.bool, device=x.device) for x in (x0, x1)]
             if depth_confidence > 0.0:
-                logits = [self.confidence(index).logits(x).float() for x in (x0, x1)]
-                certain = [torch.sigmoid(logit) >= _certain_above(index, last + 1) for logit in logits]
+                certain = [self.certain(index, x) for x in (x0, x1)]
                 uncertain = sum(int((~flags).sum()) for flags in certain)
                 if 1.0 - uncertain / total > depth_confidence:
                     break
@@ -268,16 +282,10 @@ class LightGlue(nn.Module):
     def _pruned(
         self, index: int, x: Tensor, code: tuple[Tensor, Tensor], kept: Tensor, certain: Tensor, confidence: float
     ) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
-        probability = torch.sigmoid(self.assignment(index).logits(x).float())
-        stays = torch.nonzero(((probability > 1.0 - confidence) | ~certain)[0]).squeeze(1)
+        stays = torch.nonzero(self.staying(index, x, certain, confidence)[0]).squeeze(1)
         if len(stays) == x.shape[1]:
             return x, code, kept
         return x[:, stays], (code[0][:, :, stays], code[1][:, :, stays]), kept[stays]
-
-
-def _certain_above(index: int, layers: int) -> float:
-    """Confidence from which a keypoint counts as certain after layer `index` of so many."""
-    return 0.8 + 0.1 * math.exp(-4.0 * index / layers)
 
 
 def log_assignment(head: Assignment, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     import torch
 
 Precision = Literal["auto", "float32", "bfloat16"]
-Device = Literal["cpu", "auto"]
+Device = Literal["cpu", "cuda", "auto"]
+# A strategy's setting. Where a network runs is no part of a recipe: its answers differ by rounding.
+DEVICE: Any = Field(
+    "cpu", description="`auto` takes CUDA where there is one.", json_schema_extra={"fingerprint": "left out"}
+)
 
 
 def device_of(asked: Device) -> str:
-    """The device a setting means: "cuda" where `auto` finds one, else "cpu"."""
+    """The device a setting means: "cuda" where `auto` finds one, else "cpu". Raises ConfigError where there is none."""
+    if asked == "cpu":
+        return asked
     import torch
 
-    return "cuda" if asked == "auto" and torch.cuda.is_available() else "cpu"
+    if torch.cuda.is_available():
+        return "cuda"
+    if asked == "cuda":
+        raise ConfigError("device `cuda`: torch sees none on this machine; set `auto`, which takes one where there is")
+    return "cpu"
 
 
 def layer_type(precision: Precision, device: str = "cpu") -> torch.dtype:

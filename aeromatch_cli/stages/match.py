@@ -10,6 +10,7 @@ from pathlib import Path
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.stages import extract, rows
+from aeromatch_cli.stages.batches import asked_together
 from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage
 from aeromatch_cli.stages.enhance import EnhanceTask
 from aeromatch_cli.stages.rows import PairTask
@@ -76,18 +77,25 @@ def run_task(task: MatchTask) -> RowResult:
     path = task.workspace.matches(task.image_id0)
     old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
-    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0))
+    ahead = asked_together(task.matcher, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
+    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)
 
 
-def _match_pair(task: MatchTask, pair: PairTask, features0: Features) -> MatchEntry:
-    path1 = task.workspace.features(pair.image_id1)
+def _match_pair(task: MatchTask, pair: PairTask, features0: Features, ahead: dict[str, Matches]) -> MatchEntry:
+    """ahead: matches of pairs that are there already, which are taken out."""
     ids = (task.image_id0, pair.image_id1)
-    features1 = _features(path1, _stamp(path1))
-    sources = (task.sources[ids[0]], task.sources[ids[1]]) if task.matcher.reads_pixels else None
-    matches = compared(task.matcher, (features0, features1), pair.geometry, sources)
+    matches = ahead.pop(pair.image_id1, None)
+    if matches is None:
+        sources = (task.sources[ids[0]], task.sources[ids[1]]) if task.matcher.reads_pixels else None
+        matches = compared(task.matcher, _sides(task, pair, features0), pair.geometry, sources)
     return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
+
+
+def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:
+    path1 = task.workspace.features(pair.image_id1)
+    return features0, _features(path1, _stamp(path1))
 
 
 def compared(

@@ -47,9 +47,10 @@ class Row(Generic[E]):
 def redo(image_id0: str, pairs: Sequence[PairTask], old: Mapping[str, E], make: Callable[[PairTask], E]) -> Row[E]:
     """Keep the entries that carry the wanted fingerprint, make the others; one failing pair does not stop the rest."""
     entries, made, failures = [], [], []
+    wanted = {pair.image_id1 for pair in missing(pairs, old)}
     for pair in pairs:
         entry = old.get(pair.image_id1)
-        if entry is None or entry.fingerprint != pair.fingerprint:
+        if entry is None or pair.image_id1 in wanted:
             outcome = guarded(make, pair)
             if outcome.value is None:
                 failures.append((f"{image_id0} {pair.image_id1}", outcome.error))
@@ -58,6 +59,12 @@ def redo(image_id0: str, pairs: Sequence[PairTask], old: Mapping[str, E], make: 
             made.append(entry)
         entries.append(entry)
     return Row(tuple(entries), tuple(made), tuple(failures))
+
+
+def missing(pairs: Sequence[PairTask], old: Mapping[str, E]) -> list[PairTask]:
+    """The pairs without an entry that carries the wanted fingerprint."""
+    on_file = {image_id1: entry.fingerprint for image_id1, entry in old.items()}
+    return [pair for pair in pairs if on_file.get(pair.image_id1) != pair.fingerprint]
 
 
 def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) -> dict[str, E]:

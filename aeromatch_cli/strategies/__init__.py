@@ -14,9 +14,9 @@ Calls, by family (table in the family's __init__):
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
@@ -137,3 +137,20 @@ class Matcher(Protocol):
     def __call__(
         self, features0: Features, features1: Features, geometry: PairGeometry, *rasters: tuple[Raster, Raster]
     ) -> Matches: ...
+
+
+@runtime_checkable
+class Asking(Protocol):
+    """A matcher that may ask a network, of many pairs together where `asks_together` says that this is faster.
+
+    steps: the call, stopping at its questions; it is sent as many answers, and ends with the matches.
+    """
+
+    @property
+    def asks_together(self) -> bool: ...
+
+    def steps(
+        self, features0: Features, features1: Features, geometry: PairGeometry
+    ) -> Generator[Sequence[Any], Sequence[Any], Matches]: ...
+
+    def answers(self, questions: Sequence[Any]) -> Sequence[Any]: ...

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -22,16 +24,22 @@ from lightglue_training.sides import Partners, Seen
 SHARD = 50  # groups of homography views in a file
 
 
-def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[str], args: Any) -> None:
+class OutOfTime(Exception):  # noqa: N818 - no error: what is left is done when called again
+    """Not all was done by the time that was set."""
+
+
+def prepare(
+    out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[str], args: Any, until: float = math.inf
+) -> None:
     """Every file that is not there yet.
 
     trained_on, unseen: real blocks below `data` whose pictures are warped for training and for validation; every
-    fourth shard is of rendered pictures.
+    fourth shard is of rendered pictures. until: of time.time(), when no further file is begun. Raises OutOfTime then.
     """
     for folder in ("stage1", "stage2", "unseen1", "unseen2"):
         (out / folder).mkdir(parents=True, exist_ok=True)
     blocks = range(args.blocks)
-    folders = mapped(partial(render, args.rendered), list(blocks), args.jobs)
+    folders = mapped(partial(render, args.rendered), list(blocks), args.jobs, until)
     known = [folder for index, folder in enumerate(folders) if index not in LEFT_OUT]
     left = [folders[index] for index in LEFT_OUT]
     real, other = (pictures(data / name for name in names) for names in (trained_on, unseen))
@@ -46,7 +54,7 @@ def prepare(out: Path, data: Path, trained_on: Sequence[str], unseen: Sequence[s
     for name, group in (("stage2", known), ("unseen2", left)):
         paths = ((out / name / f"{folder.name}.npz", folder) for folder in group)
         jobs += [partial(write_block, path, partial(block_pairs, folder)) for path, folder in paths]
-    mapped(_call, jobs, args.jobs)
+    mapped(_call, jobs, args.jobs, until)
 
 
 def _call(job: Callable[[], None]) -> None:
@@ -54,12 +62,22 @@ def _call(job: Callable[[], None]) -> None:
     job()
 
 
-def mapped(function: Callable[[Any], Any], items: list[Any], jobs: int) -> list[Any]:
+def mapped(function: Callable[[Any], Any], items: list[Any], jobs: int, until: float = math.inf) -> list[Any]:
+    """Results in order. Raises OutOfTime where some were not begun by `until`, of time.time(); the others are done."""
+    work = partial(_in_time, function, until)
     if jobs == 1:
-        return [function(item) for item in items]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(function, items))
+        found = [work(item) for item in items]
+    else:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            found = list(pool.map(work, items))
+    if not all(done for done, _ in found):
+        raise OutOfTime
+    return [result for _, result in found]
+
+
+def _in_time(function: Callable[[Any], Any], until: float, item: Any) -> tuple[bool, Any]:
+    return (True, function(item)) if time.time() < until else (False, None)
 
 
 def pictures(folders: Iterable[Path]) -> list[Path]:

@@ -13,9 +13,10 @@ from aeromatch_cli.nets.lightglue_file import Calibration
 from aeromatch_cli.strategies.matchers.scan import mutual_nearest
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair
-from lightglue_training.sides import UNKNOWN, Array
+from lightglue_training.sides import NONE, UNKNOWN, Array
 
 RATIO, LEAST_SCORE = 0.8, 0.01
+LIKE_OCTAVES, LIKE_DEG = 0.5, 30.0
 EDGES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
@@ -41,6 +42,12 @@ class Found:
         right = np.cumsum(self.right[order])
         good = right / np.arange(1, len(right) + 1) >= precision
         return float(right[good].max(initial=0)) / max(self.possible, 1)
+
+    def least_score_at(self, precision: float) -> float:
+        """Score of the last match that `recall_at` takes; infinite where it takes none."""
+        order = np.argsort(-self.scores, kind="stable")
+        good = np.flatnonzero(np.cumsum(self.right[order]) / np.arange(1, len(order) + 1) >= precision)
+        return float(self.scores[order[good[-1]]]) if len(good) else np.inf
 
     def wrong_at(self, recall: float) -> int:
         """Wrong matches among the best-scored ones that reach a recall; -1 where none do."""
@@ -126,10 +133,49 @@ def _cut(pair: Pair, keypoints: int) -> Pair:
     return Pair(pair.side0.take(rows0), pair.side1.take(rows1), pair.truth.take(rows0, rows1), pair.two_suns)
 
 
+Answer = tuple[Pair, Array, Array]
+
+
+def answered(network: LightGlue, pairs: Sequence[Pair]) -> tuple[list[Answer], list[Answer]]:
+    """Matches of the ratio test and of the network in the same pairs."""
+    return [(pair, *by_ratio(pair)) for pair in pairs], [(pair, *by_network(network, pair)) for pair in pairs]
+
+
 def compared(network: LightGlue, pairs: Sequence[Pair]) -> tuple[Found, Found]:
     """What the ratio test and the network find in the same pairs."""
-    ratio = judged((pair, *by_ratio(pair)) for pair in pairs)
-    return ratio, judged((pair, *by_network(network, pair)) for pair in pairs)
+    ratio, own = answered(network, pairs)
+    return judged(ratio), judged(own)
+
+
+def of_like_look(pair: Pair) -> Array:
+    """Which keypoints of image 0 that have a partner (P,) have one of like size and turn.
+
+    Truth knows places alone: the others are different things that happen to lie within CORRECT_PX. Like: within
+    LIKE_OCTAVES and LIKE_DEG of the pair's median.
+    """
+    side0, side1 = pair.side0, pair.side1
+    rows = np.flatnonzero(pair.truth.of0 >= 0)
+    mates = pair.truth.of0[rows]
+    octaves = np.log2(side1.sizes_px[mates] / side0.sizes_px[rows])
+    turns = np.exp(1j * (side1.angles_rad[mates] - side0.angles_rad[rows]))
+    usual = np.median(turns.real) + 1j * np.median(turns.imag)
+    off_deg = np.abs(np.rad2deg(np.angle(turns * np.conj(usual))))
+    return np.asarray((np.abs(octaves - np.median(octaves)) <= LIKE_OCTAVES) & (off_deg <= LIKE_DEG))
+
+
+def recalls(answers: Iterable[Answer], least_score: float) -> tuple[float, float, float]:
+    """Share of the partners that are of like look, recall of these, and of the others, by matches of such scores."""
+    alike, found = [np.zeros(0, bool)], [np.zeros(0, bool)]
+    for pair, indices, scores in answers:
+        rows, places = np.flatnonzero(pair.truth.of0 >= 0), pair.side1.places_px
+        match = np.full(len(pair.side0.points_px), NONE)
+        kept = indices[scores >= least_score]
+        match[kept[:, 0]] = kept[:, 1]
+        same = (places[match[rows]] == places[pair.truth.of0[rows]]).all(axis=1)
+        alike.append(of_like_look(pair))
+        found.append((match[rows] != NONE) & same)
+    like, right = np.concatenate(alike), np.concatenate(found)
+    return float(like.mean()), float(right[like].mean()), float(right[~like].mean())
 
 
 def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[str, float]]:

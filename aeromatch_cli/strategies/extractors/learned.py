@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.nets.precision import Device, Precision, device_of
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
 from aeromatch_cli.strategies.extractors.described import Described
@@ -52,7 +52,7 @@ class Learned(Described):
         description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
         "one for shards on different processors.",
     )
-    device: Device = Field("cpu", description="`auto` takes CUDA where there is one.")
+    device: Device = DEVICE
 
     @property
     def follows_north(self) -> bool:
@@ -66,6 +66,11 @@ class Learned(Described):
         names = [name for name, asked in (("detector", self.detector == "network"), ("context", self.context)) if asked]
         names += ["geodesc", *(["orientation"] if self.orientation != "upright" else [])]
         return tuple(str(shipped_path(name)) for name in sorted(names))
+
+    def check_files(self, descriptor_length: int) -> None:
+        """The device is looked for as well."""
+        super().check_files(descriptor_length)
+        device_of(self.device)
 
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
         """One feature for each point, not yet turned."""

@@ -1,39 +1,35 @@
 """LightGlue: an attention network that matches the keypoints of both images jointly.
 
 Every view is matched in its own frame, because the network reads positions, scales and orientations as it saw them
-in training. Conventions of the published SIFT weights: keypoints from the image corner (ours + 0.5), scale = size / 2,
-orientation in radians in (-pi, pi], RootSIFT of unit length.
+in training (`matchers.inference`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.nets.precision import Device, Precision, device_of, layer_type
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
 from aeromatch_cli.strategies.matchers.evidence import most_evident
 from aeromatch_cli.strategies.matchers.guided import SecondSearch
+from aeromatch_cli.strategies.matchers.inference import Shown, Wanted, check_length, ready, shown_of
 from aeromatch_cli.strategies.matchers.nearest import Nearest
 from aeromatch_cli.strategies.matchers.overlap import in_overlap
-from aeromatch_cli.strategies.matchers.search import Search
+from aeromatch_cli.strategies.matchers.search import Search, Steps
 
 # Cost at least of matches that are there without the network's having found them, beside those of 1 - probability.
 _DOUBTFUL = 0.7
 # Where the network sees more than there is, its surest matches alone, or none, support a model better: probabilities.
 _SURER = (0.3, 0.5, 0.8)
-# Around the keypoints that are left of a view; training takes it from here.
-FRAME_PX = 4.0
 
 
 class LightGlue(Search):
@@ -78,7 +74,7 @@ class LightGlue(Search):
         description="Of the network's layers; auto is bfloat16 where the processor has it. Matches "
         "depend on it: name one for shards on different processors.",
     )
-    device: Device = Field("cpu", description="`auto` takes CUDA where there is one.")
+    device: Device = DEVICE
 
     def reads(self) -> frozenset[str]:
         """The cameras, in which a pair's matches are judged; more where guided or limited to the overlap."""
@@ -100,23 +96,24 @@ class LightGlue(Search):
     def check_files(self, descriptor_length: int) -> None:
         """Weights that a user names are loaded once; those that ship are `aeromatch weights verify`'s."""
         (path,) = self.fingerprint_files()
+        device_of(self.device)
         if self.weights is not None:
             from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 
             network = load_lightglue(Path(path))
-            _check_length(network.dimensions.input_dim, descriptor_length)
+            check_length(network.dimensions.input_dim, descriptor_length)
             read_calibration(Path(path))
 
     def scan(self, asked: Comparison) -> Found:
         """The mutual ratio test."""
         return Nearest().scan(asked)
 
-    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Found:
+    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
         """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""
         if len(found.rows) >= self.enough:
             return found
         shown = in_overlap(asked, found, self.windows) if self.overlap else None
-        closer = self.by_network(asked, shown)
+        closer = yield from self.by_network(asked, shown)
         doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
         surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in self._least_probabilities()]
         closer = most_evident(asked, [*surer, doubtful])
@@ -125,130 +122,41 @@ class LightGlue(Search):
     def _least_probabilities(self) -> list[float]:
         return [self.threshold, *(least for least in _SURER if least > self.threshold)]
 
-    def by_network(self, asked: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Found:
+    def by_network(self, asked: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Steps[Found]:
         """Matches of all view pairs that are alike, each keypoint once, costs 1 - probability.
 
         shown: (K0,), (K1,) the keypoints that the other image may show.
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.
         """
-        (path,) = self.fingerprint_files()
-        matcher = _matcher(path, _content_stamp(path), self)
         if shown is None:
             shown = np.ones(len(asked.features0.keypoints_px), bool), np.ones(len(asked.features1.keypoints_px), bool)
-        shown0, shown1 = shown
-        parts = []
-        for view0, view1 in np.argwhere(asked.alike):
-            side0 = self._view(asked.features0, int(view0), shown0)
-            side1 = self._view(asked.features1, int(view1), shown1)
-            if len(side0.rows) and len(side1.rows):
-                pairs, scores = matcher.match(side0, side1)
-                parts.append(Found(side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - scores))
-        found = asked.within(joined(parts))
+        views = [
+            (
+                shown_of(asked.features0, int(view0), shown[0], self.max_keypoints),
+                shown_of(asked.features1, int(view1), shown[1], self.max_keypoints),
+            )
+            for view0, view1 in np.argwhere(asked.alike)
+        ]
+        views = [(side0, side1) for side0, side1 in views if len(side0.rows) and len(side1.rows)]
+        answers = yield views
+        found = asked.within(
+            joined(
+                [
+                    Found(side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - probabilities)
+                    for (side0, side1), (pairs, probabilities) in zip(views, answers, strict=True)
+                ]
+            )
+        )
         return found.take(one_to_one(*asked.keypoints(found), found.costs))
 
-    def _view(self, features: Features, view: int, shown: BoolArray) -> _Side:
-        rows = np.flatnonzero(features.view_idx == view)
-        total = len(rows)
-        rows = rows[shown[features.descriptor_keypoint_idx[rows]]]
-        culled = len(rows) < total
-        if len(rows) > self.max_keypoints:
-            strength = features.responses[features.descriptor_keypoint_idx[rows]]
-            rows = np.sort(rows[np.argsort(-strength, kind="stable")[: self.max_keypoints]])
-        size_px = np.asarray(features.view_sizes_px[view], dtype=np.float32)
-        # Sub-pixel refinement can push a point over the border.
-        points = np.clip(features.view_keypoints_px[rows].astype(np.float32) + np.float32(COLMAP_OFFSET_PX), 0, size_px)
-        if culled and len(rows):
-            low = points.min(axis=0) - np.float32(FRAME_PX)
-            size_px = points.max(axis=0) + np.float32(FRAME_PX) - low
-            points = points - low
-        return _Side(
-            rows=rows,
-            points_px=points,
-            scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
-            orientations_rad=wrapped_rad(features.view_orientation_deg[rows]),
-            descriptors=_as_float(features.descriptors[rows]),
-            size_px=size_px,
-        )
+    @property
+    def asks_together(self) -> bool:
+        """A GPU answers many pairs in the time of one."""
+        return device_of(self.device) == "cuda"
 
-
-@dataclass(frozen=True, eq=False)
-class _Side:
-    """The keypoints of one view that are compared.
-
-    rows: (N,) of the image's descriptors. points_px: (N, 2) from the corner; size_px: (2,) width, height.
-    """
-
-    rows: IntArray
-    points_px: FloatArray
-    scales_px: FloatArray
-    orientations_rad: FloatArray
-    descriptors: FloatArray
-    size_px: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _Matcher:
-    network: Any
-    calibration: Any
-    device: str
-    options: dict[str, float]
-
-    def match(self, side0: _Side, side1: _Side) -> tuple[IntArray, FloatArray]:
-        """Row pairs (M, 2) and their probabilities (M,)."""
-        pairs, scores = self.network.match(self._tensors(side0), self._tensors(side1), **self.options)
-        return pairs.cpu().numpy(), self.calibration.calibrated(scores.cpu().numpy())
-
-    def _tensors(self, side: _Side) -> Any:
-        import torch
-
-        from aeromatch_cli.nets.lightglue import Side, normalised
-
-        dimensions = self.network.dimensions
-        _check_length(dimensions.input_dim, side.descriptors.shape[1])
-        places = normalised(torch.from_numpy(side.points_px), torch.from_numpy(side.size_px))
-        if dimensions.add_scale_ori:
-            more = np.stack([side.scales_px, side.orientations_rad], axis=1)
-            places = torch.cat([places, torch.from_numpy(more)], dim=1)
-        descriptors = torch.from_numpy(np.ascontiguousarray(side.descriptors))
-        return Side(places[None].to(self.device), descriptors[None].to(self.device))
-
-
-def _check_length(expected: int, given: int) -> None:
-    if given != expected:
-        raise ConfigError(
-            f"these LightGlue weights expect descriptors of length {expected}, the extractor makes {given}; use "
-            "weights trained for it"
-        )
-
-
-def _content_stamp(path: str) -> tuple[int, int]:
-    status = Path(path).stat()
-    return status.st_size, status.st_mtime_ns
-
-
-@lru_cache(maxsize=2)
-def _matcher(path: str, content_stamp: tuple[int, int], recipe: LightGlue) -> _Matcher:
-    """The network, built once per process; the stamp makes a replaced file load again."""
-    from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
-
-    device = device_of(recipe.device)
-    network = load_lightglue(Path(path), device=device).with_layers_in(layer_type(recipe.precision, device))
-    calibration = read_calibration(Path(path))
-    options = {name: getattr(recipe, name) for name in ("depth_confidence", "width_confidence")}
-    options["threshold"] = calibration.score_of(recipe.threshold)
-    return _Matcher(network, calibration, device, options)
-
-
-def wrapped_rad(angles_deg: FloatArray) -> FloatArray:
-    """Radians in (-pi, pi]."""
-    degrees = np.asarray(angles_deg, dtype=np.float64)
-    return np.deg2rad(180.0 - np.mod(180.0 - degrees, 360.0)).astype(np.float32)
-
-
-def _as_float(descriptors: NDArray[Any]) -> FloatArray:
-    """float32 descriptors; stored RootSIFT (uint8, x 512) regains unit length."""
-    if descriptors.dtype != np.uint8:
-        return descriptors.astype(np.float32)
-    values = descriptors.astype(np.float32)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1.0)
+    def answers(self, questions: Sequence[tuple[Shown, Shown]]) -> list[tuple[IntArray, FloatArray]]:
+        """Of each pair of views row pairs (M, 2) and their probabilities (M,)."""
+        (path,) = self.fingerprint_files()
+        wanted = Wanted(path, self.precision, self.device, self.threshold, self.depth_confidence, self.width_confidence)
+        return ready(wanted).answers(questions)

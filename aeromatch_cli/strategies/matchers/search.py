@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +21,22 @@ from aeromatch_cli.strategies.matchers.views import appearances, like_views
 
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
+
+T = TypeVar("T")
+# A search that puts questions to a network, is sent as many answers and ends with a result. Whoever runs it decides
+# when the network is asked, and for how many pairs at once.
+Steps = Generator[Sequence[Any], Sequence[Any], T]
+
+
+def finished(steps: Steps[T], answers: Callable[[Sequence[Any]], Sequence[Any]]) -> T:
+    """The result of steps whose questions are answered as they come."""
+    try:
+        questions = next(steps)
+        while True:
+            questions = steps.send(answers(questions))
+    except StopIteration as end:
+        result: T = end.value
+        return result
 
 
 class Search(Strategy):
@@ -59,6 +76,19 @@ class Search(Strategy):
 
         Scores are the matcher's own, or 1 - cost where a model guided the search.
         """
+        return finished(self.steps(features0, features1, geometry), self.answers)
+
+    @property
+    def asks_together(self) -> bool:
+        """Whether it is faster to put the questions of many pairs to the network together."""
+        return False
+
+    def answers(self, questions: Sequence[Any]) -> Sequence[Any]:
+        """Of a network, one for each question of `steps`."""
+        raise NotImplementedError(f"{type(self).__name__} asks no network")
+
+    def steps(self, features0: Features, features1: Features, geometry: PairGeometry) -> Steps[Matches]:
+        """The call, which stops where a network is asked."""
         alike = like_views(features0, features1, self.max_direction_deg)
         taken, *enhanced = (alike & which for which in appearances(features0, features1))
         windows = self.windows(features0, geometry) if self.guided else None
@@ -68,7 +98,7 @@ class Search(Strategy):
         asked = replace(asked, where=where)
         found = asked.within(found)
         if len(found.rows) < self.ample:
-            asked, found = self._searched_harder(asked, found, enhanced)
+            asked, found = yield from self._searched_harder(asked, found, enhanced)
         return _matches(asked, found)
 
     @abstractmethod
@@ -78,7 +108,9 @@ class Search(Strategy):
         A keypoint may occur several times. Costs lie in 0-1; the score of a match is 1 - cost.
         """
 
-    def _searched_harder(self, asked: Comparison, found: Found, enhanced: list[BoolArray]) -> tuple[Comparison, Found]:
+    def _searched_harder(
+        self, asked: Comparison, found: Found, enhanced: list[BoolArray]
+    ) -> Steps[tuple[Comparison, Found]]:
         """The pictures that say most and their matches, where those of the pictures as taken are few.
 
         enhanced: view pairs (V0, V1) of the enhanced pictures, where there are any.
@@ -89,10 +121,11 @@ class Search(Strategy):
         # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
         asked, found = max(scans, key=lambda scan: len(scan[1].rows))
         again = SecondSearch(asked) if self.guided else None
-        return asked, self.look_closer(asked, again(found) if again else found, again)
+        return asked, (yield from self.look_closer(asked, again(found) if again else found, again))
 
-    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Found:
+    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
         """What a dearer search makes of the matches found so far. again: the second search, where it is wanted."""
+        yield from ()
         return found
 
     def windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:

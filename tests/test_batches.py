@@ -1,0 +1,140 @@
+"""Pairs that ask the network together: the same matches as one by one, and nothing lost where something fails."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from make_lightglue import SIFT, features, seeded_tensors, write
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.precision import device_of
+from aeromatch_cli.stages import batches
+from aeromatch_cli.stages.batches import asked_together
+from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.strategies.matchers import inference
+from aeromatch_cli.strategies.matchers.lightglue import LightGlue
+from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.workspace import fingerprint
+
+CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
+
+
+class Together(LightGlue):
+    """As where there is a GPU."""
+
+    @property
+    def asks_together(self) -> bool:
+        return True
+
+
+def task(image_id1: str) -> PairTask:
+    return PairTask(PairGeometry(Pair("a", image_id1, np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None), "", 0)
+
+
+PAIRS = [task(name) for name in ("same", "moved", "many", "few")]
+
+
+def sides(pair: PairTask) -> tuple[Features, Features]:
+    """`many` is settled by the ratio test; the others ask."""
+    if pair.image_id1 == "many":
+        return features(400), features(400)
+    if pair.image_id1 == "few":
+        return features(30), features(20)
+    return features(120), features(120, seed=pair.image_id1 != "same")
+
+
+@pytest.fixture(scope="module")
+def matcher(tmp_path_factory: pytest.TempPathFactory) -> Together:
+    path = write(tmp_path_factory.mktemp("weights") / "sift.pth", seeded_tensors(SIFT))
+    return Together(weights=str(path), precision="float32", threshold=0.0)
+
+
+@pytest.mark.parametrize("most", [1, 3, 32])
+def test_together_they_find_what_each_finds_alone(
+    matcher: Together, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    monkeypatch.setattr(batches, "_TOGETHER", most)
+    asked: list[int] = []
+    plain = LightGlue.answers
+
+    def spy(self: LightGlue, questions: Sequence[Any]) -> Any:
+        asked.append(len(questions))
+        return plain(self, questions)
+
+    monkeypatch.setattr(Together, "answers", spy)
+    found = asked_together(matcher, PAIRS, sides)
+    assert asked == {1: [1, 1, 1], 3: [2, 1], 32: [3]}[most]
+    assert found.keys() == {pair.image_id1 for pair in PAIRS}
+    for pair in PAIRS:
+        alone = matcher(*sides(pair), pair.geometry)
+        assert len(alone.indices) > 5 or pair.image_id1 in ("moved", "few")
+        np.testing.assert_array_equal(found[pair.image_id1].indices, alone.indices)
+        np.testing.assert_array_equal(found[pair.image_id1].scores, alone.scores)
+
+
+def test_one_by_one_where_nothing_is_gained(matcher: Together) -> None:
+    assert asked_together(matcher, PAIRS[:1], sides) == {}
+    assert asked_together(LightGlue(weights=matcher.weights), PAIRS, sides) == {}
+    assert asked_together(Nearest(), PAIRS, sides) == {}
+
+
+def test_a_pair_that_fails_is_left_for_its_own_turn(matcher: Together) -> None:
+    def broken(pair: PairTask) -> tuple[Features, Features]:
+        if pair.image_id1 == "moved":
+            raise ConfigError("no features")
+        return sides(pair)
+
+    assert asked_together(matcher, PAIRS, broken).keys() == {"same", "many", "few"}
+
+
+def test_where_the_network_fails_only_settled_pairs_are_there(
+    matcher: Together, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setattr(Together, "answers", full)
+    with caplog.at_level(logging.WARNING):
+        assert asked_together(matcher, PAIRS, sides).keys() == {"many"}
+    assert "pair by pair" in caplog.text
+    assert "CUDA out of memory" in caplog.text
+
+
+def test_batches_on_a_gpu_answer_in_the_order_of_the_questions(
+    matcher: Together, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inference, "_BATCH_KEYPOINTS", 400)
+    (path,) = matcher.fingerprint_files()
+    asked = inference.ready(inference.Wanted(path, "float32", "cpu", 0.0, 0.95, 0.99))
+    given = [features(count, seed) for seed, count in enumerate((40, 120, 0, 80, 119))]
+    kept = np.ones(200, bool)
+    shown = [inference.shown_of(one, 0, kept[: len(one.keypoints_px)], 2048) for one in given]
+    questions = [(asked._tensors(one), asked._tensors(one)) for one in shown]
+    together, alone = asked._in_batches(questions), [asked._alone(pair) for pair in questions]
+    for (pairs, scores), (own_pairs, own_scores) in zip(together, alone, strict=True):
+        assert pairs.tolist() == own_pairs.tolist()
+        torch.testing.assert_close(scores, own_scores, atol=1e-4, rtol=0.0)
+    assert [len(scores) > 20 for _, scores in alone] == [True, True, False, True, True]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("setting", ["match.device", "extract.device"])
+def test_a_device_that_is_not_there_is_named(setting: str) -> None:
+    settings = load("oblique" if setting.startswith("extract") else "fusion", [f"{setting}=cuda"])
+    strategy = settings.extract if setting.startswith("extract") else settings.match
+    with pytest.raises(ConfigError, match="torch sees none on this machine; set `auto`"):
+        strategy.check_files(128)
+    assert device_of("auto") == "cpu"
+
+
+def test_the_device_is_no_part_of_the_recipe() -> None:
+    one, other = LightGlue(), LightGlue(device="auto")
+    assert fingerprint(one) == fingerprint(other)
+    assert fingerprint(one) != fingerprint(LightGlue(precision="float32"))
