@@ -35,7 +35,6 @@ from detector_training.loss import at, drawn, label_loss, peaks, repeat_loss
 from detector_training.scenes import Sight, read_sights, sights, write_sights
 from detector_training.shapes import shape
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table, thinned
-from scipy.spatial import cKDTree
 from torch import Tensor
 from training_blocks import LEFT_OUT, numbers, render
 from training_runs import (
@@ -51,14 +50,12 @@ from training_runs import (
 )
 
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
-from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat_keypoints
 
 DECAY, CLIP = 0.995, 1.0
 LABEL_PX2 = 160.0  # a view has one label per so many pixels
 OF_RUN = ("trained_on", "blocks", "unseen", "seed", "scale", "batch", "rate")
 STEEP_DEG, STEEP_PAIRS = 45.0, 4
 MOST_PAIRS = 24  # of validation between two view angles
-OFFSET_KEYPOINTS = 500  # of each view of which the offset is measured
 REPORT_EVERY, SAVE_EVERY = 250, 50  # steps
 
 
@@ -250,7 +247,7 @@ def forward(network: Detector, grays: Tensor) -> Tensor:
     """Logits (N, 1, S, S) of grays (N, S, S) uint8."""
     grays = grays.to(next(network.parameters()).device)
     with torch.autocast(grays.device.type, dtype=torch.bfloat16):
-        return network(grays[:, None].float() / 255.0).float()
+        return network.one_way(grays[:, None].float() / 255.0).float()
 
 
 def _inner(weight: Tensor) -> Tensor:
@@ -270,23 +267,6 @@ def write(run: Run, out: Path) -> None:
     draw_curves(run.log, out / "curves.png")
 
 
-def offset_px(network: Detector, blocks: list[list[Sight]]) -> Tensor:
-    """(2,) as Detector has it, the mean over the keypoints of one view of every block that its half turn shows, too."""
-    network = copy.deepcopy(network).eval()
-    network.offset_px.zero_()
-    found = []
-    for sight in (block[0] for block in blocks):
-        last = np.array(sight.gray.shape[::-1]) - 1.0
-        turned = np.ascontiguousarray(sight.gray[::-1, ::-1]), np.ascontiguousarray(sight.valid[::-1, ::-1])
-        points0, sizes0, _ = heat_keypoints(sight.gray, OFFSET_KEYPOINTS, sight.valid, network)
-        points1, sizes1, _ = heat_keypoints(turned[0], OFFSET_KEYPOINTS, turned[1], network)
-        if len(points0) and len(points1):
-            away, row = cKDTree(last - points1).query(points0)
-            same = (away < sizes0 / SIZE_PX) & (np.abs(sizes1[row] - sizes0) < 0.1 * sizes0)
-            found.append(((points0 + points1[row] - last) / (sizes0 / SIZE_PX)[:, None] / 2.0)[same])
-    return torch.from_numpy(np.concatenate(found).mean(axis=0)).float()
-
-
 def draw_curves(log: Log, path: Path) -> None:
     """Repeatability by steps and view angle at 3 px and 1 px, and SIFT's (dashed)."""
     from matplotlib.figure import Figure
@@ -299,7 +279,8 @@ def draw_curves(log: Log, path: Path) -> None:
                       label=f"{angle} degrees")  # fmt: skip
             axes.axhline(log[0]["unseen"][angle][limit], color=f"C{number}", linestyle="--", linewidth=0.8)
         axes.set(xlabel="steps", ylabel=f"repeatability at {limit} (dashed: SIFT)", ylim=(0.0, None))
-    axes.legend(frameon=False, fontsize=8)
+    if log[0]["unseen"]:
+        axes.legend(frameon=False, fontsize=8)
     figure.savefig(path)
 
 
@@ -362,7 +343,6 @@ def main() -> None:
     real = pictures([args.data / name for name in args.trained_on.split(",")])
     run = train(args, Sources(real, blocks + 2 * steep), unseen)
     if run is not None:
-        run.average.offset_px.copy_(offset_px(run.average, blocks))
         write(run, args.out)
 
 

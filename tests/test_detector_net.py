@@ -30,6 +30,14 @@ def test_heat_has_the_size_of_its_picture(network: Detector) -> None:
         network(torch.zeros(1, 3, 8, 8))
 
 
+def test_a_picture_turned_by_half_has_its_heat_turned_by_half(network: Detector) -> None:
+    picture = noise(48, 64)  # whole cells: those of local brightness turn onto themselves
+    turned = network(picture.flip(2, 3)).flip(2, 3)
+    torch.testing.assert_close(turned, network(picture), atol=1e-5, rtol=0.0)
+    lopsided = network.one_way(picture.flip(2, 3)).flip(2, 3)
+    assert (lopsided - network.one_way(picture)).abs().max() > 1e-2
+
+
 def test_gain_and_offset_of_the_light_change_nothing() -> None:
     picture = 0.2 + 0.6 * noise(64, 64)
     assert torch.allclose(evened(0.5 * picture + 0.1), evened(picture), atol=2e-3)

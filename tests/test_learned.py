@@ -119,8 +119,8 @@ def test_without_cuda_auto_is_the_cpu(picture: NDArray[np.uint8], monkeypatch: p
 @pytest.mark.parametrize("key", ["extract=learned", "match=lightglue"])
 def test_devices_have_the_same_words_for_every_network(key: str) -> None:
     place = key.partition("=")[0]
-    with pytest.raises(ConfigError, match=rf"{place}\.device: must be 'cpu' or 'auto' \(got 'cuda'\)"):
-        load("baseline", [key, f"{place}.device=cuda"])
+    with pytest.raises(ConfigError, match=rf"{place}\.device: must be 'cpu', 'cuda' or 'auto' \(got 'gpu'\)"):
+        load("baseline", [key, f"{place}.device=gpu"])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

@@ -33,18 +33,15 @@ _FLAT = 1.0 / 255.0
 class Detector(nn.Module):
     """Heat of gray pictures; layers may run in bfloat16, but the entrance and the last layer's sums are float32 always.
 
-    offset_px: (2,) x and y, how far from its place in the picture the top of the heat is on the average: as far as it
-    changes sides when the picture is turned by half. What reads places from the heat takes it off.
+    The heat is the mean of what the layers say of the picture and of the picture turned by half: alone, they put it
+    beside its place, to one and the same side.
     """
-
-    offset_px: Tensor
 
     def __init__(self) -> None:
         super().__init__()
         self.first = nn.Conv2d(1, CHANNELS, 5, padding=2)
         self.layers = nn.ModuleList(nn.Conv2d(CHANNELS, CHANNELS, 3, padding=gap, dilation=gap) for gap in _GAPS)
         self.last = nn.Conv2d(CHANNELS, 1, 3, padding=1)
-        self.register_buffer("offset_px", torch.zeros(2))
 
     def forward(self, gray: Tensor) -> Tensor:
         """Logits (N, 1, H, W) float32 of the heat (confidence 0-1 by a sigmoid) for gray (N, 1, H, W), 0-1.
@@ -54,11 +51,19 @@ class Detector(nn.Module):
         """
         if gray.ndim != 4 or gray.shape[1] != 1:
             raise ValueError(f"gray has shape {tuple(gray.shape)} instead of (N, 1, H, W)")
-        x = evened(gray.float()).to(self.first.weight.dtype).contiguous(memory_format=torch.channels_last)
+        x = evened(gray.float())
+        return (self._layered(x) + self._layered(x.flip(2, 3)).flip(2, 3)) / 2.0
+
+    def one_way(self, gray: Tensor) -> Tensor:
+        """What the layers say of the picture as it is, in half the time: for training."""
+        return self._layered(evened(gray.float()))
+
+    def _layered(self, x: Tensor) -> Tensor:
+        x = x.to(self.first.weight.dtype).contiguous(memory_format=torch.channels_last)
         x = F.relu_(self.first(x))
         for layer in self.layers:
             x = F.relu_(layer(x))
-        with torch.autocast(gray.device.type, enabled=False):
+        with torch.autocast(x.device.type, enabled=False):
             bias = self.last.bias
             return F.conv2d(x.float(), self.last.weight.float(), None if bias is None else bias.float(), padding=1)
 

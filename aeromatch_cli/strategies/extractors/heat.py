@@ -53,7 +53,7 @@ def heat_keypoints(
     network = network or load_detector()
     levels = levels_of(gray)
     maps = [heat(level.gray, network) for level in levels]
-    points, sizes, logits = maxima(levels, maps, network.offset_px.double().cpu().numpy())
+    points, sizes, logits = maxima(levels, maps)
     inside = _within(valid, points, sizes)
     points, sizes, logits = points[inside], sizes[inside], logits[inside]
     ranks = logits - _FINER * 2.0 * np.log2(sizes / SIZE_PX)
@@ -71,7 +71,7 @@ def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_
     from aeromatch_cli.nets.detector import CELL_PX, load_detector
 
     network = network or load_detector()
-    device = network.offset_px.device
+    device = network.first.weight.device
     height, width = gray.shape
     out = np.empty((height, width), np.float32)
     with torch.inference_mode():
@@ -87,12 +87,8 @@ def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_
     return np.asarray(cv2.GaussianBlur(out, (0, 0), _SMOOTH_PX), np.float32)
 
 
-def maxima(
-    levels: Sequence[Level], maps: Sequence[Logits], offset_px: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def maxima(levels: Sequence[Level], maps: Sequence[Logits]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """All maxima over place and scale: picture points (N, 2), sizes (N,), log odds (N,), refined below the pixel.
-
-    offset_px: (2,) of the Detector, in pixels of every level.
 
     A maximum is larger than its eight neighbours and than the nine pixels around its place in the levels next to its
     own.
@@ -115,7 +111,7 @@ def maxima(
                 stands &= logits[y, x] > _nearest(tops[other], levels[other].from_picture(places))
         x, y = x[stands], y[stands]
         steps, values = refined(logits, x, y)
-        points = level.to_picture(np.column_stack([x, y]) + steps - offset_px)
+        points = level.to_picture(np.column_stack([x, y]) + steps)
         found_points.append(points)
         found_sizes.append(np.full(len(x), SIZE_PX / float(np.sqrt(level.scale.prod()))))
         found_logits.append(values)

@@ -35,7 +35,7 @@ _CHOICE = 8
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(
