@@ -6,7 +6,8 @@ import pytest
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Candidates, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.strategies.filters.colour import Colour, chromaticity_distances, dominant_colours
+from aeromatch_cli.strategies.filters.clustered_ransac import dominant_colours
+from aeromatch_cli.strategies.filters.colour import Colour, chromaticity_distances
 
 ROOF, LAWN, STREET, WATER = (150, 70, 50), (80, 120, 60), (120, 120, 115), (40, 70, 110)
 NOWHERE = PairGeometry(Pair("a", "b", 0.5, 10.0, "overlap"), None, None, None, None, None)

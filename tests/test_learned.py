@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import device_of
+from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
+from aeromatch_cli.workspace import fingerprint
 
 SIDE = 320
 
@@ -152,3 +155,30 @@ def test_flat_picture_has_no_features() -> None:
 def test_matcher_for_other_descriptors_is_refused(extract: str, match: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load("baseline", [f"extract={extract}", f"match={match}"])
+
+
+def test_own_weights_take_the_place_of_those_that_ship(picture: NDArray[np.uint8], tmp_path: Path) -> None:
+    content = load_file(shipped_path("geodesc"))
+    first = next(iter(content))
+    save_file({**content, first: -content[first]}, tmp_path / "geodesc.safetensors")
+    plain, own = extract(picture), extract(picture, weights=str(tmp_path))
+    np.testing.assert_array_equal(plain.keypoints_px, own.keypoints_px)  # the detector is the one that ships
+    assert (plain.descriptors != own.descriptors).mean() > 0.5
+    assert fingerprint(Learned()) != fingerprint(Learned(weights=str(tmp_path)))
+    copied = tmp_path / "copied"
+    copied.mkdir()
+    (copied / "geodesc.safetensors").write_bytes(shipped_path("geodesc").read_bytes())
+    assert fingerprint(Learned()) == fingerprint(Learned(weights=str(copied)))  # what they hold counts
+    Learned(weights=str(tmp_path)).check_files(128)
+
+
+def test_own_weights_that_are_not_there_or_no_network_are_named(tmp_path: Path) -> None:
+    for folder in (tmp_path / "absent", tmp_path):
+        with pytest.raises(ConfigError, match=r"holds none of .*: detector\.safetensors, geodesc\.safetensors, orient"):
+            Learned(weights=str(folder)).check_files(128)
+    (tmp_path / "detector.safetensors").write_bytes(b"no network")
+    with pytest.raises(ConfigError, match=r"detector\.safetensors is damaged"):
+        Learned(weights=str(tmp_path)).check_files(128)
+    # A network that this recipe does not ask is not read.
+    with pytest.raises(ConfigError, match="holds none of"):
+        Learned(weights=str(tmp_path), detector="sift").check_files(128)

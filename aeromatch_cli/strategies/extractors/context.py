@@ -29,22 +29,24 @@ def with_context(
     descriptors: NDArray[np.float32],
     raw: Raw,
     gray: NDArray[np.uint8],
+    network: Any = None,
     precision: Precision = "auto",
-    device: str = "cpu",
 ) -> NDArray[np.float32]:
     """The descriptors (N, 128) of one view (H, W), those of features `raw`, with what is around them.
 
-    Computed on "cpu" or "cuda".
+    network: a Context, by default the one that ships; computed where it is.
     """
     import torch
 
     from aeromatch_cli.nets.context import load_context
     from aeromatch_cli.nets.precision import layer_type
 
+    network = network or load_context()
+    device = next(network.parameters()).device.type
     half = layer_type(precision, device) == torch.bfloat16
     inputs = [values.to(device) for values in context_inputs(descriptors, raw, gray)]
     with torch.inference_mode(), torch.autocast(device, torch.bfloat16, enabled=half):
-        found = load_context(device=device)(*inputs)
+        found = network(*inputs)
     return np.asarray(found.float().cpu().numpy())
 
 

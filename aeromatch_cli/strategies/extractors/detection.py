@@ -46,6 +46,42 @@ class Raw:
         return Raw(**(vars(points) | {"orientations_deg": np.zeros_like(points.orientations_deg)}))
 
 
+@dataclass(frozen=True)
+class SiftSettings:
+    """Of OpenCV's SIFT, as `extract=sift` documents them."""
+
+    contrast_threshold: float = 0.004
+    edge_threshold: float = 10.0
+    octave_layers: int = 3
+    sigma: float = 1.6
+
+
+SIFT = SiftSettings()
+# Up to this size a larger blob is found again more surely, because noise averages out over it; beyond, relief and
+# perspective cost as much as that gains (share of keypoints found again in rendered pairs, by size).
+_STABLE_SIZE_PX = 6.0
+
+
+def sift_detector(settings: SiftSettings = SIFT) -> Any:
+    """cv2.SIFT, for `detect` and `describe`."""
+    import cv2
+
+    return cv2.SIFT.create(
+        nfeatures=0,
+        nOctaveLayers=settings.octave_layers,
+        contrastThreshold=settings.contrast_threshold,
+        edgeThreshold=settings.edge_threshold,
+        sigma=settings.sigma,
+        descriptorType=cv2.CV_8U,
+        enable_precise_upscale=True,  # without it every keypoint is off by a quarter pixel
+    )
+
+
+def balanced(raw: Raw) -> FloatArray:
+    """What of SIFT's features (N,) is found again most surely: response x size^2, sizes up to _STABLE_SIZE_PX."""
+    return raw.responses * np.minimum(raw.sizes_px, _STABLE_SIZE_PX) ** 2
+
+
 def concatenate(parts: Sequence[Raw]) -> Raw:
     return Raw(**{key: np.concatenate([getattr(part, key) for part in parts]) for key in vars(parts[0])})
 

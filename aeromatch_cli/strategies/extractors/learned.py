@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -19,14 +20,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.context import as_bytes, with_context
 from aeromatch_cli.strategies.extractors.described import Described
-from aeromatch_cli.strategies.extractors.detection import Raw
+from aeromatch_cli.strategies.extractors.detection import Raw, balanced, detect, sift_detector
 from aeromatch_cli.strategies.extractors.heat import heat_keypoints
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
-from aeromatch_cli.strategies.extractors.sift import Sift
 
 # Keypoints of a view that the even spread chooses from, for each that it may keep.
 _CHOICE = 8
@@ -47,6 +48,12 @@ class Learned(Described):
         "axes follow the world's.",
     )
     context: bool = Field(False, description="Descriptors know what is around them: picture and other keypoints.")
+    weights: str | None = Field(
+        None,
+        description="Folder with files of your own, `detector.safetensors`, `orientation.safetensors`, "
+        "`geodesc.safetensors` or `context.safetensors`, as the scripts train_* write them; those that it lacks ship.",
+        json_schema_extra={"path": "folder"},
+    )
     precision: Precision = Field(
         "auto",
         description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
@@ -60,23 +67,59 @@ class Learned(Described):
         return self.orientation == "auto"
 
     def fingerprint_files(self) -> tuple[str, ...]:
-        """The weights that ship, of the networks that this recipe asks. Raises ConfigError where one is missing."""
-        from aeromatch_cli.nets.weights import shipped_path
-
-        names = [name for name, asked in (("detector", self.detector == "network"), ("context", self.context)) if asked]
-        names += ["geodesc", *(["orientation"] if self.orientation != "upright" else [])]
-        return tuple(str(shipped_path(name)) for name in sorted(names))
+        """The weights of the networks that this recipe asks. Raises ConfigError where one is missing."""
+        return tuple(str(self._path(name)) for name in self._asked())
 
     def check_files(self, descriptor_length: int) -> None:
-        """The device is looked for as well."""
+        """Weights of a user are loaded once; the device is looked for."""
         super().check_files(descriptor_length)
         device_of(self.device)
+        if self.weights is None:
+            return
+        own = [name for name in self._asked() if (Path(self.weights).expanduser() / f"{name}.safetensors").is_file()]
+        if not own:
+            raise ConfigError(
+                f"extract.weights {self.weights!r} holds none of the files that this recipe reads: "
+                + ", ".join(f"{name}.safetensors" for name in self._asked())
+            )
+        for name in own:
+            self._network(name)
+
+    def _asked(self) -> list[str]:
+        """Names of the networks that this recipe needs, in order."""
+        needed = {
+            "context": self.context,
+            "detector": self.detector == "network",
+            "geodesc": True,
+            "orientation": self.orientation != "upright",
+        }
+        return [name for name, asked in needed.items() if asked]
+
+    def _path(self, name: str) -> Path:
+        from aeromatch_cli.nets.weights import shipped_path
+
+        own = None if self.weights is None else Path(self.weights).expanduser() / f"{name}.safetensors"
+        return own if own is not None and own.is_file() else shipped_path(name)
+
+    def _network(self, name: str) -> Any:
+        """Once per process."""
+        from aeromatch_cli.nets.context import load_context
+        from aeromatch_cli.nets.detector import load_detector
+        from aeromatch_cli.nets.geodesc import load_geodesc
+        from aeromatch_cli.nets.orientation import load_orientation
+
+        path, device = self._path(name), device_of(self.device)
+        if name == "context":
+            return load_context(path, device)
+        loaders = {"detector": load_detector, "geodesc": load_geodesc, "orientation": load_orientation}
+        return loaders[name](path, precision=self.precision, device=device)
 
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
         """One feature for each point, not yet turned."""
         if self.detector == "sift":
-            return Sift(orientation="upright").detected(view, view_idx)
-        points, sizes, confidences = heat_keypoints(view.gray, _CHOICE * self.keypoints, view.valid, self._detector())
+            return detect(sift_detector(), view, view_idx).upright()
+        most = _CHOICE * self.keypoints
+        points, sizes, confidences = heat_keypoints(view.gray, most, view.valid, self._network("detector"))
         return Raw(
             source_px=points,
             source_sizes_px=sizes.astype(np.float32),
@@ -89,44 +132,36 @@ class Learned(Described):
         )
 
     def strengths(self, raw: Raw) -> FloatArray:
-        """The network's confidence; of SIFT's keypoints as `Sift` has it."""
-        return Sift().strengths(raw) if self.detector == "sift" else raw.responses
+        """The network's confidence; of SIFT's keypoints what `sift` chooses by."""
+        return balanced(raw) if self.detector == "sift" else raw.responses
 
     def turned(self, raw: Raw, views: Sequence[ViewPixels]) -> Raw:
         """Orientations by the network, where a view needs them."""
-        from aeromatch_cli.nets.orientation import directions, load_orientation
+        from aeromatch_cli.nets.orientation import directions
 
         angles = raw.orientations_deg.copy()
         for view_idx, view in enumerate(views):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
             upright = self.orientation == "upright" or (self.orientation == "auto" and view.view.north_up)
             if len(of_view) and not upright:
-                network = load_orientation(precision=self.precision, device=device_of(self.device))
-                cosine, sine = directions(_patches(view, raw.take(of_view)), network).T
+                cosine, sine = directions(_patches(view, raw.take(of_view)), self._network("orientation")).T
                 angles[of_view] = np.rad2deg(np.arctan2(sine, cosine))
         return replace(raw, orientations_deg=angles)
 
     def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
         """Descriptor bytes (N, 128), see `context.as_bytes`."""
-        from aeromatch_cli.nets.geodesc import describe, load_geodesc
+        from aeromatch_cli.nets.geodesc import describe
 
-        device = device_of(self.device)
-        network = load_geodesc(precision=self.precision, device=device)
         found = np.zeros((len(raw.view_idx), self.descriptor_length), np.float32)
         for view_idx, view in enumerate(views):
             of_view = np.flatnonzero(raw.view_idx == view_idx)
             if len(of_view):
                 there = raw.take(of_view)
-                plain = describe(_patches(view, there), network)
+                plain = describe(_patches(view, there), self._network("geodesc"))
                 if self.context:
-                    plain = with_context(plain, there, view.gray, self.precision, device)
+                    plain = with_context(plain, there, view.gray, self._network("context"), self.precision)
                 found[of_view] = plain
         return as_bytes(found)
-
-    def _detector(self) -> Any:
-        from aeromatch_cli.nets.detector import load_detector
-
-        return load_detector(precision=self.precision, device=device_of(self.device))
 
 
 def _patches(view: ViewPixels, raw: Raw) -> NDArray[np.uint8]:

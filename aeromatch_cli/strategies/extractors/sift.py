@@ -15,11 +15,15 @@ from pydantic import Field
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.described import Described
-from aeromatch_cli.strategies.extractors.detection import Raw, describe, detect
-
-# Up to this size a larger blob is found again more surely, because noise averages out over it; beyond, relief and
-# perspective cost as much as that gains (share of keypoints found again in rendered pairs, by size).
-_STABLE_SIZE_PX = 6.0
+from aeromatch_cli.strategies.extractors.detection import (
+    SIFT,
+    Raw,
+    SiftSettings,
+    balanced,
+    describe,
+    detect,
+    sift_detector,
+)
 
 
 class Sift(Described):
@@ -34,13 +38,13 @@ class Sift(Described):
         "auto is upright in views whose axes follow the world's.",
     )
     contrast_threshold: float = Field(
-        0.004,
+        SIFT.contrast_threshold,
         gt=0.0,
         description="Smallest contrast, divided by octave_layers inside; so low that dull ground fills its budget too.",
     )
-    edge_threshold: float = Field(10.0, gt=1.0, description="Largest ratio of the two curvatures.")
-    octave_layers: int = Field(3, ge=1, description="Scales per octave.")
-    sigma: float = Field(1.6, gt=0.5, description="Blur of the first scale, pixels of the doubled image.")
+    edge_threshold: float = Field(SIFT.edge_threshold, gt=1.0, description="Largest ratio of the two curvatures.")
+    octave_layers: int = Field(SIFT.octave_layers, ge=1, description="Scales per octave.")
+    sigma: float = Field(SIFT.sigma, gt=0.5, description="Blur of the first scale, pixels of the doubled image.")
     selection: Literal["balanced", "scale", "response"] = Field(
         "balanced",
         description="What a cell gives first: the largest, the most contrasted, or response x size^2, sizes up to 6 "
@@ -68,17 +72,7 @@ class Sift(Described):
             return raw.sizes_px
         if self.selection == "response":
             return raw.responses
-        return raw.responses * np.minimum(raw.sizes_px, _STABLE_SIZE_PX) ** 2
+        return balanced(raw)
 
     def _detector(self) -> Any:
-        import cv2
-
-        return cv2.SIFT.create(
-            nfeatures=0,
-            nOctaveLayers=self.octave_layers,
-            contrastThreshold=self.contrast_threshold,
-            edgeThreshold=self.edge_threshold,
-            sigma=self.sigma,
-            descriptorType=cv2.CV_8U,
-            enable_precise_upscale=True,  # without it every keypoint is off by a quarter pixel
-        )
+        return sift_detector(SiftSettings(self.contrast_threshold, self.edge_threshold, self.octave_layers, self.sigma))

@@ -5,27 +5,29 @@ Source: J. Geo-inf. Sci. 2025(6), 1401-1419; the mathematics stands in geometry.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray, Candidates, PairGeometry, Verdict
 from aeromatch_cli.geometry.planes import Planes, fit_planes
 from aeromatch_cli.geometry.two_view import undistorted
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.filters.colour import dominant_colours
 from aeromatch_cli.strategies.filters.gate import shortage
 
 # Without colours: matches for each cluster.
 _MATCHES_PER_CLUSTER = 64
+# Dominant colours: cells of 64 levels a channel that hold at least one in 32 places.
+_LEVELS_PER_CELL, _DOMINANT_SHARE = 64, 1 / 32
 
 
 class ClusteredRansac(Strategy):
     """Keeps a match if a plane of its own or a nearby cluster explains it, or if its neighbours move as it does.
 
     The number of clusters follows the colour content: dominant colours of the matched places in image 0 (see
-    `colour.dominant_colours`), or one per 64 matches where the extractor keeps no colours; never so many that they
+    `dominant_colours`), or one per 64 matches where the extractor keeps no colours; never so many that they
     hold less than 24 matches on average. Small structures, trees and facades that make no plane are kept by local
     support; the more of a pair's matches are explained, the less of it is asked, for where few are wrong, being alone
     is no sign of being wrong. Where planes and support do not explain min_inliers matches there is too little to judge
@@ -93,3 +95,10 @@ class ClusteredRansac(Strategy):
         if candidates.colours0 is None:
             return max(1, len(candidates) // _MATCHES_PER_CLUSTER)
         return dominant_colours(candidates.colours0)
+
+
+def dominant_colours(colours: NDArray[Any]) -> int:
+    """How many coarse colours, of 64 levels a channel, hold one in 32 of the places (N, 3) or more each; 1 at least."""
+    cells = np.asarray(colours, np.int64) // _LEVELS_PER_CELL
+    _, counts = np.unique(cells @ np.array([64, 8, 1]), return_counts=True)
+    return max(1, int((counts >= _DOMINANT_SHARE * max(len(cells), 1)).sum()))

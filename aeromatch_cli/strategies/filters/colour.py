@@ -1,4 +1,4 @@
-"""Colour as evidence: matches whose places have clearly different colours, and how many colours a scene is made of."""
+"""Colour as evidence: matches whose places have clearly different colours go."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from aeromatch_cli.strategies import Strategy
 _DARK_LEVELS = 16.0
 # How much more the light of sun and sky may differ than the colour of a thing.
 _DAYLIGHT = 2.0
-# Dominant colours: cells of 64 levels a channel that hold at least one in 32 places.
-_LEVELS_PER_CELL, _DOMINANT_SHARE = 64, 1 / 32
 _FEWEST = 8  # matches that tell the gain between two images
 
 
@@ -64,10 +62,3 @@ def chromaticity_distances(colours0: NDArray[Any], colours1: NDArray[Any]) -> Fl
     red, green, blue = ratio.T
     daylight, other = (blue - red) / np.sqrt(2.0), (2.0 * green - red - blue) / np.sqrt(6.0)
     return np.asarray(np.hypot(daylight / _DAYLIGHT, other))
-
-
-def dominant_colours(colours: NDArray[Any]) -> int:
-    """How many coarse colours, of 64 levels a channel, hold one in 32 of the places (N, 3) or more each; 1 at least."""
-    cells = np.asarray(colours, np.int64) // _LEVELS_PER_CELL
-    _, counts = np.unique(cells @ np.array([64, 8, 1]), return_counts=True)
-    return max(1, int((counts >= _DOMINANT_SHARE * max(len(cells), 1)).sum()))

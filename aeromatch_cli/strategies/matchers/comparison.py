@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.geometry.prediction import Windows
-from aeromatch_cli.strategies.matchers.scan import Limits
+from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
+
+# Largest distance to the nearest over that to the next other keypoint, where nothing else is said.
+RATIO = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +105,14 @@ class Comparison:
             return found
         idx0, idx1 = self.keypoints(found)
         return found.take(self.where.windows.take(idx0).contain(self.where.places_px[idx1]))
+
+
+def ratio_test(asked: Comparison, ratio: float = RATIO) -> Found:
+    """Mutual nearest neighbours of all view pairs that are alike and hold the ratio, costs d1/d2."""
+    parts = []
+    for views in asked.view_pairs():
+        rows, columns, ratios = mutual_nearest(
+            views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=ratio, limits=views.limits
+        )
+        parts.append(Found(views.of0[rows], views.of1[columns], ratios))
+    return joined(parts)

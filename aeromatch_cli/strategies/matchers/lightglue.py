@@ -18,11 +18,10 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
 from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
+from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined, ratio_test
 from aeromatch_cli.strategies.matchers.evidence import most_evident
 from aeromatch_cli.strategies.matchers.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.inference import Shown, Wanted, check_length, ready, shown_of
-from aeromatch_cli.strategies.matchers.nearest import Nearest
 from aeromatch_cli.strategies.matchers.overlap import in_overlap
 from aeromatch_cli.strategies.matchers.search import Search, Steps
 
@@ -106,7 +105,7 @@ class LightGlue(Search):
 
     def scan(self, asked: Comparison) -> Found:
         """The mutual ratio test."""
-        return Nearest().scan(asked)
+        return ratio_test(asked)
 
     def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
         """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""

@@ -6,8 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.scan import mutual_nearest
+from aeromatch_cli.strategies.matchers.comparison import RATIO, Comparison, Found, ratio_test
 from aeromatch_cli.strategies.matchers.search import Search
 
 
@@ -17,15 +16,9 @@ class Nearest(Search):
     version: ClassVar[int] = 2
     name: Literal["nearest"] = "nearest"
     ratio: float = Field(
-        0.8, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
+        RATIO, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
     )
 
     def scan(self, asked: Comparison) -> Found:
         """Matches of all view pairs that are alike, costs d1/d2."""
-        parts = []
-        for views in asked.view_pairs():
-            rows, columns, ratios = mutual_nearest(
-                views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=self.ratio, limits=views.limits
-            )
-            parts.append(Found(views.of0[rows], views.of1[columns], ratios))
-        return joined(parts)
+        return ratio_test(asked, self.ratio)
