@@ -5,10 +5,11 @@ which it reaches the ratio test's recall. Pairs: homographies of pictures of --u
 scenes, suns and flights of training_blocks with other numbers. Reliability: share of right ones among matches by score.
 
 Seconds a pair with 2048 keypoints on either side, features excluded, one process with --threads, median of 20 after a
-warm-up: this forward in both precisions, kornia's with the same weights and kornia's of the official size (9 layers of
+warm-up: this forward in float32, and in bfloat16 where the processor has it, kornia's with the same weights and kornia's of the official size (9 layers of
 256, random weights), then what early exit and pruning add; two processes beside two threads; and the whole matcher over
-the pairs of a rendered block, with what saves time switched on step by step. Writes OUT/lightglue.md and
-OUT/lightglue.json; OUT/data keeps the pairs.
+the pairs of a rendered block, with what saves time switched on step by step. Writes OUT/accuracy.md, OUT/speed.md and
+OUT/lightglue.json; OUT/data keeps the pairs. In the README each part has a place of its own, and speed two: with and
+without bfloat16 in the processor.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from training_runs import at_least_one, check_recipe
 
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration, load_lightglue, read_calibration
+from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import write_text
@@ -148,13 +150,46 @@ def rendered_block(args: argparse.Namespace) -> Path:
     return folder
 
 
+def accuracy(
+    args: argparse.Namespace, network: LightGlue, sets: dict[str, list[Pair]]
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Figures, and what the README says."""
+    facts, found = accuracy_rows(network, sets)
+    text = [accuracy_table(facts)]
+    text += [f"The same matches by what the truth, which knows places alone, takes for partners: {LIKE}"]
+    text += [look_table(facts), "Whether scores mean what they say:"]
+    return facts, [*text, reliability_table(found, read_calibration(args.weights))]
+
+
+def speed(args: argparse.Namespace, network: LightGlue, sets: dict[str, list[Pair]], device: str) -> list[str]:
+    """What the README says."""
+    where = f"{args.threads} threads" if device == "cpu" else torch.cuda.get_device_name()
+    where += ", bfloat16 native" if has_bfloat16(device) else ", no bfloat16 of its own"
+    text = []
+    # A GPU is asked for what a block takes of it as well: fewer keypoints, many pairs.
+    for count in (TIMED_KEYPOINTS,) if device == "cpu" else (1024, TIMED_KEYPOINTS):
+        text += [f"Seconds a pair with {count} keypoints on either side ({where}):"]
+        text += [forward_table(network, first_keypoints(full_pair(sets), count), device)]
+    text += [f"Pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
+    text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
+    return [*text, jobs_table(args.weights, full_pair(sets))] if device == "cpu" else text
+
+
+def publish_part(args: argparse.Namespace, part: str, marker: str, text: Sequence[str]) -> None:
+    """Into OUT, and with --readme into the README."""
+    whole = "\n\n".join(text) + "\n"
+    write_text(args.out / f"{part}.md", whole)
+    print(whole, flush=True)
+    if args.readme:
+        asked = f"--data DIR --unseen {args.unseen} --groups {args.groups} --blocks {args.blocks} --seed {args.seed}"
+        write_readme(f"    scripts/bench_lightglue {asked} --parts {part} --out DIR\n\n{whole}", marker)
+
+
 def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
-    """Refuses unknown parts, half a README, and a folder that holds other pairs."""
+    """Refuses unknown parts, and a folder that holds other pairs."""
     args.parts = args.parts.split(",")
     if unknown := set(args.parts) - set(PARTS):
         parser.error(f"--parts: {', '.join(sorted(unknown))} is none of {', '.join(PARTS)}")
-    if args.readme and set(args.parts) != set(PARTS):
-        parser.error(f"--readme needs all --parts: {','.join(PARTS)}")
     check_recipe(parser, args, ("data", "unseen", "groups", "blocks", "seed"))
 
 
@@ -178,31 +213,13 @@ def main() -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     network = load_lightglue(args.weights, device=device)
     sets = pairs_of(args)
-    text, facts = [], {}
     if "accuracy" in args.parts:
-        facts["accuracy"], found = accuracy_rows(network, sets)
-        text += [accuracy_table(facts["accuracy"])]
-        text += [f"The same matches by what the truth, which knows places alone, takes for partners: {LIKE}"]
-        text += [look_table(facts["accuracy"]), "Whether scores mean what they say:"]
-        text += [reliability_table(found, read_calibration(args.weights))]
-        print("\n\n".join(text), flush=True)
+        facts, text = accuracy(args, network, sets)
+        write_text(args.out / "lightglue.json", json.dumps({"accuracy": facts}, indent=1) + "\n")
+        publish_part(args, "accuracy", "bench_lightglue", text)
     if "speed" in args.parts:
-        where = f"{args.threads} threads" if device == "cpu" else torch.cuda.get_device_name()
-        # A GPU is asked for what a block takes of it as well: fewer keypoints, many pairs.
-        for count in (TIMED_KEYPOINTS,) if device == "cpu" else (1024, TIMED_KEYPOINTS):
-            text += [f"Seconds a pair with {count} keypoints on either side ({where}):"]
-            text += [forward_table(network, first_keypoints(full_pair(sets), count), device)]
-        text += [f"Pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
-        text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
-        if device == "cpu":
-            text += [jobs_table(args.weights, full_pair(sets))]
-    if facts:
-        write_text(args.out / "lightglue.json", json.dumps(facts, indent=1) + "\n")
-    whole = "\n\n".join(text) + "\n"
-    write_text(args.out / "lightglue.md", whole)
-    if args.readme:
-        asked = f"--data DIR --unseen {args.unseen} --groups {args.groups} --blocks {args.blocks} --seed {args.seed}"
-        write_readme(f"    scripts/bench_lightglue {asked} --out DIR\n\n{whole}", "bench_lightglue")
+        kind = "" if has_bfloat16(device) else "_float32"
+        publish_part(args, "speed", f"bench_lightglue_speed{kind}", speed(args, network, sets, device))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from aeromatch_cli.formats import read_features
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_batch import match_batch
 from aeromatch_cli.nets.lightglue_file import load_lightglue
+from aeromatch_cli.nets.precision import has_bfloat16, layer_type
 from aeromatch_cli.stages import extract
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue as Matcher
 from aeromatch_cli.strategies.matchers.nearest import Nearest
@@ -51,14 +52,16 @@ def forward_table(network: LightGlue, pair: Pair, device: str) -> str:
         "kornia, official size, float32": _kornia(OFFICIAL, device, None),
         "kornia, these weights, float32": _kornia(network.dimensions, device, network),
         "own forward, float32": _own(network, device),
-        "own forward, bfloat16": _own(in_bfloat16(network), device),
-        "bfloat16, early exit": _own(in_bfloat16(network), device, depth_confidence=0.95),
-        "bfloat16, early exit and pruning": _own(
-            in_bfloat16(network), device, depth_confidence=0.95, width_confidence=0.99
-        ),
     }
+    kind = "float32"
+    if has_bfloat16(device):
+        kind = "bfloat16"
+        ways["own forward, bfloat16"] = _own(as_used(network, device), device)
+    ways[f"{kind}, early exit"] = _own(as_used(network, device), device, depth_confidence=0.95)
+    both = {"depth_confidence": 0.95, "width_confidence": 0.99}
+    ways[f"{kind}, early exit and pruning"] = _own(as_used(network, device), device, **both)
     if device == "cuda":
-        ways[f"bfloat16, {BATCH} pairs at once"] = _own_batch(in_bfloat16(network), device)
+        ways[f"{kind}, {BATCH} pairs at once"] = _own_batch(as_used(network, device), device)
     lines = ["| forward | seconds a pair | pairs a second | x official (goal 0.25) |", "|---|---|---|---|"]
     base = 0.0
     for name, way in ways.items():
@@ -69,11 +72,11 @@ def forward_table(network: LightGlue, pair: Pair, device: str) -> str:
     return "\n".join(lines)
 
 
-def in_bfloat16(network: LightGlue) -> LightGlue:
-    """A copy."""
-    half = LightGlue(network.dimensions).to(next(network.parameters()).device).eval()
-    half.load_state_dict(network.state_dict())
-    return half.with_layers_in(torch.bfloat16)
+def as_used(network: LightGlue, device: str) -> LightGlue:
+    """A copy in the precision that the matcher takes there."""
+    copied = LightGlue(network.dimensions).to(device).eval()
+    copied.load_state_dict(network.state_dict())
+    return copied.with_layers_in(layer_type("auto", device))
 
 
 def _kornia(dimensions: Dimensions, device: str, weights: LightGlue | None) -> Callable[[Pair], Any]:
@@ -134,7 +137,7 @@ def jobs_table(weights: Path, pair: Pair) -> str:
 def _work(weights: Path, pair: Pair, threads: int) -> tuple[float, float]:
     """Seconds a pair and megabytes beyond the loaded network, in a fresh process."""
     torch.set_num_threads(threads)
-    network = in_bfloat16(load_lightglue(weights))
+    network = as_used(load_lightglue(weights), "cpu")
     before_mb = peak_mb()
     seconds = median_seconds(partial(_own(network, "cpu"), pair), "cpu")
     return seconds, peak_mb() - before_mb
