@@ -5,11 +5,11 @@ which it reaches the ratio test's recall. Pairs: homographies of pictures of --u
 scenes, suns and flights of training_blocks with other numbers. Reliability: share of right ones among matches by score.
 
 Seconds a pair with 2048 keypoints on either side, features excluded, one process with --threads, median of 20 after a
-warm-up: this forward in float32, and in bfloat16 where the processor has it, kornia's with the same weights and kornia's of the official size (9 layers of
-256, random weights), then what early exit and pruning add; two processes beside two threads; and the whole matcher over
-the pairs of a rendered block, with what saves time switched on step by step. Writes OUT/accuracy.md, OUT/speed.md and
-OUT/lightglue.json; OUT/data keeps the pairs. In the README each part has a place of its own, and speed two: with and
-without bfloat16 in the processor.
+warm-up: this forward in float32, and in bfloat16 where the processor has it, kornia's with the same weights and of the
+official size (9 layers of 256, random weights), then what early exit and pruning add; two processes beside two threads;
+and the whole matcher over the pairs of a rendered block, with what saves time switched on step by step. Writes
+OUT/accuracy.md, OUT/speed.md and OUT/lightglue.json; OUT/data keeps the pairs. In the README each part has a place of
+its own, and speed two: with and without bfloat16 in the processor.
 """
 
 from __future__ import annotations

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +17,16 @@ from make_lightglue import SIFT, features, seeded_tensors, write
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats import read_match_row, write_features
+from aeromatch_cli.nets import lightglue_batch
 from aeromatch_cli.nets.precision import device_of
-from aeromatch_cli.stages import batches
+from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import asked_together
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.matchers import inference
 from aeromatch_cli.strategies.matchers.lightglue import LightGlue
 from aeromatch_cli.strategies.matchers.nearest import Nearest
-from aeromatch_cli.workspace import fingerprint
+from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 
@@ -111,17 +116,51 @@ def test_batches_on_a_gpu_answer_in_the_order_of_the_questions(
     matcher: Together, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inference, "_BATCH_KEYPOINTS", 400)
-    (path,) = matcher.fingerprint_files()
-    asked = inference.ready(inference.Wanted(path, "float32", "cpu", 0.0, 0.95, 0.99))
     given = [features(count, seed) for seed, count in enumerate((40, 120, 0, 80, 119))]
     kept = np.ones(200, bool)
     shown = [inference.shown_of(one, 0, kept[: len(one.keypoints_px)], 2048) for one in given]
-    questions = [(asked._tensors(one), asked._tensors(one)) for one in shown]
-    together, alone = asked._in_batches(questions), [asked._alone(pair) for pair in questions]
+    (path,) = matcher.fingerprint_files()
+    here = inference.ready(inference.Wanted(path, "float32", "cpu", 0.0, 0.95, 0.99))
+    calls: list[int] = []
+    plain = lightglue_batch.match_batch
+
+    def spy(network: Any, sides0: Sequence[Any], sides1: Sequence[Any], **options: float) -> Any:
+        calls.append(len(sides0))
+        return plain(network, sides0, sides1, **options)
+
+    monkeypatch.setattr(lightglue_batch, "match_batch", spy)
+    alone = here.answers([(one, one) for one in shown])
+    assert calls == []
+    # As on a GPU, but for where the tensors lie.
+    there = dataclasses.replace(here, device="cuda")
+    tensors = here._tensors
+    monkeypatch.setattr(inference.Asked, "_tensors", lambda _, one: tensors(one))
+    together = there.answers([(one, one) for one in shown])
+    assert calls == [1, 1, 2, 1]
     for (pairs, scores), (own_pairs, own_scores) in zip(together, alone, strict=True):
         assert pairs.tolist() == own_pairs.tolist()
-        torch.testing.assert_close(scores, own_scores, atol=1e-4, rtol=0.0)
+        np.testing.assert_allclose(scores, own_scores, atol=1e-4)
     assert [len(scores) > 20 for _, scores in alone] == [True, True, False, True, True]
+
+
+def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: Path) -> None:
+    """A row of the match stage, its pairs asked together and one by one, is the same file."""
+    names = ("a", *(pair.image_id1 for pair in PAIRS))
+    rows = []
+    for kind in (matcher, LightGlue(**{**matcher.model_dump(), "name": "lightglue"})):
+        workspace = Workspace(tmp_path / type(kind).__name__)
+        for name in names:
+            own = sides(task(name))[1] if name != "a" else features(120)
+            write_atomically(workspace.features(name), partial(write_features, features=own, fingerprint=""))
+        result = match.run_task(match.MatchTask("a", tuple(PAIRS), kind, workspace, overwrite=True))
+        assert (result.done, result.failures) == (len(PAIRS), ())
+        rows.append(read_match_row(workspace.matches("a")))
+    assert rows[0].keys() == rows[1].keys() == set(names[1:])
+    for name, entry in rows[0].items():
+        np.testing.assert_array_equal(entry.matches.indices, rows[1][name].matches.indices)
+        np.testing.assert_array_equal(entry.matches.scores, rows[1][name].matches.scores)
+    assert len(rows[0]["same"].matches.indices) > 100
+    assert len(rows[0]["moved"].matches.indices) < 100
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

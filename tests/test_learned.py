@@ -157,25 +157,53 @@ def test_matcher_for_other_descriptors_is_refused(extract: str, match: str, mess
         load("baseline", [f"extract={extract}", f"match={match}"])
 
 
-def test_own_weights_take_the_place_of_those_that_ship(picture: NDArray[np.uint8], tmp_path: Path) -> None:
-    content = load_file(shipped_path("geodesc"))
-    first = next(iter(content))
-    save_file({**content, first: -content[first]}, tmp_path / "geodesc.safetensors")
-    plain, own = extract(picture), extract(picture, weights=str(tmp_path))
-    np.testing.assert_array_equal(plain.keypoints_px, own.keypoints_px)  # the detector is the one that ships
-    assert (plain.descriptors != own.descriptors).mean() > 0.5
-    assert fingerprint(Learned()) != fingerprint(Learned(weights=str(tmp_path)))
-    copied = tmp_path / "copied"
-    copied.mkdir()
-    (copied / "geodesc.safetensors").write_bytes(shipped_path("geodesc").read_bytes())
-    assert fingerprint(Learned()) == fingerprint(Learned(weights=str(copied)))  # what they hold counts
-    Learned(weights=str(tmp_path)).check_files(128)
+def spoilt(name: str, folder: Path) -> None:
+    """A network that ships, its tensors with the opposite sign, as a user's own."""
+    content = load_file(shipped_path(name))
+    save_file({key: -value for key, value in content.items()}, folder / f"{name}.safetensors")
+
+
+@pytest.mark.parametrize("name", ["detector", "orientation", "geodesc", "context"])
+def test_own_weights_take_the_place_of_those_that_ship(picture: NDArray[np.uint8], tmp_path: Path, name: str) -> None:
+    settings = {"context": True, "orientation": "network"}
+    spoilt(name, tmp_path)
+    plain, own = extract(picture, **settings), extract(picture, weights=str(tmp_path), **settings)
+    same = [
+        np.array_equal(getattr(plain, part), getattr(own, part))
+        for part in ("keypoints_px", "view_orientation_deg", "descriptors")
+    ]
+    # Places come first, angles of patches there second, what both look like last.
+    changed = {"detector": 0, "orientation": 1, "geodesc": 2, "context": 2}[name]
+    assert same == [part < changed for part in range(3)]
+    recipe = Learned(**settings)
+    assert fingerprint(recipe) != fingerprint(Learned(weights=str(tmp_path), **settings))
+    Learned(weights=str(tmp_path), **settings).check_files(128)
+
+
+def test_own_weights_count_by_what_they_hold(picture: NDArray[np.uint8], tmp_path: Path) -> None:
+    path = tmp_path / "geodesc.safetensors"
+    path.write_bytes(shipped_path("geodesc").read_bytes())
+    assert fingerprint(Learned()) == fingerprint(Learned(weights=str(tmp_path)))
+    before = extract(picture, weights=str(tmp_path))
+    spoilt("geodesc", tmp_path)  # the same process must not go on with the old ones
+    assert not np.array_equal(before.descriptors, extract(picture, weights=str(tmp_path)).descriptors)
+
+
+def test_the_precision_reaches_every_network(picture: NDArray[np.uint8]) -> None:
+    exact, coarse = (extract(picture, context=True, precision=kind) for kind in ("float32", "bfloat16"))
+    assert not np.array_equal(exact.keypoints_px, coarse.keypoints_px)
+    assert share_right(exact, coarse, np.eye(2, 3))[1] > 0.95
 
 
 def test_own_weights_that_are_not_there_or_no_network_are_named(tmp_path: Path) -> None:
-    for folder in (tmp_path / "absent", tmp_path):
-        with pytest.raises(ConfigError, match=r"holds none of .*: detector\.safetensors, geodesc\.safetensors, orient"):
-            Learned(weights=str(folder)).check_files(128)
+    (tmp_path / "other").write_text("")
+    for place, wrong in (
+        ("absent", "is no folder"),
+        ("other", "is a file; give its folder"),
+        (".", r"holds none of .*: detector\.safetensors, geodesc\.safetensors, orient"),
+    ):
+        with pytest.raises(ConfigError, match=wrong):
+            Learned(weights=str(tmp_path / place)).check_files(128)
     (tmp_path / "detector.safetensors").write_bytes(b"no network")
     with pytest.raises(ConfigError, match=r"detector\.safetensors is damaged"):
         Learned(weights=str(tmp_path)).check_files(128)

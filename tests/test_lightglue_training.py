@@ -83,6 +83,11 @@ def test_partners_of_other_size_or_turn_are_told_apart() -> None:
     answer = (pair, np.array([[0, 0], [1, 1], [3, 3], [4, 4], [5, 2]]), np.array([0.9, 0.9, 0.9, 0.2, 0.9]))
     assert recalls([answer], 0.5) == pytest.approx((4 / 6, 2 / 4, 1 / 2))
     assert recalls([answer], -np.inf) == pytest.approx((4 / 6, 3 / 4, 1 / 2))
+    usual = Pair(first, first, partners(first, first, places, places), False)
+    everything = (usual, np.array([[0, 0]]), np.ones(1))
+    assert recalls([everything], 0.0) == pytest.approx((1.0, 1 / 6, np.nan), nan_ok=True)  # no others
+    nothing = Pair(first, first, partners(first, first, places + 900.0, places + 900.0), False)
+    assert recalls([answer, (nothing, np.zeros((0, 2), int), np.zeros(0))], 0.5) == recalls([answer], 0.5)
 
 
 def test_the_least_score_is_where_the_precision_ends() -> None:

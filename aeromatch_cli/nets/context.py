@@ -10,14 +10,13 @@ its geometric one from a PointNet over all keypoints of a picture, here from the
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import torch
 import torch.nn.functional as nnf
 from torch import Tensor, nn
 
-from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.weights import shipped_path
 
 DESCRIPTOR, VISUAL, GEOMETRIC = 128, 64, 64
@@ -118,7 +117,7 @@ def layout_of(points: Tensor, sizes: Tensor, angles: Tensor, neighbours: Tensor)
     return torch.stack([x / mean, y / mean, distance, (sizes[neighbours] / sizes[:, None]).log()], dim=2)
 
 
-@lru_cache(maxsize=2)
+@once_per_file
 def load_context(path: Path | None = None, device: str = "cpu") -> Context:
     """The network of a weights file, by default the one that ships, once per process, in float32.
 

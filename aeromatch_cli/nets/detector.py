@@ -9,14 +9,13 @@ scripts/train_detector.py documents the training, trained/detector.md the weight
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import shipped_path
 
@@ -95,7 +94,7 @@ def _enlarged(cells: Tensor) -> Tensor:
     return F.interpolate(cells, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
 
 
-@lru_cache(maxsize=4)
+@once_per_file
 def load_detector(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> Detector:
     """The network of a weights file, by default the one that ships, once per process; layers in `precision`.
 

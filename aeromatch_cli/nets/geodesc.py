@@ -7,7 +7,7 @@ scripts/train_descriptor.py documents the recipe of the weights that ship.
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import shipped_path
@@ -43,7 +43,7 @@ class GeoDesc(nn.Module):
         return functional.normalize(self.last(x).flatten(1).float(), dim=1)
 
 
-@lru_cache(maxsize=4)
+@once_per_file
 def load_geodesc(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> GeoDesc:
     """The folded network of a weights file, by default the one that ships, once per process; layers in `precision`.
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +16,34 @@ from aeromatch_cli.nets.weights import read_tensors
 
 _MAX_NAMED = 3
 Network = TypeVar("Network", bound=nn.Module)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def once_per_file(load: Callable[P, R]) -> Callable[P, R]:
+    """A loader, whose first argument is the file's path or None, that loads once per process and anew where the file
+    was replaced."""
+
+    @lru_cache(maxsize=4)
+    def cached(stamp: tuple[int, int] | None, args: tuple[Any, ...], named: tuple[tuple[str, Any], ...]) -> R:
+        del stamp
+        again: Callable[..., R] = load
+        return again(*args, **dict(named))
+
+    @wraps(load)
+    def loader(*args: P.args, **kwargs: P.kwargs) -> R:
+        path = args[0] if args else kwargs.get("path")
+        return cached(content_stamp(path) if isinstance(path, Path) else None, args, tuple(sorted(kwargs.items())))
+
+    return loader
+
+
+def content_stamp(path: Path) -> tuple[int, int] | None:
+    """Size and time of a file's last change, None where it is missing: what tells a replaced file apart."""
+    if not path.is_file():
+        return None
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def load_network(

@@ -8,7 +8,7 @@ scripts/train_orientation.py documents the recipe of the weights that ship.
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.loading import load_network
+from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
 from aeromatch_cli.nets.weights import shipped_path
@@ -77,7 +77,7 @@ def bin_angles() -> Tensor:
     return (torch.arange(BINS) - per_quarter // 2) * (360.0 / BINS)
 
 
-@lru_cache(maxsize=4)
+@once_per_file
 def load_orientation(path: Path | None = None, precision: Precision = "auto", device: str = "cpu") -> OrientationNet:
     """The folded network of a weights file, by default the one that ships, once per process; layers in `precision`.
 

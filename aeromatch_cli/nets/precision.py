@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 Precision = Literal["auto", "float32", "bfloat16"]
 Device = Literal["cpu", "cuda", "auto"]
-# A strategy's setting. Where a network runs is no part of a recipe: its answers differ by rounding.
+# A strategy's setting. Where a network runs is no part of a recipe, as the processor is none: answers differ by the
+# rounding of the precision, which is a setting of its own for who wants the same one everywhere.
 DEVICE: Any = Field(
     "cpu", description="`auto` takes CUDA where there is one.", json_schema_extra={"fingerprint": "left out"}
 )

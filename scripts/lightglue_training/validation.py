@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -163,11 +164,16 @@ def of_like_look(pair: Pair) -> Array:
     return np.asarray((np.abs(octaves - np.median(octaves)) <= LIKE_OCTAVES) & (off_deg <= LIKE_DEG))
 
 
-def recalls(answers: Iterable[Answer], least_score: float) -> tuple[float, float, float]:
-    """Share of the partners that are of like look, recall of these, and of the others, by matches of such scores."""
+def recalls(answers: Iterable[Answer], least_score: float) -> tuple[float, ...]:
+    """Share of the partners that are of like look, recall of these, and of the others, by matches of such scores.
+
+    Not a number where there is none.
+    """
     alike, found = [np.zeros(0, bool)], [np.zeros(0, bool)]
     for pair, indices, scores in answers:
         rows, places = np.flatnonzero(pair.truth.of0 >= 0), pair.side1.places_px
+        if not len(rows):
+            continue
         match = np.full(len(pair.side0.points_px), NONE)
         kept = indices[scores >= least_score]
         match[kept[:, 0]] = kept[:, 1]
@@ -175,7 +181,7 @@ def recalls(answers: Iterable[Answer], least_score: float) -> tuple[float, float
         alike.append(of_like_look(pair))
         found.append((match[rows] != NONE) & same)
     like, right = np.concatenate(alike), np.concatenate(found)
-    return float(like.mean()), float(right[like].mean()), float(right[~like].mean())
+    return tuple(float(part.mean()) if len(part) else math.nan for part in (like, right[like], right[~like]))
 
 
 def report(network: LightGlue, sets: dict[str, list[Pair]]) -> dict[str, dict[str, float]]:

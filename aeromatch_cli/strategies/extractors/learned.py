@@ -52,7 +52,7 @@ class Learned(Described):
         None,
         description="Folder with files of your own, `detector.safetensors`, `orientation.safetensors`, "
         "`geodesc.safetensors` or `context.safetensors`, as the scripts train_* write them; those that it lacks ship.",
-        json_schema_extra={"path": "folder"},
+        json_schema_extra={"path": True},
     )
     precision: Precision = Field(
         "auto",
@@ -76,7 +76,11 @@ class Learned(Described):
         device_of(self.device)
         if self.weights is None:
             return
-        own = [name for name in self._asked() if (Path(self.weights).expanduser() / f"{name}.safetensors").is_file()]
+        folder = Path(self.weights).expanduser()
+        if not folder.is_dir():
+            wrong = "is a file; give its folder" if folder.exists() else "is no folder"
+            raise ConfigError(f"extract.weights {self.weights!r} {wrong}")
+        own = [name for name in self._asked() if (folder / f"{name}.safetensors").is_file()]
         if not own:
             raise ConfigError(
                 f"extract.weights {self.weights!r} holds none of the files that this recipe reads: "

@@ -130,7 +130,9 @@ class Wanted:
 
 def ready(wanted: Wanted) -> Asked:
     """The network, built once per process and read anew where the file was replaced."""
-    return _ready(wanted, _content_stamp(wanted.path))
+    from aeromatch_cli.nets.loading import content_stamp
+
+    return _ready(wanted, content_stamp(Path(wanted.path)))
 
 
 def check_length(expected: int, given: int) -> None:
@@ -142,16 +144,11 @@ def check_length(expected: int, given: int) -> None:
         )
 
 
-def _content_stamp(path: str) -> tuple[int, int]:
-    status = Path(path).stat()
-    return status.st_size, status.st_mtime_ns
-
-
 @lru_cache(maxsize=2)
-def _ready(wanted: Wanted, content_stamp: tuple[int, int]) -> Asked:
+def _ready(wanted: Wanted, stamp: tuple[int, int] | None) -> Asked:
     from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 
-    del content_stamp
+    del stamp
     device, path = device_of(wanted.device), Path(wanted.path)
     network = load_lightglue(path, device=device).with_layers_in(layer_type(wanted.precision, device))
     calibration = read_calibration(path)
