@@ -102,6 +102,7 @@ def variants(threshold_px: float) -> list[Variant]:
     graph = Graph(threshold_px=threshold_px)
     found += [Variant("graph", (graph,)), Variant("graph + poselib", (graph, poselib))]
     found.append(Variant("poselib + graph", (poselib, graph)))
+    found.append(Variant("epipolar + graph", (Epipolar(), graph)))
     return found
 
 

@@ -50,4 +50,4 @@ def test_direct_ransac_is_shown_where_it_keeps_as_many(bench):
     assert "| 105 | 90 | 90.0 % | 15 | 85.7 % |" in fair
     assert any(line.startswith("| colour + homography + epipolar 3 px |") for line in lines)
     assert sum(line.startswith(("| magsac |", "| poselib |", "| epipolar |")) for line in lines) == 3
-    assert sum(line.startswith(("| graph", "| poselib + graph |")) for line in lines) == 3
+    assert sum(line.startswith(("| graph", "| poselib + graph |", "| epipolar + graph |")) for line in lines) == 4

@@ -40,6 +40,7 @@ class VisualContext(nn.Module):
         )  # fmt: skip
 
     def forward(self, picture: Tensor) -> Tensor:
+        """Of a gray picture (1, 1, h, w), 0-1; shapes as the class has them."""
         out: Tensor = self.layers(evened(picture))
         return out
 
@@ -55,6 +56,7 @@ class GeometricContext(nn.Module):
         self.all = nn.Linear(2 * 96, GEOMETRIC)
 
     def forward(self, layout: Tensor, descriptors: Tensor, neighbours: Tensor) -> Tensor:
+        """layout: (N, K, 4) float. descriptors: (N, DESCRIPTOR). neighbours: (N, K) int64, rows of both."""
         looks = self.looks(descriptors)[neighbours]
         each = self.each(torch.cat([layout.to(looks.dtype), looks], dim=2))
         mean = (self.weight(each).softmax(dim=1) * each).sum(dim=1)
@@ -98,6 +100,7 @@ def evened(picture: Tensor) -> Tensor:
 
 
 def _blurred(picture: Tensor) -> Tensor:
+    """Means (1, 1, h, w) of squares of _LOCAL_PX around each pixel, fewer at the edges."""
     for side, around in (((_LOCAL_PX, 1), (_LOCAL_PX // 2, 0)), ((1, _LOCAL_PX), (0, _LOCAL_PX // 2))):
         picture = nnf.avg_pool2d(picture, side, 1, around, count_include_pad=False)
     return picture

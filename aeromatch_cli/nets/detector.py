@@ -5,6 +5,9 @@ convolutions at the level's full resolution, because places count: 5 x 5 from th
 of them with gaps of one pixel) and 3 x 3 to the heat; 12,161 parameters. What a pixel answers depends on the
 2 REACH_PX + 1 pixels squared around it, and through local brightness and contrast on FIELD_PX to every side.
 scripts/train_detector.py documents the training, trained/detector.md the weights.
+
+Source: heat maps, trained on shapes and then by homographies, after DeTone, Malisiewicz and Rabinovich, SuperPoint,
+CVPR workshops 2018; their maxima over scale after the paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837).
 """
 
 from __future__ import annotations
@@ -54,10 +57,11 @@ class Detector(nn.Module):
         return (self._layered(x) + self._layered(x.flip(2, 3)).flip(2, 3)) / 2.0
 
     def one_way(self, gray: Tensor) -> Tensor:
-        """What the layers say of the picture as it is, in half the time: for training."""
+        """What the layers say of the picture as it is, (N, 1, H, W) as `forward`, in half the time: for training."""
         return self._layered(evened(gray.float()))
 
     def _layered(self, x: Tensor) -> Tensor:
+        """Logits (N, 1, H, W) float32 of an evened picture (N, 1, H, W)."""
         x = x.to(self.first.weight.dtype).contiguous(memory_format=torch.channels_last)
         x = F.relu_(self.first(x))
         for layer in self.layers:
@@ -84,13 +88,14 @@ def evened(gray: Tensor) -> Tensor:
 
 
 def _smooth(cells: Tensor) -> Tensor:
-    """Means over 3 x 3 twice, edges repeated."""
+    """Means (N, 1, h, w) over 3 x 3 twice, edges repeated."""
     for _ in range(2):
         cells = F.avg_pool2d(F.pad(cells, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
     return cells
 
 
 def _enlarged(cells: Tensor) -> Tensor:
+    """Cells (N, 1, h, w) as pixels (N, 1, CELL_PX h, CELL_PX w)."""
     return F.interpolate(cells, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
 
 

@@ -46,6 +46,7 @@ class _Batch:
         return self.of(self.state0.there.any(1) & self.state1.there.any(1))
 
     def through(self, layer: Layer) -> _Batch:
+        """After one more layer."""
         one, other = self.state0, self.state1
         x0, x1 = layer.self_attn(one.x, one.code, one.there), layer.self_attn(other.x, other.code, other.there)
         x0, x1 = layer.cross_attn(x0, x1, one.there, other.there)
@@ -113,6 +114,7 @@ def match_batch(
 
 
 def _begun(network: LightGlue, sides0: Sequence[Side], sides1: Sequence[Side]) -> _Batch:
+    """Of sides with places (1, N, P) and descriptors (1, N, C), before the first layer."""
     state0, state1 = _filled_up(network, sides0), _filled_up(network, sides1)
     totals = state0.there.sum(1) + state1.there.sum(1)
     return _Batch(state0, state1, torch.arange(len(sides0), device=totals.device), totals)
@@ -133,7 +135,7 @@ def _filled_up(network: LightGlue, sides: Sequence[Side]) -> _State:
 
 
 def _answer(network: LightGlue, index: int, batch: _Batch, position: int, threshold: float) -> tuple[Tensor, Tensor]:
-    """Of one pair of the batch, after layer `index`."""
+    """Index pairs (K, 2) int64 and scores (K,) of one pair of the batch, after layer `index`."""
     states = (batch.state0, batch.state1)
     kept0, kept1 = (torch.nonzero(state.there[position]).squeeze(1) for state in states)
     x0, x1 = (s.x[position : position + 1, kept] for s, kept in zip(states, (kept0, kept1), strict=True))
