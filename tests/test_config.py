@@ -74,6 +74,14 @@ def test_other_strategies_in_default_yaml_are_valid_when_uncommented() -> None:
     assert len(active) == len(FAMILIES)  # one of each family is the default, all others are shown
 
 
+def test_oblique_is_what_its_tables_say() -> None:
+    found = load("oblique")
+    assert found.pairs.max_view_angle_deg == 90.0
+    assert (found.simulate.name, found.extract.name) == ("neighbours", "learned")
+    assert (found.match.name, found.match.ratio, found.match.guided) == ("bidirectional", 0.9, True)
+    assert [one.name for one in found.filter] == ["epipolar", "graph"]
+
+
 @pytest.mark.parametrize("name", preset_names())
 def test_every_preset_loads(name: str) -> None:
     assert isinstance(load(name), Settings)

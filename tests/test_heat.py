@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from detector_training.scenes import sights
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table
 from numpy.typing import NDArray
 
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat, heat_keypoints, maxima, refined
-from aeromatch_cli.strategies.extractors.pyramid import levels_of
+from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, levels_of
 
 Gray = NDArray[np.uint8]
 
@@ -60,6 +62,44 @@ def test_a_maximum_beats_its_neighbours_in_place_and_scale() -> None:
     assert sizes[0] == pytest.approx(SIZE_PX * 2**0.5, rel=0.02)
     assert points[0] == pytest.approx([60.0, 40.0], abs=0.75)
     assert values[0] == pytest.approx(2.0, abs=0.01)
+
+
+class Peaks:
+    """Stands for the network: log odds of 2 at chosen pixels of maps of chosen heights, little elsewhere."""
+
+    first = SimpleNamespace(weight=torch.zeros(1))
+
+    def __init__(self, *peaks: tuple[int, int, int]) -> None:
+        self.peaks = peaks
+
+    def __call__(self, gray: torch.Tensor) -> torch.Tensor:
+        logits = torch.full_like(gray, -9.0)
+        for height, row, column in self.peaks:
+            if gray.shape[2] == height:
+                logits[0, 0, row, column] = 2.0
+        return logits
+
+
+def test_of_equal_heat_the_finer_keypoint_comes_first() -> None:
+    picture = texture(128, 128)
+    fine, half = levels_of(picture)[0].gray.shape[0], levels_of(picture)[2].gray.shape[0]
+    network = Peaks((half, 40, 40), (fine, 30, 100), (fine, 110, 20))
+    _, sizes, confidences = heat_keypoints(picture, 10, network=network)
+    assert sizes == pytest.approx([SIZE_PX, SIZE_PX, 2 * SIZE_PX], rel=0.02)
+    odds = np.log(confidences / (1.0 - confidences))
+    assert odds[0] - odds[2] == pytest.approx(2 * 0.3, abs=0.02)  # of log odds for each of two half octaves
+    assert len(heat_keypoints(picture, 2, network=network)[0]) == 2
+
+
+def test_where_a_levels_edge_is_seen_nothing_is_found() -> None:
+    picture = texture(128, 128)
+    inner, outer = ((row, column) for row, column in ((60, 4), (60, 3)))
+    assert len(heat_keypoints(picture, 10, network=Peaks((128, *inner)))[0]) == 1
+    assert len(heat_keypoints(picture, 10, network=Peaks((128, *outer)))[0]) == 0
+
+
+def test_a_patch_shows_48_pixels_of_its_level() -> None:
+    assert pytest.approx(48.0) == SIZE_PX * SUPPORT
 
 
 @pytest.mark.parametrize("middle", [(47.0, 48.0), (47.4, 48.3), (46.75, 44.5)])
