@@ -177,3 +177,16 @@ def test_the_device_is_no_part_of_the_recipe() -> None:
     one, other = LightGlue(), LightGlue(device="auto")
     assert fingerprint(one) == fingerprint(other)
     assert fingerprint(one) != fingerprint(LightGlue(precision="float32"))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_finds_what_the_cpu_finds(matcher: Together) -> None:
+    there = LightGlue(weights=matcher.weights, precision="float32", threshold=0.0, device="cuda")
+    together = asked_together(there, PAIRS, sides)
+    for pair in PAIRS:
+        alone, own = matcher(*sides(pair), pair.geometry), together[pair.image_id1]
+        here = dict(zip(map(tuple, alone.indices.tolist()), alone.scores, strict=True))
+        found = dict(zip(map(tuple, own.indices.tolist()), own.scores, strict=True))
+        both = here.keys() & found.keys()
+        assert len(both) >= 0.999 * max(len(here), len(found))
+        np.testing.assert_allclose([found[key] for key in both], [here[key] for key in both], atol=1e-3)

@@ -14,6 +14,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.stages import enhance, pairs, sources
 from aeromatch_cli.stages.sources import StoredRaster
 
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 WIDTH, HEIGHT = 700, 500
 PICTURE = np.clip(ground(3, (WIDTH, HEIGHT)), 1.0, 254.0).astype(np.float64)
 
