@@ -7,7 +7,7 @@ scenes, suns and flights of training_blocks with other numbers. Reliability: sha
 Seconds a pair with 2048 keypoints on either side, features excluded, one process with --threads, median of 20 after a
 warm-up: this forward in float32, and in bfloat16 where the processor has it, kornia's with the same weights and of the
 official size (9 layers of 256, random weights), then what early exit and pruning add; two processes beside two threads;
-and the whole matcher over the pairs of a rendered block, with what saves time switched on step by step. Writes
+and the whole matcher over 16 pairs of a rendered block, with what saves time switched on step by step. Writes
 OUT/accuracy.md, OUT/speed.md and OUT/lightglue.json; OUT/data keeps the pairs. In the README each part has a place of
 its own, and speed two: with and without bfloat16 in the processor.
 """
@@ -170,7 +170,7 @@ def speed(args: argparse.Namespace, network: LightGlue, sets: dict[str, list[Pai
     for count in (TIMED_KEYPOINTS,) if device == "cpu" else (1024, TIMED_KEYPOINTS):
         text += [f"Seconds a pair with {count} keypoints on either side ({where}):"]
         text += [forward_table(network, first_keypoints(full_pair(sets), count), device)]
-    text += [f"Pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
+    text += [f"16 pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
     text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
     return [*text, jobs_table(args.weights, full_pair(sets))] if device == "cpu" else text
 
