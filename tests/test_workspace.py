@@ -274,11 +274,13 @@ def test_fingerprint_feels_every_field(changed: dict[str, Any]) -> None:
 def test_fingerprint_feels_every_field_of_every_strategy(name: str, tmp_path: Path) -> None:
     family, _, key = name.partition(".")
     default = FAMILIES[family][key]()
-    if "weights" in type(default).model_fields:
-        (tmp_path / "own.pt").write_bytes(b"")  # "other" does not exist
-        default = default.model_copy(update={"weights": str(tmp_path / "own.pt")})
+    if "weights" in type(default).model_fields:  # a folder of files, or one file; "other" does not exist
+        own = tmp_path if family == "extract" else tmp_path / "own.pt"
+        (tmp_path / ("geodesc.safetensors" if family == "extract" else "own.pt")).write_bytes(b"")
+        default = default.model_copy(update={"weights": str(own)})
     prints = {fingerprint(default)}
-    fields = [f for f in type(default).model_fields if f != "name"]
+    # Where a network runs is no part of the recipe.
+    fields = [f for f in type(default).model_fields if f not in ("name", "device")]
     for field in fields:
         value = getattr(default, field)
         other = not value if isinstance(value, bool) else value + 1 if isinstance(value, int | float) else "other"
