@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from common import write_readme
 from lightglue_training.blocks import Pair, block_pairs
-from lightglue_training.costs import block_table, first_keypoints, forward_table, jobs_table
+from lightglue_training.costs import BLOCK_PAIRS, block_table, first_keypoints, forward_table, jobs_table
 from lightglue_training.data import pictures as pictures_of
 from lightglue_training.data import read_block, read_groups, write_block, write_groups
 from lightglue_training.validation import (
@@ -170,7 +170,8 @@ def speed(args: argparse.Namespace, network: LightGlue, sets: dict[str, list[Pai
     for count in (TIMED_KEYPOINTS,) if device == "cpu" else (1024, TIMED_KEYPOINTS):
         text += [f"Seconds a pair with {count} keypoints on either side ({where}):"]
         text += [forward_table(network, first_keypoints(full_pair(sets), count), device)]
-    text += [f"16 pairs of a rendered block of 12 images, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
+    of_block = f"{BLOCK_PAIRS} pairs of a rendered block of 12 images"
+    text += [f"{of_block}, features of preset `baseline`, {TIMED_KEYPOINTS} keypoints:"]
     text += [block_table(rendered_block(args), args.weights, TIMED_KEYPOINTS)]
     return [*text, jobs_table(args.weights, full_pair(sets))] if device == "cpu" else text
 

@@ -30,7 +30,8 @@ from lightglue_training.blocks import Pair, prepared
 OFFICIAL = Dimensions(input_dim=128, descriptor_dim=256, n_layers=9, num_heads=4, add_scale_ori=True)
 REPEATS = 20
 BATCH = 16
-_ROUNDS, _PAIRS = 3, 16
+_ROUNDS = 3
+BLOCK_PAIRS = 16
 EVERYTHING = {"depth_confidence": -1.0, "width_confidence": -1.0}
 
 
@@ -157,7 +158,7 @@ def block_table(folder: Path, weights: Path, keypoints: int) -> str:
     }
     matchers = {name: Matcher(weights=str(weights), **settings) for name, settings in steps.items()}
     pairs = _block_features(folder, keypoints)
-    block = pairs[:: max(1, len(pairs) // _PAIRS)][:_PAIRS]
+    block = pairs[:: max(1, len(pairs) // BLOCK_PAIRS)][:BLOCK_PAIRS]
     asked = {**matchers, "nearest": Nearest()}
     seconds: dict[str, list[float]] = {name: [] for name in asked}
     found = dict.fromkeys(asked, 0)

@@ -80,7 +80,7 @@ class Learned(Described):
         if not folder.is_dir():
             wrong = "is a file; give its folder" if folder.exists() else "is no folder"
             raise ConfigError(f"extract.weights {self.weights!r} {wrong}")
-        own = [name for name in self._asked() if (folder / f"{name}.safetensors").is_file()]
+        own = [name for name in self._asked() if self._own(name) is not None]
         if not own:
             raise ConfigError(
                 f"extract.weights {self.weights!r} holds none of the files that this recipe reads: "
@@ -102,8 +102,12 @@ class Learned(Described):
     def _path(self, name: str) -> Path:
         from aeromatch_cli.nets.weights import shipped_path
 
-        own = None if self.weights is None else Path(self.weights).expanduser() / f"{name}.safetensors"
-        return own if own is not None and own.is_file() else shipped_path(name)
+        return self._own(name) or shipped_path(name)
+
+    def _own(self, name: str) -> Path | None:
+        """The user's file of a network, where there is one."""
+        path = None if self.weights is None else Path(self.weights).expanduser() / f"{name}.safetensors"
+        return path if path is not None and path.is_file() else None
 
     def _network(self, name: str) -> Any:
         """Once per process."""
