@@ -22,6 +22,7 @@ from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.stages import report_map
 from aeromatch_cli.strategies.extractors.sift import Sift
 
@@ -63,6 +64,37 @@ def test_log_file_records_failures_and_errors(site):
     assert "INFO exit code 2 after" in last.splitlines()[-1]
     assert site("run", "--set", "nonsense", "--log-file", log).code == 2
     assert "ERROR error: --set 'nonsense'" in log.read_text()
+
+
+# --- remarks on the recipe ------------------------------------------------------------------------------------------
+
+
+def test_the_summary_names_own_weights_and_only_those(site):
+    own = site.root / "own"
+    own.mkdir()
+    (own / "geodesc.safetensors").write_bytes(shipped_path("geodesc").read_bytes())
+    learned = ("--set", "extract=learned", "--set", f"extract.weights={own}")
+    lines = site("pairs", *learned).stdout.splitlines()[:-1]
+    assert [line for line in lines if "weights" in line] == [f"own weights      {own}/geodesc.safetensors"]
+    assert "own weights" not in site("pairs", "--set", "extract=learned").stdout
+
+
+@pytest.mark.parametrize(
+    ("chain", "judged"),
+    [
+        ("poselib", True),
+        ("epipolar+graph", True),
+        ("poselib+magsac", False),
+        ("magsac+graph", False),
+        ("[{name: epipolar, model: fundamental}]", False),
+    ],
+)
+def test_the_summary_tells_where_the_chain_judges_no_attitude(site, chain, judged):
+    lines = site("pairs", "--set", f"filter={chain}").stdout.splitlines()
+    told = [line for line in lines if line.startswith("attitudes ")]
+    name = "epipolar" if "fundamental" in chain else chain
+    expected = f"attitudes        not judged: filter={name} gives no rotation (poselib and epipolar do, with "
+    assert told == ([] if judged else [expected + "model: relative_pose)"])
 
 
 # --- configuration ------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from aeromatch_cli.formats import cameras_text, images_text, pairs_text, poses_t
 from aeromatch_cli.stages.assemble import Assembled, assemble
 from aeromatch_cli.stages.common import Context, Shard, StageReport, forget_absent
 from aeromatch_cli.stages.distrust import without_distrusted
+from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import Workspace, file_digest, fingerprint, read_json, write_json, write_text
 
 log = logging.getLogger("aeromatch")
@@ -52,7 +54,7 @@ def prepare(
         report.items = report.done = len(pairs)
     summary = summarise(assembled.block, pairs)
     report.facts = {
-        "summary": list(summary.lines()),
+        "summary": [*summary.lines(), *_remarks(settings, summary.oriented)],
         "block": summary.figures(),
         "warnings": [*assembled.warnings, *summary.warnings],
         "images": len(assembled.block.images),
@@ -103,9 +105,28 @@ def _context(
 
 def _check_files(settings: Settings) -> None:
     """Files that strategies need (weights, pair lists) are found wanting now and not after hours of extraction."""
-    chosen = (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
-    for strategy in (*chosen, *settings.filter, *settings.export):
+    for strategy in _chosen(settings):
         strategy.check_files(settings.extract.descriptor_length)
+
+
+def _chosen(settings: Settings) -> Iterator[Strategy]:
+    yield from (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
+    yield from settings.filter
+    yield from settings.export
+
+
+def _remarks(settings: Settings, oriented: int) -> list[str]:
+    """What the recipe makes of this block that its user may not expect. oriented: images with attitude."""
+    found = [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
+    # The last model wins (filters.chain).
+    verifying = [one for one in settings.filter if one.verifies]
+    if oriented and verifying and not verifying[-1].tells_rotation():
+        chain = "+".join(one.name for one in settings.filter)
+        found.append(
+            f"attitudes        not judged: filter={chain} gives no rotation (poselib and epipolar do, with "
+            "model: relative_pose)"
+        )
+    return found
 
 
 def _turned(context: Context) -> set[str]:

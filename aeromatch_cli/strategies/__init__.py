@@ -59,6 +59,14 @@ class Strategy(BaseModel):
         """Raises ConfigError where a file is missing, or is not what it is named for with this extractor."""
         self.fingerprint_files()
 
+    def own_weights(self) -> tuple[str, ...]:
+        """Files of the user's own that stand in for networks that ship, once `check_files` has passed."""
+        return ()
+
+    def tells_rotation(self) -> bool:
+        """Whether a filter's verdict holds the relative rotation, by which attitudes are judged."""
+        return False
+
 
 @dataclass(frozen=True, eq=False)
 class Enhanced:

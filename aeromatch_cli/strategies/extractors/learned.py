@@ -80,7 +80,7 @@ class Learned(Described):
         if not folder.is_dir():
             wrong = "is a file; give its folder" if folder.exists() else "is no folder"
             raise ConfigError(f"extract.weights {self.weights!r} {wrong}")
-        own = [name for name in self._asked() if self._own(name) is not None]
+        own = self._own_names()
         if not own:
             raise ConfigError(
                 f"extract.weights {self.weights!r} holds none of the files that this recipe reads: "
@@ -88,6 +88,13 @@ class Learned(Described):
             )
         for name in own:
             self._network(name)
+
+    def own_weights(self) -> tuple[str, ...]:
+        """Those in the folder that this recipe reads."""
+        return tuple(str(self._path(name)) for name in self._own_names())
+
+    def _own_names(self) -> list[str]:
+        return [name for name in self._asked() if self._own(name) is not None]
 
     def _asked(self) -> list[str]:
         """Names of the networks that this recipe needs, in order."""

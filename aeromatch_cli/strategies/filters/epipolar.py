@@ -36,6 +36,10 @@ class Epipolar(Gated):
     )
     narrowest_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
 
+    def tells_rotation(self) -> bool:
+        """Known cameras have one; a fundamental matrix holds none."""
+        return self.model == "relative_pose"
+
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
         points0, points1, usable = undistorted(candidates.points0_px, candidates.points1_px, geometry)

@@ -28,6 +28,10 @@ class Poselib(Gated):
     min_iterations: int = Field(50, ge=1, description="Samples drawn at least.")
     max_iterations: int = Field(3000, ge=1, description="Samples drawn at most.")
 
+    def tells_rotation(self) -> bool:
+        """Known cameras have one; a fundamental matrix holds none."""
+        return self.model == "relative_pose"
+
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
         points0, points1, usable = undistorted(candidates.points0_px, candidates.points1_px, geometry)

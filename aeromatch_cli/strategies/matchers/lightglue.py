@@ -103,6 +103,10 @@ class LightGlue(Search):
             check_length(network.dimensions.input_dim, descriptor_length)
             read_calibration(Path(path))
 
+    def own_weights(self) -> tuple[str, ...]:
+        """The file that `weights` stands for."""
+        return () if self.weights is None else self.fingerprint_files()
+
     def scan(self, asked: Comparison) -> Found:
         """The mutual ratio test."""
         return ratio_test(asked)
