@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from patch_training.data import prepare, read
-from patch_training.draws import Source, developed, drawn, sources_of
+from patch_training.draws import Source, developed, drawn, photographed, sources_of
 from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from patch_training.turns import (
     Orient,
@@ -77,7 +77,7 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
         hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * run.step / args.steps
         chosen = rng.choice(len(known), GROUPS, p=weights / weights.sum())
         sides = [turned(drawn(known[i], args.batch // GROUPS, hardness, rng), rng) for i in chosen]
-        first, second = (torch.cat([developed(side[i], rng) for side in sides]) for i in (0, 1))
+        first, second = (torch.cat([photographed(developed(side[i], rng), rng) for side in sides]) for i in (0, 1))
         turn = torch.from_numpy(np.concatenate([side[2] for side in sides])).float()
         run.network.train()
         both = answered(run.network.scores, torch.stack([first, second], dim=1).flatten(0, 1), run.device)

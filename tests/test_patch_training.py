@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from patch_training.data import learnt_from
-from patch_training.draws import cropped, distinct, drawn, sources_of
+from patch_training.draws import compressed, cropped, distinct, drawn, photographed, sources_of
 from patch_training.loss import descriptor_loss
 from patch_training.sources import homography
 from patch_training.tracks import Tracks
 from patch_training.turns import gradient_peaks, turned, wrapped_deg
 from patch_training.validation import average_precision, fpr95
+from scipy.fft import dctn, idctn
 from train_orientation import turn_loss
 
 from aeromatch_cli.nets.orientation import BINS, bin_angles
@@ -70,6 +71,29 @@ def test_a_crop_along_a_direction_shows_its_content_turned_back(tracks: Tracks) 
     sides = [(side[:, 0] * 255.0).to(torch.uint8).numpy() for side in (first, second)]
     off = wrapped_deg(gradient_peaks(sides[1]) - gradient_peaks(sides[0]) - turn)
     assert np.median(np.abs(off)) < 20.0
+
+
+def test_compression_rounds_cosine_coefficients_of_blocks() -> None:
+    patches = torch.from_numpy(np.random.default_rng(0).random((3, 1, 32, 32), np.float32))
+    found = compressed(patches, torch.tensor([0.0, 0.05, 0.2]), (3, 6))
+    assert torch.allclose(found[0], patches[0], atol=1e-5)
+    # The second block of the first row, which begins 5 rows below the upper edge and 2 columns from the left one.
+    block = patches[2, 0, 5:13, 2:10].numpy()
+    steps = 0.2 * (1.0 + np.add.outer(np.arange(8), np.arange(8)) / 2.0)
+    expected = idctn(np.rint(dctn(block, norm="ortho") / steps) * steps, norm="ortho")
+    np.testing.assert_allclose(found[2, 0, 5:13, 2:10].numpy(), expected, atol=1e-4)
+
+
+def test_photographed_patches_still_show_the_same(tracks: Tracks) -> None:
+    patches = torch.from_numpy(tracks.patches[:40, None, 8:40, 8:40]).float() / 255.0
+    first, again, other = (photographed(patches, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert alike(first.numpy(), patches.numpy()).min() > 0.6
+    # Some are sharper than the other camera has them, some softer.
+    finer = (first - other).diff(dim=3).abs().mean(dim=(1, 2, 3)) > 0.0
+    assert finer.all()
+    detail = [side.diff(dim=3).square().mean(dim=(1, 2, 3)) for side in (first, other)]
+    assert 0 < int((detail[0] > detail[1]).sum()) < 40
 
 
 def test_the_turn_loss_is_least_at_the_turn() -> None:

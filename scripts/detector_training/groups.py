@@ -25,6 +25,8 @@ _PICTURE_PX = 1800
 LEVEL_SHARES = (0.34, 0.24, 0.18, 0.12, 0.07, 0.05)
 # A place counts if so much of the first view is seen in another.
 LEAST_SEEN = 0.2
+# How many views are sharpened: renders are not, photographs are.
+_SHARPENED = 0.3
 # How often the other views are those at the largest angles.
 _STEEP_SHARE = 0.6
 Array = NDArray[np.float64]
@@ -67,7 +69,7 @@ def homography_group(sources: list[Gray], views: int, rng: np.random.Generator) 
     grays = []
     for matrix in matrices:
         view = cv2.warpPerspective(gray, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        grays.append(developed(_smeared(view, rng), rng))
+        grays.append(_sharpened(developed(_smeared(view, rng), rng), rng))
     inside = cv2.warpPerspective(np.full(gray.shape, 255, np.uint8), matrices[0], size) == 255
     y, x = np.mgrid[0:SIDE_PX, 0:SIDE_PX].astype(np.float64)
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -101,6 +103,15 @@ def _smeared(gray: Gray, rng: np.random.Generator) -> Gray:
     across = steps[:, None] * cosine - steps[None, :] * sine
     kernel = np.exp(-((along / length) ** 2 + (across / 0.4) ** 2) / 2.0)
     return cv2.filter2D(gray, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
+
+
+def _sharpened(gray: Gray, rng: np.random.Generator) -> Gray:
+    """Some views as cameras write them: more than the lens has seen of everything that is small."""
+    if rng.random() < 1.0 - _SHARPENED:
+        return gray
+    blurred = cv2.GaussianBlur(gray, (0, 0), float(rng.uniform(0.7, 1.5)))
+    more = float(rng.uniform(0.2, 1.2))
+    return cv2.addWeighted(gray, 1.0 + more, blurred, -more, 0.0)
 
 
 def block_group(blocks: list[list[Sight]], views: int, rng: np.random.Generator) -> Group | None:
@@ -146,6 +157,7 @@ def block_group(blocks: list[list[Sight]], views: int, rng: np.random.Generator)
         return None
     if rng.random() < 0.3:
         grays = [developed(gray, rng) for gray in grays]
+    grays = [_sharpened(gray, rng) for gray in grays]
     return _turned(Group(np.stack(grays), np.stack(found)), rng)
 
 

@@ -19,6 +19,10 @@ PLACE_PX, OCTAVES = 0.8, 0.13
 UPRIGHT_DEG, ALIGNED_DEG, FAR_DEG, FAR_SHARE = 4.0, 8.0, 20.0, 0.1
 # Share of a batch by where tracks come from.
 SHARES = {"block": 0.65, "homographies": 0.15, "reference": 0.2}
+# What cameras and their software do to a picture: sigma of softness (1: as blurred as a mean over [1 2 1] / 4, below 0:
+# sharpened), share of patches that were compressed, and the coarsest step of their coefficients.
+SOFTNESS, COMPRESSED, COARSEST = 0.6, 0.3, 0.04
+_BLOCK_PX = 8
 _WINDOW = 4  # tracks of like reach from which a group draws one in so many
 
 
@@ -120,6 +124,36 @@ def developed(patches: Tensor, rng: np.random.Generator) -> Tensor:
     return values + noise.float() * spread
 
 
+def photographed(patches: Tensor, rng: np.random.Generator) -> Tensor:
+    """Patches (N, 1, 32, 32) in 0-1 as different cameras write them: blurred or sharpened, some compressed."""
+    count = len(patches)
+    taps = torch.tensor([0.25, 0.5, 0.25])
+    around = functional.pad(patches, (1, 1, 1, 1), mode="replicate")
+    blurred = functional.conv2d(around, (taps[:, None] * taps)[None, None])
+    softness = torch.from_numpy(rng.normal(0.0, SOFTNESS, count)).float().clamp(-1.5, 1.0)[:, None, None, None]
+    values = (patches + softness * (blurred - patches)).clamp(0.0, 1.0)
+    steps = np.where(rng.random(count) < COMPRESSED, rng.uniform(0.01, COARSEST, count), 0.0)
+    return compressed(values, torch.from_numpy(steps).float(), tuple(rng.integers(_BLOCK_PX, size=2).tolist()))
+
+
+def compressed(patches: Tensor, steps: Tensor, shift: tuple[int, int]) -> Tensor:
+    """Patches (N, 1, S, S) whose cosine coefficients, in blocks of 8 px, are rounded to multiples of steps (N,), higher
+    ones to coarser ones, as in JPEG; 0 leaves a patch as it is. shift: where blocks begin, y and x."""
+    count, side = len(patches), patches.shape[-1]
+    place = torch.arange(_BLOCK_PX)
+    basis = torch.cos(torch.pi / _BLOCK_PX * (place + 0.5) * place[:, None]) * (2.0 / _BLOCK_PX) ** 0.5
+    basis[0] /= 2.0**0.5
+    rolled = patches.roll(shift, (2, 3))
+    parts = side // _BLOCK_PX
+    blocks = rolled.reshape(count, parts, _BLOCK_PX, parts, _BLOCK_PX).transpose(2, 3)
+    coefficients = basis @ blocks @ basis.T
+    coarseness = steps[:, None, None, None, None] * (1.0 + (place[:, None] + place) / 2.0)
+    rounded = torch.where(coarseness > 0.0, (coefficients / coarseness.clamp(min=1e-6)).round() * coarseness, 0.0)
+    kept = torch.where(coarseness > 0.0, rounded, coefficients)
+    back = (basis.T @ kept @ basis).transpose(2, 3).reshape(count, 1, side, side)
+    return back.roll((-shift[0], -shift[1]), (2, 3))
+
+
 def looked_at(group: Group, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Both sides (N, 1, 32, 32) of a group as they are described in use.
 
@@ -132,7 +166,7 @@ def looked_at(group: Group, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     for rows in (group.rows0, group.rows1):
         stored = torch.from_numpy(group.tracks.patches[rows])
         turns = turn + jitters_deg(group.upright, count, rng)
-        sides.append(developed(cropped(stored, turns, flips, rng), rng))
+        sides.append(photographed(developed(cropped(stored, turns, flips, rng), rng), rng))
     return sides[0], sides[1]
 
 
