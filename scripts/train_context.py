@@ -153,7 +153,7 @@ def draw_curves(log: Log, path: Path) -> None:
         )
         axes.axhline(log[-1]["plain"][name]["rank1"], color=f"C{number}", linestyle="--", linewidth=0.8)
     axes.set(xlabel="pairs seen", ylabel="nearest neighbour is the partner (dashed: without context)")
-    axes.legend(title="view angle", frameon=False)
+    figure.legend(title="view angle", loc="outside right upper", frameon=False)
     figure.savefig(path)
 
 
@@ -170,7 +170,7 @@ def main() -> None:
     add = parser.add_argument
     add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; validation is on those left out")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--pairs", type=at_least_one, default=24_000, help="to be seen")
+    add("--pairs", type=at_least_one, default=6_000, help="to be seen")
     add("--seed", type=int, default=0, help="of what is drawn")
     add("--jobs", type=at_least_one, default=2, help="processes that make the data, threads that train")
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")

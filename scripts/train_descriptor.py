@@ -110,7 +110,7 @@ def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser, others="descriptors", steps=3000, batch=512)
+    add_arguments(parser, others="descriptors", steps=3200, batch=512)
     parser.add_argument("--only-data", action="store_true", help="make the data and stop")
     parser.add_argument("--only-table", action="store_true", help="compare the state as it is and write its weights")
     args = parsed(parser)

@@ -315,7 +315,7 @@ def main() -> None:
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
     add("--trained-on", default="sheffield,caliterra,seneca,brighton", help="real blocks whose pictures are warped")
-    add("--blocks", default="0-5,29-39,41,43-47", help="numbers of the rendered blocks (training_blocks)")
+    add("--blocks", default="0-15,17,19-39,41,43-47", help="numbers of the rendered blocks (training_blocks)")
     add("--unseen", default="16,18,40,42,209", help="rendered blocks for validation only")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--keypoints", type=int, default=400, help="of validation, in the overlap")

@@ -131,7 +131,7 @@ def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_arguments(parser, others="networks", steps=6000, batch=128)
+    add_arguments(parser, others="networks", steps=5000, batch=128)
     args = parsed(parser)
     prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     unseen = read(args.patches / "unseen")

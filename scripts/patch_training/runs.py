@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser, *, others: str, steps: int, b
     add("--reference", type=Path, help=f"folder of other {others}' weights, to compare with")
     add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--groups", type=int, default=1600, help="groups of homography views, a multiple of 40")
+    add("--groups", type=int, default=960, help="groups of homography views, a multiple of 40")
     add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
     add("--seed", type=int, default=0)
     add("--steps", type=int, default=steps)
@@ -105,7 +105,7 @@ def draw_curves(log: Log, values: dict[str, list[float]], lines: dict[str, float
     """Values by step, lines of others to compare with (dashed), and the loss."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 4.0), dpi=110, layout="constrained")
+    figure = Figure(figsize=(8.0, 4.3), dpi=110, layout="constrained")
     axes, losses = figure.subplots(1, 2)
     steps = [row["step"] for row in log]
     for name, series in values.items():
@@ -113,7 +113,7 @@ def draw_curves(log: Log, values: dict[str, list[float]], lines: dict[str, float
     for number, (name, value) in enumerate(lines.items()):
         axes.axhline(value, color=f"C{number + len(values)}", linestyle="--", linewidth=0.9, label=name)
     axes.set(xlabel="steps", ylabel=label)
-    axes.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     losses.plot(steps, [row["loss"] for row in log])
     losses.set(xlabel="steps", ylabel="loss")
     figure.savefig(path)
