@@ -18,40 +18,38 @@ def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(suburb: Path, work: Path, *more: str) -> dict[str, float]:
-    """The figures of `evaluate`."""
-    block = ["--images", suburb / "images", "--poses", suburb / "poses_noisy.csv", "--cameras", suburb / "block.json"]
-    outcome = invoke("run", *more, *block, "--workspace", work, "--jobs", 1, "--json")
+def arguments(suburb: Path, work: Path, *recipe: str) -> tuple[str | Path | int, ...]:
+    block = ("--images", suburb / "images", "--poses", suburb / "poses_noisy.csv", "--cameras", suburb / "block.json")
+    budget = ("--set", "extract.keypoints=1000")
+    return ("run", *recipe, *budget, *block, "--workspace", work, "--jobs", 1, "--json")
+
+
+@pytest.fixture(scope="module")
+def matched(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Workspace of preset oblique."""
+    work = tmp_path_factory.mktemp("oblique")
+    outcome = invoke(*arguments(suburb, work, "oblique"))
     assert outcome.code == 0, outcome.stderr
-    judged = invoke("evaluate", work, "--truth", suburb, "--no-mapping", "--json")
-    assert judged.code == 0, judged.stderr
-    totals: dict[str, float] = json.loads(judged.stdout.strip().splitlines()[-1])["totals"]
+    return work
+
+
+def judged(suburb: Path, work: Path) -> dict[str, float]:
+    """The figures of `evaluate`."""
+    outcome = invoke("evaluate", work, "--truth", suburb, "--no-mapping", "--json")
+    assert outcome.code == 0, outcome.stderr
+    totals: dict[str, float] = json.loads(outcome.stdout.strip().splitlines()[-1])["totals"]
     return totals
 
 
-def test_oblique_finds_more_than_baseline(suburb: Path, tmp_path: Path) -> None:
-    budget = ("--set", "extract.keypoints=1000")
-    plain = run(suburb, tmp_path / "baseline", "baseline", *budget, "--set", "pairs.max_view_angle_deg=90")
-    learned = run(suburb, tmp_path / "oblique", "oblique", *budget)
+def test_oblique_finds_more_than_baseline(suburb: Path, matched: Path, tmp_path: Path) -> None:
+    outcome = invoke(*arguments(suburb, tmp_path, "baseline", "--set", "pairs.max_view_angle_deg=90"))
+    assert outcome.code == 0, outcome.stderr
+    plain, learned = (judged(suburb, work) for work in (tmp_path, matched))
     assert learned["correct"] > 1.2 * plain["correct"]
     assert learned["correctness"] > 0.9
 
 
-def test_a_second_run_makes_nothing(suburb: Path, tmp_path: Path) -> None:
-    block = ["--images", suburb / "images", "--poses", suburb / "poses_noisy.csv", "--cameras", suburb / "block.json"]
-    arguments = (
-        "run",
-        "oblique",
-        *block,
-        "--workspace",
-        tmp_path,
-        "--jobs",
-        1,
-        "--set",
-        "extract.keypoints=300",
-        "--json",
-    )
-    assert invoke(*arguments).code == 0
-    again = invoke(*arguments)
+def test_a_second_run_makes_nothing(suburb: Path, matched: Path) -> None:
+    again = invoke(*arguments(suburb, matched, "oblique"))
     assert again.code == 0
     assert not {"extract", "match", "filter"} & again.done().keys()
