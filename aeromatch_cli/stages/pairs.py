@@ -118,9 +118,9 @@ def _chosen(settings: Settings) -> Iterator[Strategy]:
 def _remarks(settings: Settings, oriented: int) -> list[str]:
     """What the recipe makes of this block that its user may not expect. oriented: images with attitude."""
     found = [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
-    # The last model wins (filters.chain).
-    verifying = [one for one in settings.filter if one.verifies]
-    if oriented and verifying and not verifying[-1].tells_rotation():
+    # The last model wins (filters.chain); every chain has one (config).
+    *_, last = (one for one in settings.filter if one.verifies)
+    if oriented and not last.tells_rotation():
         chain = "+".join(one.name for one in settings.filter)
         found.append(
             f"attitudes        not judged: filter={chain} gives no rotation (poselib and epipolar do, with "

@@ -84,8 +84,8 @@ class Search(Strategy):
         return False
 
     def answers(self, questions: Sequence[Any]) -> Sequence[Any]:
-        """Of a network, one for each question of `steps`."""
-        raise NotImplementedError(f"{type(self).__name__} asks no network")
+        """Of a network, one for each question of `steps`. Raises TypeError where a matcher that asks none is asked."""
+        raise TypeError(f"{type(self).__name__} asks no network")
 
     def steps(self, features0: Features, features1: Features, geometry: PairGeometry) -> Steps[Matches]:
         """The call, which stops where a network is asked."""
