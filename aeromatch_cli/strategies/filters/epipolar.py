@@ -11,13 +11,13 @@ from pydantic import Field
 from aeromatch_cli.data import Candidates, FloatArray, PairGeometry, Verdict
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
-from aeromatch_cli.strategies.filters.gate import Gated
+from aeromatch_cli.strategies.filters.gate import TwoViewGated
 
 # Median of |x| of a normal variable is its standard deviation over this.
 _SIGMA_OF_MEDIAN = 1.4826
 
 
-class Epipolar(Gated):
+class Epipolar(TwoViewGated):
     """Keeps the matches within a band whose width follows from the data.
 
     The geometry is found with `threshold_px`. The standard deviation of its inliers is estimated robustly, and the band
@@ -25,20 +25,11 @@ class Epipolar(Gated):
     """
 
     version: ClassVar[int] = 2
-    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["epipolar"] = "epipolar"
-    model: Literal["relative_pose", "fundamental"] = Field(
-        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without."
-    )
-    threshold_px: float = Field(4.0, gt=0.0, description="Largest Sampson error, undistorted pixels.")
     sigmas: float = Field(
         6.0, gt=0.0, description="Half-width of the band in standard deviations of its matches, at most threshold_px."
     )
     narrowest_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
-
-    def tells_rotation(self) -> bool:
-        """Known cameras have one; a fundamental matrix holds none."""
-        return self.model == "relative_pose"
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""

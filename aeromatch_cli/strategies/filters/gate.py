@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -96,3 +96,17 @@ class Gated(Strategy):
         refused = partial(self.refusal, distance, points0_px, points1_px, threshold_px, found.sample)
         errors = distance(points0_px, points1_px)
         return self.verdict(usable, found.inliers, refused, found.kind, found.model, errors, found.rotation)
+
+
+class TwoViewGated(Gated):
+    """Those that find one two-view geometry of cameras, known or not."""
+
+    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
+    model: Literal["relative_pose", "fundamental"] = Field(
+        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without."
+    )
+    threshold_px: float = Field(4.0, gt=0.0, description="Largest Sampson error, undistorted pixels.")
+
+    def tells_rotation(self) -> bool:
+        """Known cameras have one; a fundamental matrix holds none."""
+        return self.model == "relative_pose"

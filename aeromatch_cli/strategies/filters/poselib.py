@@ -8,29 +8,20 @@ from pydantic import Field
 
 from aeromatch_cli.data import Candidates, PairGeometry, Verdict
 from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
-from aeromatch_cli.strategies.filters.gate import Gated
+from aeromatch_cli.strategies.filters.gate import TwoViewGated
 
 
-class Poselib(Gated):
+class Poselib(TwoViewGated):
     """Keeps the matches that one two-view geometry explains.
 
     The gates on the number of inliers come after the estimator, which calls 7 of 7 random matches inliers.
     """
 
     version: ClassVar[int] = 2
-    needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["poselib"] = "poselib"
-    model: Literal["relative_pose", "fundamental"] = Field(
-        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without."
-    )
-    threshold_px: float = Field(4.0, gt=0.0, description="Largest Sampson error, undistorted pixels.")
     confidence: float = Field(0.999, gt=0.0, lt=1.0, description="Sampling stops at this chance of a clean sample.")
     min_iterations: int = Field(50, ge=1, description="Samples drawn at least.")
     max_iterations: int = Field(3000, ge=1, description="Samples drawn at most.")
-
-    def tells_rotation(self) -> bool:
-        """Known cameras have one; a fundamental matrix holds none."""
-        return self.model == "relative_pose"
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
