@@ -137,8 +137,10 @@ def figures(found: FloatArray) -> tuple[float, float, float]:
 
 
 def like(view0: View, view1: View) -> bool:
-    """Whether the matcher would compare two views."""
-    if view0.is_source or view1.is_source or view0.world_direction is None or view1.world_direction is None:
+    """Whether the matcher would compare two views (`matchers.views.like_views`)."""
+    if view0.world_direction is None or view1.world_direction is None:
+        return True
+    if view0.is_source or view1.is_source:
         return view0.is_source and view1.is_source
     return float(view0.world_direction @ view1.world_direction) >= np.cos(np.deg2rad(_LIKE_DEG)) - 1e-6
 

@@ -32,7 +32,7 @@ import torch
 from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
-from training_blocks import LEFT_OUT, numbers, render
+from training_blocks import LEFT_OUT, block_list, numbers, render
 from training_runs import (
     Log,
     at_least_one,
@@ -45,13 +45,15 @@ from training_runs import (
     training_device,
 )
 
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
 from aeromatch_cli.strategies.extractors.detection import Raw
+from aeromatch_cli.strategies.extractors.learned import Learned
 
 DECAY, CLIP, RATE, BATCH = 0.999, 1.0, 1e-3, 4
-OF_RUN = ("blocks", "pairs", "seed")
+OF_RUN = ("blocks", "pairs", "weights", "seed")
 REPORT_EVERY = 2_000
 _KEEP = (0.5, 1.0)  # share of the keypoints of a view, drawn for every step
 
@@ -157,18 +159,24 @@ def draw_curves(log: Log, path: Path) -> None:
     figure.savefig(path)
 
 
-def one_block(out: Path, rendered: Path, index: int) -> None:
+def one_block(out: Path, rendered: Path, weights: Path | None, index: int) -> None:
     """Render block `index` and write its pairs, unless they are there."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     folder = render(rendered, index)
-    block_pairs(folder, out / "data" / f"{index:04d}.npz")
+    block_pairs(folder, out / "data" / f"{index:04d}.npz", weights)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; validation is on those left out")
+    add(
+        "--blocks",
+        type=block_list,
+        default="0-47",
+        help="rendered blocks by number, as 0-4,29-47; validation is on those left out",
+    )
+    add("--weights", type=Path, help="folder of your own networks, as `extract.weights` takes it; default: what ships")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--pairs", type=at_least_one, default=6_000, help="to be seen")
     add("--seed", type=int, default=0, help="of what is drawn")
@@ -176,18 +184,23 @@ def main() -> None:
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--out", type=Path, required=True)
     args = parser.parse_args()
+    if args.weights is not None:
+        try:
+            Learned(weights=str(args.weights)).check_files(Learned.descriptor_length)
+        except ConfigError as error:
+            parser.error(str(error))
     check_recipe(parser, args, OF_RUN)
     wanted = sorted({*numbers(args.blocks), *LEFT_OUT})
     (args.out / "data").mkdir(parents=True, exist_ok=True)
     rendered = args.rendered or args.out / "blocks"
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        list(pool.map(partial(one_block, args.out, rendered), wanted))
+        list(pool.map(partial(one_block, args.out, rendered, args.weights), wanted))
     torch.set_num_threads(args.jobs)
     groups: dict[bool, list[ContextPair]] = {False: [], True: []}
     for index in wanted:
         folder = render(rendered, index)
-        groups[index in LEFT_OUT] += block_pairs(folder, args.out / "data" / f"{index:04d}.npz")
+        groups[index in LEFT_OUT] += block_pairs(folder, args.out / "data" / f"{index:04d}.npz", args.weights)
     print(f"{len(groups[False])} pairs, {len(groups[True])} unseen ones", flush=True)
     run = train(groups[False], groups[True], args)
     if run is not None:

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from patch_training.data import prepare, read
+from patch_training.data import prepare
 from patch_training.draws import Source, distinct, drawn, looked_at, sources_of
 from patch_training.loss import descriptor_loss
 from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
@@ -113,15 +113,17 @@ def main() -> None:
     add_arguments(parser, others="descriptors", steps=3200, batch=512)
     parser.add_argument("--only-data", action="store_true", help="make the data and stop")
     parser.add_argument("--only-table", action="store_true", help="compare the state as it is and write its weights")
-    args = parsed(parser)
-    prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
+    args = parsed(parser, PEERS.values())
+    known, unseen = prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     if args.only_data:
         return
-    unseen = read(args.patches / "unseen")
     run = Run.begin(args.out / "state.pt", GeoDesc, args.rate, args.seed)
     quick = pairs_of(unseen, QUICK)[::5]
-    if not args.only_table:
-        train(run, sources_of(read(args.patches / "known")), quick, args)
+    if args.only_table and not run.log:
+        parser.error(f"--only-table: {args.out} has no state of a training yet")
+    if not args.only_table and not train(run, sources_of(known), quick, args):
+        print(f"ended by --minutes after step {run.step} of {args.steps}: the same command goes on, and writes weights")
+        return
     ship(fold(run.average.eval(), GeoDesc(folded=True)), args.out / "geodesc.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     compare(run, pairs_of(unseen), args.out, args.reference)

@@ -36,7 +36,7 @@ from detector_training.scenes import Sight, read_sights, sights, write_sights
 from detector_training.shapes import shape
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table, thinned
 from torch import Tensor
-from training_blocks import LEFT_OUT, numbers, render
+from training_blocks import LEFT_OUT, block_list, numbers, render
 from training_runs import (
     Log,
     at_least_one,
@@ -49,6 +49,7 @@ from training_runs import (
     training_device,
 )
 
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 
 DECAY, CLIP = 0.995, 1.0
@@ -307,7 +308,20 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     shared = {*LEFT_OUT, *numbers(args.unseen)} & set(numbers(args.blocks))
     if shared:
         parser.error(f"--blocks {args.blocks}: {', '.join(map(str, sorted(shared)))} are for validation")
-    check_recipe(parser, args, OF_RUN)
+    if args.validate is None:
+        check_recipe(parser, args, OF_RUN)
+        return
+    try:
+        load_detector(args.validate, "bfloat16")
+    except ConfigError as error:
+        parser.error(str(error))
+
+
+def validate(args: argparse.Namespace, unseen: list[list[Sight]]) -> None:
+    """Print the figures of --validate's weights, and SIFT's."""
+    pairs = thinned(pairs_of(unseen), MOST_PAIRS)
+    for name, find in (("sift", by_sift), ("heat", by_heat(load_detector(args.validate, "bfloat16")))):
+        print(json.dumps({name: table(scores(pairs, find, args.keypoints))}), flush=True)
 
 
 def main() -> None:
@@ -315,8 +329,13 @@ def main() -> None:
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
     add("--trained-on", default="sheffield,caliterra,seneca,brighton", help="real blocks whose pictures are warped")
-    add("--blocks", default="0-15,17,19-39,41,43-47", help="numbers of the rendered blocks (training_blocks)")
-    add("--unseen", default="16,18,40,42,209", help="rendered blocks for validation only")
+    add(
+        "--blocks",
+        type=block_list,
+        default="0-15,17,19-39,41,43-47",
+        help="numbers of the rendered blocks (training_blocks)",
+    )
+    add("--unseen", type=block_list, default="16,18,40,42,209", help="rendered blocks for validation only")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--keypoints", type=int, default=400, help="of validation, in the overlap")
     add("--seed", type=int, default=0)
@@ -333,9 +352,7 @@ def main() -> None:
     check(parser, args)
     unseen = prepared_views(args, numbers(args.unseen))
     if args.validate is not None:
-        pairs = thinned(pairs_of(unseen), MOST_PAIRS)
-        for name, find in (("sift", by_sift), ("heat", by_heat(load_detector(args.validate, "bfloat16")))):
-            print(json.dumps({name: table(scores(pairs, find, args.keypoints))}), flush=True)
+        validate(args, unseen)
         return
     blocks = prepared_views(args, numbers(args.blocks))
     # Blocks seen at steep angles are drawn three times as often.

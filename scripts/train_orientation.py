@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from patch_training.data import prepare, read
+from patch_training.data import prepare
 from patch_training.draws import Source, developed, drawn, photographed, sources_of
 from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from patch_training.turns import (
@@ -68,8 +68,8 @@ def turn_loss(first: Tensor, second: Tensor, turn_deg: Tensor) -> Tensor:
     return -torch.log((differences * near).sum(dim=1).clamp(min=0.0) + FLOOR).mean()
 
 
-def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Namespace) -> None:
-    """To the end, or until --minutes are over."""
+def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Namespace) -> bool:
+    """Whether it came to the end; False where --minutes ended it before."""
     weights = np.array([source.weight for source in known])
     started, losses = time.monotonic(), []
     while run.step < args.steps:
@@ -95,7 +95,8 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
         if over or run.step % SAVE_EVERY == 0 or run.step == args.steps:
             run.save(args.out / "state.pt")
         if over:
-            return
+            return run.step >= args.steps
+    return True
 
 
 def oriented_by(run: Run) -> Orient:
@@ -132,12 +133,13 @@ def compare(run: Run, unseen: TurnedPairs, out: Path, reference: Path | None) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser, others="networks", steps=5000, batch=128)
-    args = parsed(parser)
-    prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
-    unseen = read(args.patches / "unseen")
+    args = parsed(parser, (PEER,))
+    known, unseen = prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     run = Run.begin(args.out / "state.pt", OrientationNet, args.rate, args.seed)
     quick = unseen_pairs(unseen, EACH // 5)
-    train(run, sources_of(read(args.patches / "known")), quick, args)
+    if not train(run, sources_of(known), quick, args):
+        print(f"ended by --minutes after step {run.step} of {args.steps}: the same command goes on, and writes weights")
+        return
     ship(fold(run.average.eval(), OrientationNet(folded=True)), args.out / "orientation.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
     compare(run, unseen_pairs(unseen, EACH), args.out, args.reference)

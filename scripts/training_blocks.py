@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -41,3 +42,14 @@ def numbers(text: str) -> list[int]:
         first, _, last = part.partition("-")
         found |= set(range(int(first), int(last or first) + 1))
     return sorted(found)
+
+
+def block_list(text: str) -> str:
+    """For argparse: the text, if `numbers` reads it."""
+    try:
+        found = numbers(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0-4,29-47") from error
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} names no number: ranges go up, as in 0-4")
+    return text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,7 @@ def spoilt(name: str, folder: Path) -> None:
 
 @pytest.mark.parametrize("name", ["detector", "orientation", "geodesc", "context"])
 def test_own_weights_take_the_place_of_those_that_ship(picture: NDArray[np.uint8], tmp_path: Path, name: str) -> None:
-    settings = {"context": True, "orientation": "network"}
+    settings = {"context": name == "context", "orientation": "network"}
     spoilt(name, tmp_path)
     plain, own = extract(picture, **settings), extract(picture, weights=str(tmp_path), **settings)
     same = [
@@ -210,3 +211,13 @@ def test_own_weights_that_are_not_there_or_no_network_are_named(tmp_path: Path) 
     # A network that this recipe does not ask is not read.
     with pytest.raises(ConfigError, match="holds none of"):
         Learned(weights=str(tmp_path), detector="sift").check_files(128)
+
+
+def test_own_descriptors_ask_for_their_own_context(tmp_path: Path) -> None:
+    """The context network corrects the descriptors that it was trained on."""
+    shutil.copy(shipped_path("geodesc"), tmp_path / "geodesc.safetensors")
+    Learned(weights=str(tmp_path)).check_files(128)
+    with pytest.raises(ConfigError, match=r"no context\.safetensors that was trained on them: .* --weights"):
+        Learned(weights=str(tmp_path), context=True).check_files(128)
+    shutil.copy(shipped_path("context"), tmp_path / "context.safetensors")
+    Learned(weights=str(tmp_path), context=True).check_files(128)

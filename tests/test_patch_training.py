@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import torch
+from patch_training import data
 from patch_training.data import learnt_from
 from patch_training.draws import compressed, cropped, distinct, drawn, photographed, sources_of
 from patch_training.loss import descriptor_loss
@@ -127,3 +131,37 @@ def test_figures_of_small_sets() -> None:
 
 def test_blocks_for_validation_are_never_learnt_from() -> None:
     assert learnt_from("0-2,15-18,204") == [0, 1, 2, 15, 17]
+
+
+def test_a_folder_of_patches_serves_several_recipes(
+    tracks: Tracks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each reads what it names, whatever the folder holds besides."""
+    made: list[object] = []
+    for name in ("seneca", "brighton"):
+        (tmp_path / name / "images").mkdir(parents=True)
+
+    def one(*asked: object) -> dict[str, Tracks]:
+        made.append(asked[-1])
+        return {"source": tracks}
+
+    monkeypatch.setattr(data, "_rendered", one)
+    monkeypatch.setattr(data, "_groups", one)
+    monkeypatch.setattr(data, "_unseen_groups", one)
+    monkeypatch.setattr(data.sources, "reference", one)
+    monkeypatch.setattr(data, "mapped", lambda call, jobs, count: [call(job) for job in jobs])
+
+    def prepared(real: str, blocks: str, groups: int, seed: int) -> list[str]:
+        args = argparse.Namespace(blocks=blocks, groups=groups, seed=seed, jobs=1)
+        known, unseen = data.prepare(tmp_path / "data", tmp_path, tmp_path, real.split(","), args)
+        assert len(unseen) == len(data.UNSEEN) + 1
+        return sorted(known)
+
+    first = prepared("seneca", "0-1", 80, 0)
+    names = ["block-0", "block-1", "homographies-seneca-0-0", "homographies-seneca-0-1", "seneca"]
+    assert first == [f"{name}.source" for name in names]
+    names = ["block-1", "brighton", "homographies-brighton-5-0"]
+    assert prepared("brighton", "1", 40, 5) == [f"{name}.source" for name in names]
+    made.clear()
+    assert prepared("seneca", "0-1", 80, 0) == first
+    assert made == []

@@ -54,8 +54,21 @@ def test_rows_without_coordinates_are_unposed_and_the_rest_is_kept(tmp_path: Pat
     poses = read_poses(write(tmp_path, "\n".join(["image,lat,lon,alt,yaw,pitch,roll", *lines])))
     assert [row.position is not None for row in poses.rows] == [False, False, False, True, True, True]
     assert [row.attitude is not None for row in poses.rows] == [True, False, True, False, False, True]
-    assert any("line 2, column lat" in warning for warning in poses.warnings)
-    assert any("(0, 0)" in warning for warning in poses.warnings)
+    assert poses.warnings == (
+        "poses.csv, lines 2, 3: no number in column lat, treated as unposed: a, b",
+        "poses.csv, line 4: position (0, 0), treated as unposed: c",
+        "poses.csv, line 5: no attitude, position only: d",
+        "poses.csv, line 6: attitude is incomplete, position only: e",
+    )
+
+
+def test_a_fault_of_every_line_is_one_warning(tmp_path: Path) -> None:
+    lines = [f"{number}.jpg,1,2,3,,,0" for number in range(2000)]
+    poses = read_poses(write(tmp_path, "\n".join(["image,lat,lon,alt,yaw,pitch,roll", *lines])))
+    assert poses.warnings == (
+        "poses.csv, lines 2, 3, 4, 5, 6 and 1,995 more: attitude is incomplete, position only: "
+        "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, ...",
+    )
 
 
 @pytest.mark.parametrize(

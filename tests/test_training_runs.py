@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
+import train_context
+import train_descriptor
+import train_detector
+import train_orientation
 from context_training.data import ContextPair, ViewSeen
 from context_training.validation import compared
 from lightglue_training.sides import Partners, Seen
@@ -56,3 +62,47 @@ def test_a_log_of_validation_figures_reads_back(tmp_path: Path) -> None:
     assert found["20-40"]["rank1"] == 0.5
     save_state(tmp_path / "state.pt", 4, [{"context": found}])
     assert load_state(tmp_path / "state.pt") == (4, [{"context": found}])
+
+
+@pytest.mark.parametrize(
+    ("recipe", "arguments", "words"),
+    [
+        (train_context, "--blocks x", "'x' is no list of numbers"),
+        (train_context, "--blocks 9-3", "names no number"),
+        (train_context, "--weights absent", "is no folder"),
+        (train_orientation, "--data . --blocks 0-x", "'0-x' is no list of numbers"),
+        (train_orientation, "--data absent", "has no folder images"),
+        (train_descriptor, "--data . --real block --groups 39", "no multiple of 40"),
+        (train_descriptor, "--data . --real block --reference .", "tfeat-liberty.params is missing"),
+        (train_detector, "--data . --trained-on block --validate absent.safetensors", "absent.safetensors"),
+        (train_detector, "--data absent", "has no folder images"),
+    ],
+)
+def test_wrong_arguments_are_named_and_lock_no_folder(
+    recipe: ModuleType, arguments: str, words: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    (tmp_path / "block" / "images").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train", *arguments.split(), "--out", "out"])
+    with pytest.raises(SystemExit) as ended:
+        recipe.main()
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("recipe", [train_descriptor, train_orientation])
+def test_a_training_that_minutes_ended_writes_no_weights(
+    recipe: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "block" / "images").mkdir(parents=True)
+    monkeypatch.setattr(recipe, "prepare", lambda *_: ({}, {}))
+    monkeypatch.setattr(recipe, "train", lambda *_: False)
+    for pairs in ("pairs_of", "unseen_pairs"):
+        monkeypatch.setattr(recipe, pairs, lambda *_: [], raising=False)
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["train", "--data", str(tmp_path), "--real", "block", "--out", str(out)])
+    recipe.main()
+    assert "after step 0 of" in capsys.readouterr().out
+    assert [path.name for path in out.iterdir()] == ["recipe.json"]

@@ -40,7 +40,7 @@ def warnings_of(block: Block, unpaired: Collection[str] = ()) -> tuple[str, ...]
         *_height_warnings(block, names, centers),
         *_attitude_warnings(block, ids, names),
     ]
-    if unpaired:
+    if unpaired and len(block.images) > 1:
         found.append(f"{_some(list(unpaired))} in no pair: check the poses, or lower pairs.min_overlap")
     return tuple(found)
 

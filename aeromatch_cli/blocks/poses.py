@@ -51,6 +51,9 @@ _UNCLEAR_HEIGHTS = ("z", "alt", "height", "h", "elevation", "relative_altitude",
 _BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 _RANGES = {"lat": 90.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
 _LARGEST_ANGLE_DEG = 360.0
+_LINES_NAMED = 5  # of those with the same fault
+# Images by line, by what is wrong with it.
+_Faults = dict[str, dict[int, str]]
 
 
 @dataclass(frozen=True)
@@ -95,13 +98,11 @@ def read_poses(path: Path) -> PoseList:
     """Reads a pose list. Raises ConfigError with file, line and column where the list is malformed."""
     lines = [line for line in enumerate(_text(path).splitlines(), start=1) if line[1].strip()]
     header, layout, records = _header(path, lines)
-    warnings: list[str] = []
-    if layout.ignored:
-        warnings.append(f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}")
+    faults: _Faults = {}
     rows: list[PoseRow] = []
     lines_of: dict[str, int] = {}
     for number, line in records:
-        row = _row(path, number, _split(path, number, line, layout.separator), layout, warnings)
+        row = _row(path, number, _split(path, number, line, layout.separator), layout, faults)
         if row.image in lines_of:
             raise ConfigError(
                 f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
@@ -111,7 +112,18 @@ def read_poses(path: Path) -> PoseList:
         rows.append(row)
     if not rows:
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
-    return PoseList(tuple(rows), layout.position_kind, tuple(warnings))
+    ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
+    warnings = [_fault(path, fault, images) for fault, images in faults.items()]
+    return PoseList(tuple(rows), layout.position_kind, (*ignored, *warnings))
+
+
+def _fault(path: Path, fault: str, images: Mapping[int, str]) -> str:
+    """One warning about all lines that have the same fault. images: by line."""
+    lines, names = [str(line) for line in images][:_LINES_NAMED], list(images.values())[:_LINES_NAMED]
+    more = len(images) - len(lines)
+    also = f" and {more:,} more" if more else ""
+    plural = "s" if len(images) > 1 else ""
+    return f"{path.name}, line{plural} {', '.join(lines)}{also}: {fault}: {', '.join(names)}{', ...' if more else ''}"
 
 
 def _text(path: Path) -> str:
@@ -218,7 +230,8 @@ def _split(path: Path, number: int, line: str, separator: str | None) -> list[st
         raise ConfigError(f"{path}, line {number}: not a line of separated values ({error})") from error
 
 
-def _row(path: Path, number: int, cells: list[str], layout: _Layout, warnings: list[str]) -> PoseRow:
+def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Faults) -> PoseRow:
+    """What a line says; what it lacks is added to the faults."""
     while len(cells) > len(layout.columns) and not cells[-1].strip():
         cells = cells[:-1]
     if len(cells) != len(layout.columns):
@@ -241,13 +254,15 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, warnings: l
     x, y, z = position
     lacking = next((n for n, v in zip(_POSITIONS[layout.position_kind], position, strict=True) if v is None), None)
     if lacking:
-        warnings.append(f"{path.name}, line {number}, column {lacking}: no number; {image} is treated as unposed")
+        faults.setdefault(f"no number in column {lacking}, treated as unposed", {})[number] = image
     elif layout.position_kind == "geographic" and x == 0.0 and y == 0.0:
-        warnings.append(f"{path.name}, line {number}: position (0, 0); {image} is treated as unposed")
+        faults.setdefault("position (0, 0), treated as unposed", {})[number] = image
         x = None
     whole = tuple(value for value in attitude if value is not None)
+    if len(whole) < len(attitude) and not lacking:
+        missing = "attitude is incomplete" if whole else "no attitude"
+        faults.setdefault(f"{missing}, position only", {})[number] = image
     if len(whole) < len(attitude):
-        warnings.append(f"{path.name}, line {number}: attitude is incomplete; {image} has a position only")
         whole = ()
     if len(whole) == 4 and abs(math.hypot(*whole) - 1.0) > 0.05:
         raise ConfigError(f"{path}, line {number}: qw,qx,qy,qz has length {math.hypot(*whole):.3g}, not 1")

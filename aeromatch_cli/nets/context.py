@@ -23,11 +23,16 @@ DESCRIPTOR, VISUAL, GEOMETRIC = 128, 64, 64
 NEIGHBOURS = 12
 REDUCED = 4  # view pixels along each side of a pixel of the coarse picture
 _LOCAL_PX = 31  # of the coarse picture: within it, brightness and contrast are made even
+STRIDE = 4  # coarse pixels between two values of the visual context
 _LOOKS = 32
 
 
 class VisualContext(nn.Module):
-    """Coarse picture (1, 1, h, w) -> (VISUAL, h / 4, w / 4); a value sees about 70 coarse pixels around it."""
+    """Coarse picture (1, 1, h, w) -> (1, VISUAL, ceil(h / STRIDE), ceil(w / STRIDE)).
+
+    Value (i, j) is centred on coarse pixel (STRIDE i, STRIDE j); it sees 28 of them to every side, and 15 more through
+    local brightness and contrast.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -80,13 +85,20 @@ class Context(nn.Module):
     def forward(
         self, descriptors: Tensor, places: Tensor, layout: Tensor, neighbours: Tensor, picture: Tensor
     ) -> Tensor:
-        """descriptors: (N, 128) of unit length. places: (N, 2) in -1 to 1 from edge to edge of the coarse picture
-        (1, 1, h, w) in 0-1. neighbours: (N, K) int64 into the same keypoints; layout: (N, K, 4), see `layout_of`.
+        """descriptors: (N, 128) of unit length. places: (N, 2) x and y, pixels of the coarse picture (1, 1, h, w) in
+        0-1. neighbours: (N, K) int64 into the same keypoints; layout: (N, K, 4), see `layout_of`.
         """
-        seen = nnf.grid_sample(self.visual(picture), places[None, :, None], align_corners=False, padding_mode="border")
         around = self.geometric(layout, descriptors, neighbours)
-        change = self.fusion(torch.cat([descriptors, seen[0, :, :, 0].T, around], dim=1))
+        change = self.fusion(torch.cat([descriptors, self.seen(picture, places), around], dim=1))
         return nnf.normalize(descriptors + change, dim=1)
+
+    def seen(self, picture: Tensor, places: Tensor) -> Tensor:
+        """Visual context (N, VISUAL) of a coarse picture (1, 1, h, w) at places (N, 2), interpolated, float32."""
+        visual = self.visual(picture).float()  # bfloat16 would round the places, too
+        last = places.new_tensor(visual.shape[:1:-1]) - 1.0
+        grid = 2.0 / STRIDE * places / last.clamp_min(1.0) - 1.0
+        found = nnf.grid_sample(visual, grid[None, :, None], align_corners=True, padding_mode="border")
+        return found[0, :, :, 0].T
 
 
 def evened(picture: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ def _headline(
         (f"{facts['verified_matches']:,}", "verified matches", "" if verified else "bad"),
         (f"{parts:,}", "connected group" if parts == 1 else "unconnected groups", "bad" if parts > 1 else ""),
         (f"{weak:,}", f"weakly tied images (< {WEAK_MATCHES} matches)", "bad" if weak else ""),
-        (f"{len(failures):,}", "failures", "bad" if failures else ""),
+        (f"{len(failures):,}", "failure" if len(failures) == 1 else "failures", "bad" if failures else ""),
     ]
 
 
@@ -158,25 +158,32 @@ def notices(
     if contradictions:
         text = "Matches say that these attitudes are wrong by the angle given; only their positions are used."
         items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in contradictions.items())
-        found.append(Notice("bad", f"{len(items):,} attitudes contradict the pictures", text, items))
+        title = _counted(len(items), "attitude contradicts the pictures", "attitudes contradict the pictures")
+        found.append(Notice("bad", title, text, items))
     if facts["weakly_tied"] and facts["verified_matches"]:
         ties = {row.image_id: row for row in images}
         items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in facts["weakly_tied"])
         text = f"Fewer than {WEAK_MATCHES} verified matches over all their pairs (their number in brackets)."
-        found.append(Notice("bad", f"{len(items):,} images are weakly tied", text, items))
-    for pose, title, text in (
-        ("none", "images have no position", "They were paired by name or time and are not on the map."),
-        ("position", "images have no usable attitude", "They were paired by position and have no footprint."),
+        title = _counted(len(items), "image is weakly tied", "images are weakly tied")
+        found.append(Notice("bad", title, text, items))
+    for pose, lacks, text in (
+        ("none", "no position", "Paired by name or time, and not on the map."),
+        ("position", "no usable attitude", "Paired by position, and without footprint."),
     ):
         items = tuple(row.name for row in images if row.pose == pose and row.image_id not in contradictions)
         if items:
-            found.append(Notice("warn", f"{len(items):,} {title}", text, items))
+            title = _counted(len(items), f"image has {lacks}", f"images have {lacks}")
+            found.append(Notice("warn", title, text, items))
     lost = sum(row.state == NOT_JUDGED for row in pairs)
     if lost:
-        text = "They have no matches on file: the match stage failed on them or has not run."
-        found.append(Notice("warn", f"{lost:,} pairs were not judged", text))
+        text = "No matches on file: the match stage failed there or has not run."
+        found.append(Notice("warn", _counted(lost, "pair was not judged", "pairs were not judged"), text))
     found += [Notice("warn", "Remark on the input", warning) for warning in warnings]
     return found
+
+
+def _counted(count: int, one: str, several: str) -> str:
+    return f"{count:,} {one if count == 1 else several}"
 
 
 def _remarks(context: Context) -> dict[str, list[str]]:

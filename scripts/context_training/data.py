@@ -21,8 +21,8 @@ from aeromatch_cli.stages import simulate
 from aeromatch_cli.strategies.extractors.context import coarse_of
 from aeromatch_cli.synthetic import load_truth
 
-_LEARNED = ("extract=learned", "extract.context=false")
-RECIPES = (_LEARNED, (*_LEARNED, "simulate=none"))
+LEARNED = ("extract=learned", "extract.context=false")
+RECIPES = (LEARNED, (*LEARNED, "simulate=none"))
 KEYPOINTS, LEAST_PARTNERS = 1200, 32
 Array = NDArray[Any]
 
@@ -45,10 +45,13 @@ class ContextPair:
     angle_deg: float
 
 
-def block_pairs(folder: Path, path: Path) -> list[ContextPair]:
-    """Pairs of a rendered block with partners enough, from the file `path` where it is there."""
+def block_pairs(folder: Path, path: Path, weights: Path | None = None) -> list[ContextPair]:
+    """Pairs of a rendered block with partners enough, from the file `path` where it is there.
+
+    weights: folder of detector, orientation network and GeoDesc; what it lacks, or None, are those that ship.
+    """
     if not path.is_file():
-        _write(folder, path)
+        _write(folder, path, weights)
     with np.load(path) as archive:
         arrays = dict(archive)
     views = [_view(arrays, number) for number in range(int(arrays["views"]))]
@@ -65,14 +68,15 @@ def _view(arrays: dict[str, Array], number: int) -> ViewSeen:
     return ViewSeen(Seen(**fields), arrays[f"view.{number}.coarse"])
 
 
-def _write(folder: Path, path: Path) -> None:
+def _write(folder: Path, path: Path, weights: Path | None) -> None:
     truth, judge = load_truth(folder), open_truth(folder)
     arrays: dict[str, Any] = {}
     views = pairs = 0
+    own = () if weights is None else (f"extract.weights={weights.resolve()}",)
     for recipe in RECIPES:
         numbers: dict[str, int] = {}
         known: dict[str, Seen] = {}
-        for name, side, task in extracted(folder, recipe, KEYPOINTS):
+        for name, side, task in extracted(folder, (*recipe, *own), KEYPOINTS):
             numbers[name], known[name] = views, side
             arrays[f"view.{views}.coarse"] = coarse_of(simulate.render(task.views)[0][0].gray)
             arrays |= {f"view.{views}.{key}": value for key, value in side.arrays().items()}

@@ -1,8 +1,11 @@
-"""Tracks on disk: made once, each source in a file of its own."""
+"""Tracks on disk: made once, each source in a file of its own.
+
+A folder may hold those of several recipes; each reads the files that it names.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,29 +19,36 @@ from patch_training.tracks import Tracks, joined
 
 # Rendered blocks for validation only: those that every training leaves out, and a city, farmland and hills.
 UNSEEN = (*LEFT_OUT, 204, 207, 209)
+Make = Callable[[], Mapping[str, Tracks]]
 GROUPS = 40  # of homography views in a file
 _UNSEEN_GROUPS = 10**6
 
 
-def prepare(out: Path, rendered: Path, real: Path, names: Sequence[str], args: Any) -> None:
-    """Every file that is not there yet, in OUT/known and OUT/unseen.
+def prepare(
+    out: Path, rendered: Path, real: Path, names: Sequence[str], args: Any
+) -> tuple[dict[str, Tracks], dict[str, Tracks]]:
+    """Tracks to learn from and those for validation, by file and kind; what is not there yet is made.
 
-    rendered: where blocks of training_blocks are or go, args.blocks their numbers. real: folder of the real blocks
-    `names`.
+    out: its folders known and unseen have the files. rendered: where blocks of training_blocks are or go, args.blocks
+    their numbers. real: folder of the real blocks `names`; of them args.groups groups of homography views.
     """
-    for folder in ("known", "unseen"):
-        (out / folder).mkdir(parents=True, exist_ok=True)
     paths = pictures(real / name for name in names)
-    jobs: list[Callable[[], None]] = []
-    jobs += [partial(_write, out / "unseen", partial(_rendered, rendered, index), f"block-{index}") for index in UNSEEN]
-    jobs += [partial(_write, out / "known", partial(sources.reference, real / name, name), name) for name in names]
+    known: dict[str, Make] = {name: partial(sources.reference, real / name, name) for name in names}
+    # Their pictures are in the name: the same numbers warp other blocks' in another recipe.
+    warped = "+".join(sorted(names))
     for number in range(args.groups // GROUPS):
         first = args.seed * 10**7 + number * GROUPS
-        jobs.append(partial(_write, out / "known", partial(_groups, paths, first), f"homographies-{number}"))
-    jobs.append(partial(_write, out / "unseen", partial(_unseen_groups, rendered), "homographies"))
-    for index in learnt_from(args.blocks):
-        jobs.append(partial(_write, out / "known", partial(_rendered, rendered, index), f"block-{index}"))
+        known[f"homographies-{warped}-{args.seed}-{number}"] = partial(_groups, paths, first)
+    known |= {f"block-{index}": partial(_rendered, rendered, index) for index in learnt_from(args.blocks)}
+    unseen: dict[str, Make] = {f"block-{index}": partial(_rendered, rendered, index) for index in UNSEEN}
+    unseen["homographies"] = partial(_unseen_groups, rendered)
+    # Those for validation first: a run that is ended meanwhile has them.
+    parts = ((out / "unseen", unseen), (out / "known", known))
+    jobs = [partial(_write, folder, make, name) for folder, makes in parts for name, make in makes.items()]
+    for folder, _ in parts:
+        folder.mkdir(parents=True, exist_ok=True)
     mapped(_call, jobs, args.jobs)
+    return read(out / "known", known), read(out / "unseen", unseen)
 
 
 def learnt_from(text: str) -> list[int]:
@@ -81,11 +91,11 @@ def _write(folder: Path, make: Callable[[], Mapping[str, Tracks]], name: str) ->
     done.touch()
 
 
-def read(folder: Path) -> dict[str, Tracks]:
-    """Every finished file's tracks, by its name and kind."""
+def read(folder: Path, names: Iterable[str]) -> dict[str, Tracks]:
+    """The tracks of these files, by name and kind, in alphabetical order."""
     found = {}
-    for done in sorted(folder.glob("*.done")):
-        for path in sorted(folder.glob(f"{done.stem}.*.npz")):
+    for name in sorted(names):
+        for path in sorted(folder.glob(f"{name}.*.npz")):
             with np.load(path) as archive:
                 found[path.stem] = Tracks(**dict(archive))
     return found

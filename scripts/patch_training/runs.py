@@ -5,14 +5,17 @@ from __future__ import annotations
 import argparse
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from training_blocks import block_list
 from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
+
+from patch_training.data import GROUPS
 
 DECAY, CLIP = 0.998, 5.0
 # Patches at once through a network: their answers stay in the cache, and batch norm's statistics are of so many.
@@ -26,9 +29,14 @@ def add_arguments(parser: argparse.ArgumentParser, *, others: str, steps: int, b
     add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
     add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
     add("--reference", type=Path, help=f"folder of other {others}' weights, to compare with")
-    add("--blocks", default="0-47", help="rendered blocks by number, as 0-4,29-47; those left out are left out")
+    add(
+        "--blocks",
+        type=block_list,
+        default="0-47",
+        help="rendered blocks by number, as 0-4,29-47; those left out are left out",
+    )
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
-    add("--groups", type=int, default=960, help="groups of homography views, a multiple of 40")
+    add("--groups", type=int, default=960, help=f"groups of homography views, a multiple of {GROUPS}")
     add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
     add("--seed", type=int, default=0)
     add("--steps", type=int, default=steps)
@@ -39,9 +47,20 @@ def add_arguments(parser: argparse.ArgumentParser, *, others: str, steps: int, b
     add("--out", type=Path, required=True)
 
 
-def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """The arguments of a run, its folders filled in; refuses to go on with another one."""
+def parsed(parser: argparse.ArgumentParser, peers: Iterable[str]) -> argparse.Namespace:
+    """The arguments of a run, its folders filled in; refuses what is not there, and to go on with another run.
+
+    peers: files that --reference must hold.
+    """
     args = parser.parse_args()
+    for name in args.real.split(","):
+        if not (args.data / name / "images").is_dir():
+            parser.error(f"{args.data / name} has no folder images; see --data and --real")
+    for file in peers if args.reference is not None else ():
+        if not (args.reference / file).is_file():
+            parser.error(f"{args.reference / file} is missing; --reference may be left out")
+    if args.groups % GROUPS:
+        parser.error(f"--groups {args.groups} is no multiple of {GROUPS}")
     args.patches, args.rendered = args.patches or args.out / "data", args.rendered or args.out / "blocks"
     torch.set_num_threads(args.jobs)
     check_recipe(parser, args, OF_RUN)

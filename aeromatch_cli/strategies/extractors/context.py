@@ -82,7 +82,8 @@ def context_inputs_of_coarse(
     # Few keypoints: the last neighbour again, or the keypoint itself.
     near = near if near.shape[1] else np.arange(len(points))[:, None]
     near = np.pad(near, ((0, 0), (0, NEIGHBOURS - near.shape[1])), mode="edge")
-    places = (2.0 * points + 1.0) / np.array(size_px, np.float32) - np.float32(1.0)
+    shrunk = np.array(coarse.shape[::-1], np.float32) / np.array(size_px, np.float32)
+    places = (points + np.float32(0.5)) * shrunk - np.float32(0.5)
     neighbours = torch.from_numpy(near.astype(np.int64))
     angles = torch.from_numpy(np.deg2rad(raw.orientations_deg).astype(np.float32))
     sizes = torch.from_numpy(raw.sizes_px.astype(np.float32))

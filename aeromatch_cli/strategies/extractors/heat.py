@@ -22,7 +22,7 @@ SIZE_PX = 7.5
 # Pixels of a level that the network works on at once: what its layers hold stays small.
 TILE_AREA_PX = 500_000
 _TILE_MARGIN_PX = 64
-# Closer to a level's edge the zeros that the layers put around it are seen.
+# Closer to a level's edge the zeros that the layers put around it make maxima of their own.
 BORDER_PX = 4
 # Of 5 x 5 pixels, in gray levels: with less there is nothing but rounding.
 _LEAST_CONTRAST = 3
@@ -45,7 +45,7 @@ def heat_keypoints(
 
     Confidence is the heat, lowered where a level is coarse: what fine and coarse keypoints are compared by.
 
-    valid: (H, W) where the picture shows something; keypoints whose size reaches beyond are left out.
+    valid: (H, W) where the picture shows something; keypoints closer to its edge than their size are left out.
     network: a Detector, by default the shipped one. The result does not depend on tiles.
     """
     from aeromatch_cli.nets.detector import load_detector
@@ -119,10 +119,10 @@ def maxima(levels: Sequence[Level], maps: Sequence[Logits]) -> tuple[FloatArray,
 
 
 def refined(logits: Logits, x: IntArray, y: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Steps (N, 2), x and y, at most one pixel, from pixels (N,) to the tops of paraboloids, and their heights (N,).
+    """Steps (N, 2), x and y, at most one pixel, from pixels (N,) to the tops of paraboloids, and log odds there (N,).
 
     The paraboloid is the least-squares one through 3 x 3 pixels: the log of a Gaussian is one, and so are the log odds
-    of a low one. Where it has no top, the step is 0.
+    of a low one. Where it has no top, the step is 0. Log odds are the pixel's own, and what the paraboloid rises by.
     """
     v = [[logits[y + dy, x + dx].astype(np.float64) for dx in (-1, 0, 1)] for dy in (-1, 0, 1)]
     columns, rows = [v[0][k] + v[1][k] + v[2][k] for k in range(3)], [sum(row) for row in v]
@@ -145,7 +145,10 @@ def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
 
 
 def _within(valid: BoolArray | None, points_px: FloatArray, sizes_px: FloatArray) -> BoolArray:
-    """Which keypoints (N,) see nothing but what the picture shows: a mask's edge is no texture."""
+    """Which keypoints (N,) lie farther than their size inside what the picture shows: a mask's edge is no texture.
+
+    Their patches, of more than three sizes to either side, may reach over it.
+    """
     if valid is None or bool(valid.all()):
         return np.ones(len(points_px), bool)
     import cv2

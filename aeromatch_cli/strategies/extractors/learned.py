@@ -36,7 +36,7 @@ _CHOICE = 8
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(
@@ -88,6 +88,12 @@ class Learned(Described):
             )
         for name in own:
             self._network(name)
+        if self.context and "geodesc" in own and "context" not in own:
+            raise ConfigError(
+                f"extract.weights {self.weights!r} holds descriptors of your own, geodesc.safetensors, and no "
+                "context.safetensors that was trained on them: make it by scripts/train_context.py --weights, or set "
+                "extract.context=false"
+            )
 
     def own_weights(self) -> tuple[str, ...]:
         """Those in the folder that this recipe reads."""
