@@ -1,5 +1,6 @@
 """scripts/bench_rectification: Jacobians of mappings that are known, and the table, by hand."""
 
+import argparse
 import math
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 
 from aeromatch_cli.data import Camera, View
 from aeromatch_cli.geometry.frames import apply_homography
+from aeromatch_cli.synthetic import render_block
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 CAMERA = Camera("SIMPLE_PINHOLE", 200, 150, (180.0, 100.0, 75.0))
@@ -118,3 +120,14 @@ def test_the_table_counts_pairs_within_the_goal(bench):
     assert "| all | `ground` | 4 | 1.20 | 1.28 | 50 % | 2.0 | 10.0 | 50 % | 25 % | 1.10 | 1 |" in lines
     assert rows[-1].listed()["scale"] is None
     assert rows[0].listed()["pair"] == ("a", "b")
+
+
+def test_rectified_views_of_a_rendered_block_agree_in_scale_and_turn(bench, tmp_path):
+    """With exact poses every pair keeps the limits that nine of ten have to; as taken, few do."""
+    render_block(tmp_path, "suburb", seed=2, width_px=160, height_px=120, images=10, flight="oblique")
+    args = argparse.Namespace(simulators="none,neighbours", seed=0, pairs=99, exact=True)
+    rows = list(bench.rows_of(tmp_path, "suburb", args))
+    within = {name: [row.within for row in rows if row.simulator == name] for name in ("none", "neighbours")}
+    assert len(within["neighbours"]) >= 6
+    assert all(within["neighbours"])
+    assert sum(within["none"]) <= 0.5 * len(within["none"])
