@@ -29,10 +29,11 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from common import errors_as_exits
 from context_training.data import ContextPair, ViewSeen, block_pairs
 from context_training.validation import compared
 from torch import Tensor
-from training_blocks import LEFT_OUT, block_list, numbers, render
+from training_blocks import LEFT_OUT, add_blocks, numbers, render
 from training_runs import (
     Log,
     at_least_one,
@@ -45,7 +46,6 @@ from training_runs import (
     training_device,
 )
 
-from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.context import Context
 from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
@@ -170,12 +170,7 @@ def one_block(out: Path, rendered: Path, weights: Path | None, index: int) -> No
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add(
-        "--blocks",
-        type=block_list,
-        default="0-47",
-        help="rendered blocks by number, as 0-4,29-47; validation is on those left out",
-    )
+    add_blocks(parser)
     add("--weights", type=Path, help="folder of your own networks, as `extract.weights` takes it; default: what ships")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--pairs", type=at_least_one, default=6_000, help="to be seen")
@@ -185,10 +180,8 @@ def main() -> None:
     add("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.weights is not None:
-        try:
+        with errors_as_exits():
             Learned(weights=str(args.weights)).check_files(Learned.descriptor_length)
-        except ConfigError as error:
-            parser.error(str(error))
     check_recipe(parser, args, OF_RUN)
     wanted = sorted({*numbers(args.blocks), *LEFT_OUT})
     (args.out / "data").mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from patch_training.data import prepare
+from patch_training.data import prepare, read
 from patch_training.draws import Source, distinct, drawn, looked_at, sources_of
 from patch_training.loss import descriptor_loss
 from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
@@ -117,16 +117,17 @@ def main() -> None:
     known, unseen = prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     if args.only_data:
         return
+    patches = read(args.patches / "unseen", unseen)
     run = Run.begin(args.out / "state.pt", GeoDesc, args.rate, args.seed)
-    quick = pairs_of(unseen, QUICK)[::5]
+    quick = pairs_of(patches, QUICK)[::5]
     if args.only_table and not run.log:
         parser.error(f"--only-table: {args.out} has no state of a training yet")
-    if not args.only_table and not train(run, sources_of(known), quick, args):
-        print(f"ended by --minutes after step {run.step} of {args.steps}: the same command goes on, and writes weights")
+    if not args.only_table and not train(run, sources_of(read(args.patches / "known", known)), quick, args):
+        run.tell_unfinished(args.steps)
         return
     ship(fold(run.average.eval(), GeoDesc(folded=True)), args.out / "geodesc.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
-    compare(run, pairs_of(unseen), args.out, args.reference)
+    compare(run, pairs_of(patches), args.out, args.reference)
     others = {way: table(peer, quick)["all"] for way, peer in peers(args.reference).items()}
     values = {name: [row["unseen"][name] for row in run.log] for name in ("fpr95", "map")}
     lines = {f"{way} {name}": rows[name] for way, rows in others.items() for name in values}

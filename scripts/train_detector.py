@@ -30,16 +30,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from common import errors_as_exits
 from detector_training.groups import SIDE_PX, Gray, Group, block_group, homography_group, pictures
 from detector_training.loss import at, drawn, label_loss, peaks, repeat_loss
 from detector_training.scenes import Sight, read_sights, sights, write_sights
 from detector_training.shapes import shape
 from detector_training.validation import by_heat, by_sift, pairs_of, scores, table, thinned
 from torch import Tensor
-from training_blocks import LEFT_OUT, block_list, numbers, render
+from training_blocks import LEFT_OUT, add_blocks, block_list, numbers, render
 from training_runs import (
     Log,
     at_least_one,
+    check_images,
     check_recipe,
     descend,
     follow,
@@ -49,7 +51,6 @@ from training_runs import (
     training_device,
 )
 
-from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.detector import REACH_PX, Detector, load_detector
 
 DECAY, CLIP = 0.995, 1.0
@@ -302,19 +303,15 @@ def prepared_views(args: argparse.Namespace, blocks: list[int]) -> list[list[Sig
 
 def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     """Refuses what cannot be trained on, and to go on with another run's state."""
-    for name in args.trained_on.split(","):
-        if not (args.data / name / "images").is_dir():
-            parser.error(f"{args.data / name} has no folder images; see --data and --trained-on")
+    check_images(parser, args.data, args.trained_on.split(","), "--data and --trained-on")
     shared = {*LEFT_OUT, *numbers(args.unseen)} & set(numbers(args.blocks))
     if shared:
         parser.error(f"--blocks {args.blocks}: {', '.join(map(str, sorted(shared)))} are for validation")
     if args.validate is None:
         check_recipe(parser, args, OF_RUN)
         return
-    try:
+    with errors_as_exits():
         load_detector(args.validate, "bfloat16")
-    except ConfigError as error:
-        parser.error(str(error))
 
 
 def validate(args: argparse.Namespace, unseen: list[list[Sight]]) -> None:
@@ -329,12 +326,7 @@ def main() -> None:
     add = parser.add_argument
     add("--data", type=Path, required=True, help="folder of real blocks, each with a folder images")
     add("--trained-on", default="sheffield,caliterra,seneca,brighton", help="real blocks whose pictures are warped")
-    add(
-        "--blocks",
-        type=block_list,
-        default="0-15,17,19-39,41,43-47",
-        help="numbers of the rendered blocks (training_blocks)",
-    )
+    add_blocks(parser, "0-15,17,19-39,41,43-47")
     add("--unseen", type=block_list, default="16,18,40,42,209", help="rendered blocks for validation only")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--keypoints", type=int, default=400, help="of validation, in the overlap")

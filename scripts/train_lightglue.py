@@ -37,6 +37,7 @@ from training_blocks import LEFT_OUT
 from training_runs import (
     Log,
     at_least_one,
+    check_images,
     check_recipe,
     descend,
     follow,
@@ -275,9 +276,8 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
     known, unseen = args.trained_on.split(","), args.unseen.split(",")
     if both := set(known) & set(unseen):
         parser.error(f"{', '.join(sorted(both))}: in --trained-on and --unseen; validation must not know it")
+    check_images(parser, args.data, (*known, *unseen), "--data, --trained-on and --unseen")
     for name in (*known, *unseen):
-        if not (args.data / name / "images").is_dir():
-            parser.error(f"{args.data / name} has no folder images; see --data, --trained-on and --unseen")
         if not pictures([args.data / name]):
             parser.error(f"{args.data / name / 'images'} holds no picture")
     if args.start is not None:

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from patch_training.data import prepare
+from patch_training.data import prepare, read
 from patch_training.draws import Source, developed, drawn, photographed, sources_of
 from patch_training.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from patch_training.turns import (
@@ -135,14 +135,15 @@ def main() -> None:
     add_arguments(parser, others="networks", steps=5000, batch=128)
     args = parsed(parser, (PEER,))
     known, unseen = prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
+    patches = read(args.patches / "unseen", unseen)
     run = Run.begin(args.out / "state.pt", OrientationNet, args.rate, args.seed)
-    quick = unseen_pairs(unseen, EACH // 5)
-    if not train(run, sources_of(known), quick, args):
-        print(f"ended by --minutes after step {run.step} of {args.steps}: the same command goes on, and writes weights")
+    quick = unseen_pairs(patches, EACH // 5)
+    if not train(run, sources_of(read(args.patches / "known", known)), quick, args):
+        run.tell_unfinished(args.steps)
         return
     ship(fold(run.average.eval(), OrientationNet(folded=True)), args.out / "orientation.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
-    compare(run, unseen_pairs(unseen, EACH), args.out, args.reference)
+    compare(run, unseen_pairs(patches, EACH), args.out, args.reference)
     others = {way: table(peer, quick)["all"] for way, peer in peers(args.reference).items()}
     names = [name for name in run.log[-1]["unseen"] if name.startswith("within")]
     values = {name: [row["unseen"][name] for row in run.log] for name in names}

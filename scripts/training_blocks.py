@@ -44,6 +44,11 @@ def numbers(text: str) -> list[int]:
     return sorted(found)
 
 
+def add_blocks(parser: argparse.ArgumentParser, default: str = "0-47") -> None:
+    """The argument --blocks."""
+    parser.add_argument("--blocks", type=block_list, default=default, help="rendered blocks by number, as 0-4,29-47")
+
+
 def block_list(text: str) -> str:
     """For argparse: the text, if `numbers` reads it."""
     try:

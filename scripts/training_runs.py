@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,13 @@ def at_least_one(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value
+
+
+def check_images(parser: argparse.ArgumentParser, data: Path, names: Iterable[str], options: str) -> None:
+    """Refuses real blocks without a folder of images. options: those that name folder and blocks."""
+    for name in names:
+        if not (data / name / "images").is_dir():
+            parser.error(f"{data / name} has no folder images; see {options}")
 
 
 def check_recipe(parser: argparse.ArgumentParser, args: argparse.Namespace, names: Sequence[str]) -> None:

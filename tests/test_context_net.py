@@ -15,7 +15,7 @@ from context_training.validation import compared
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeromatch_cli.nets.context import NEIGHBOURS, Context, VisualContext, evened, layout_of, load_context
+from aeromatch_cli.nets.context import NEIGHBOURS, Context, evened, layout_of, load_context
 from aeromatch_cli.strategies.extractors.context import as_bytes, context_inputs, from_bytes
 from aeromatch_cli.strategies.extractors.detection import Raw
 
@@ -60,12 +60,10 @@ def test_only_keypoints_near_a_change_of_the_picture_notice_it() -> None:
 
 def test_visual_context_is_taken_where_the_keypoint_lies() -> None:
     """Of a coarse picture with one bright pixel, untrained layers answer most at its own place, whatever its size."""
-    visual = VisualContext()
-    for layer in visual.layers[::2]:
+    network = Context()
+    for layer in network.visual.layers[::2]:
         torch.nn.init.constant_(layer.weight, 0.1)
         torch.nn.init.zeros_(layer.bias)
-    network = Context()
-    network.visual.layers = visual.layers
     for height, width in ((160, 200), (161, 203)):
         x, y = torch.meshgrid(torch.arange(0.0, width), torch.arange(0.0, height), indexing="xy")
         places = torch.stack([x.ravel(), y.ravel()], dim=1)

@@ -155,7 +155,7 @@ def test_a_folder_of_patches_serves_several_recipes(
         args = argparse.Namespace(blocks=blocks, groups=groups, seed=seed, jobs=1)
         known, unseen = data.prepare(tmp_path / "data", tmp_path, tmp_path, real.split(","), args)
         assert len(unseen) == len(data.UNSEEN) + 1
-        return sorted(known)
+        return sorted(data.read(tmp_path / "data" / "known", known))
 
     first = prepared("seneca", "0-1", 80, 0)
     names = ["block-0", "block-1", "homographies-seneca-0-0", "homographies-seneca-0-1", "seneca"]

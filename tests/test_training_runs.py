@@ -97,7 +97,7 @@ def test_a_training_that_minutes_ended_writes_no_weights(
     recipe: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "block" / "images").mkdir(parents=True)
-    monkeypatch.setattr(recipe, "prepare", lambda *_: ({}, {}))
+    monkeypatch.setattr(recipe, "prepare", lambda *_: ([], []))
     monkeypatch.setattr(recipe, "train", lambda *_: False)
     for pairs in ("pairs_of", "unseen_pairs"):
         monkeypatch.setattr(recipe, pairs, lambda *_: [], raising=False)

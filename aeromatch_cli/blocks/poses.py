@@ -259,10 +259,10 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         faults.setdefault("position (0, 0), treated as unposed", {})[number] = image
         x = None
     whole = tuple(value for value in attitude if value is not None)
-    if len(whole) < len(attitude) and not lacking:
-        missing = "attitude is incomplete" if whole else "no attitude"
-        faults.setdefault(f"{missing}, position only", {})[number] = image
     if len(whole) < len(attitude):
+        if not lacking:
+            missing = "attitude is incomplete" if whole else "no attitude"
+            faults.setdefault(f"{missing}, position only", {})[number] = image
         whole = ()
     if len(whole) == 4 and abs(math.hypot(*whole) - 1.0) > 0.05:
         raise ConfigError(f"{path}, line {number}: qw,qx,qy,qz has length {math.hypot(*whole):.3g}, not 1")

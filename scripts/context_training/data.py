@@ -21,8 +21,8 @@ from aeromatch_cli.stages import simulate
 from aeromatch_cli.strategies.extractors.context import coarse_of
 from aeromatch_cli.synthetic import load_truth
 
-LEARNED = ("extract=learned", "extract.context=false")
-RECIPES = (LEARNED, (*LEARNED, "simulate=none"))
+_LEARNED = ("extract=learned", "extract.context=false")
+RECIPES = (_LEARNED, (*_LEARNED, "simulate=none"))
 KEYPOINTS, LEAST_PARTNERS = 1200, 32
 Array = NDArray[Any]
 

@@ -24,13 +24,12 @@ GROUPS = 40  # of homography views in a file
 _UNSEEN_GROUPS = 10**6
 
 
-def prepare(
-    out: Path, rendered: Path, real: Path, names: Sequence[str], args: Any
-) -> tuple[dict[str, Tracks], dict[str, Tracks]]:
-    """Tracks to learn from and those for validation, by file and kind; what is not there yet is made.
+def prepare(out: Path, rendered: Path, real: Path, names: Sequence[str], args: Any) -> tuple[list[str], list[str]]:
+    """Names of the files to learn from, in OUT/known, and of those for validation, in OUT/unseen; those that are not
+    there yet are made.
 
-    out: its folders known and unseen have the files. rendered: where blocks of training_blocks are or go, args.blocks
-    their numbers. real: folder of the real blocks `names`; of them args.groups groups of homography views.
+    rendered: where blocks of training_blocks are or go, args.blocks their numbers. real: folder of the real blocks
+    `names`; of them args.groups groups of homography views.
     """
     paths = pictures(real / name for name in names)
     known: dict[str, Make] = {name: partial(sources.reference, real / name, name) for name in names}
@@ -48,7 +47,7 @@ def prepare(
     for folder, _ in parts:
         folder.mkdir(parents=True, exist_ok=True)
     mapped(_call, jobs, args.jobs)
-    return read(out / "known", known), read(out / "unseen", unseen)
+    return list(known), list(unseen)
 
 
 def learnt_from(text: str) -> list[int]:

@@ -12,8 +12,18 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from training_blocks import block_list
-from training_runs import Log, check_recipe, descend, follow, load_state, save_state, shipped, training_device
+from training_blocks import add_blocks
+from training_runs import (
+    Log,
+    check_images,
+    check_recipe,
+    descend,
+    follow,
+    load_state,
+    save_state,
+    shipped,
+    training_device,
+)
 
 from patch_training.data import GROUPS
 
@@ -29,12 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser, *, others: str, steps: int, b
     add("--data", type=Path, required=True, help="folder of real blocks, each with folders images and reference")
     add("--real", default="sheffield,caliterra,seneca,brighton", help="real blocks to learn from")
     add("--reference", type=Path, help=f"folder of other {others}' weights, to compare with")
-    add(
-        "--blocks",
-        type=block_list,
-        default="0-47",
-        help="rendered blocks by number, as 0-4,29-47; those left out are left out",
-    )
+    add_blocks(parser)
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--groups", type=int, default=960, help=f"groups of homography views, a multiple of {GROUPS}")
     add("--patches", type=Path, help="where patches are, or go (default OUT/data)")
@@ -53,9 +58,7 @@ def parsed(parser: argparse.ArgumentParser, peers: Iterable[str]) -> argparse.Na
     peers: files that --reference must hold.
     """
     args = parser.parse_args()
-    for name in args.real.split(","):
-        if not (args.data / name / "images").is_dir():
-            parser.error(f"{args.data / name} has no folder images; see --data and --real")
+    check_images(parser, args.data, args.real.split(","), "--data and --real")
     for file in peers if args.reference is not None else ():
         if not (args.reference / file).is_file():
             parser.error(f"{args.reference / file} is missing; --reference may be left out")
@@ -91,6 +94,10 @@ class Run:
     @property
     def device(self) -> torch.device:
         return next(self.network.parameters()).device
+
+    def tell_unfinished(self, steps: int) -> None:
+        """What a call that --minutes ended says."""
+        print(f"ended by --minutes after step {self.step} of {steps}: the same command goes on, and writes weights")
 
     def save(self, path: Path) -> None:
         save_state(path, self.step, self.log, self.network, self.average, self.optimiser)
