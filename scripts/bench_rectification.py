@@ -1,7 +1,8 @@
 """What scale and rotation remain between the views of two oblique pictures, by exact truth.
 
 Rendered blocks of a five-camera rig (flight `oblique`), pairs that overlap by a fifth at least, as many of each class
-of view angle as asked. Views are made by the simulators of --simulators from poses with the block's noise; with `none`
+of view angle as asked. The blocks of one seed share the noise of their poses, picture by picture: several seeds are as
+many draws of it. Views are made by the simulators of --simulators from poses with the block's noise; with `none`
 the pictures are compared as they were taken. A pair is compared in those of its like views that show most of the
 overlap.
 
@@ -22,7 +23,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
 from aeromatch_cli.stages import simulate
+from aeromatch_cli.strategies.matchers.search import Search
+from aeromatch_cli.strategies.matchers.views import alike
 from aeromatch_cli.synthetic import Truth, load_truth
 from aeromatch_cli.workspace import stable_hash
 
@@ -53,7 +56,6 @@ _SAMPLES, _STEP_PX = 2048, 0.5
 _FEWEST = 12  # points that a pair's medians are taken over
 # Forward and backward differences may differ by this share of the Jacobian's norm.
 _SMOOTH = 0.2
-_LIKE_DEG = 5.0  # of `match.max_direction_deg`
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Row:
     """One pair under one simulator. points: that the medians are of, NaN below 12 of them."""
 
     scene: str
+    seed: int
     pair: tuple[str, str]
     view_angle_deg: float
     view_angle_class: str
@@ -136,45 +139,48 @@ def figures(found: FloatArray) -> tuple[float, float, float]:
     return float(medians[0]), float(np.rad2deg(medians[1])), float(medians[2])
 
 
-def like(view0: View, view1: View) -> bool:
-    """Whether the matcher would compare two views (`matchers.views.like_views`)."""
-    if view0.world_direction is None or view1.world_direction is None:
-        return True
-    if view0.is_source or view1.is_source:
-        return view0.is_source and view1.is_source
-    return float(view0.world_direction @ view1.world_direction) >= np.cos(np.deg2rad(_LIKE_DEG)) - 1e-6
+def like(views0: Sequence[View], views1: Sequence[View]) -> BoolArray:
+    """(V0, V1) which views the matchers would compare."""
+    unknown = np.full(3, np.nan)
+    directions0, directions1 = (
+        np.array([unknown if view.world_direction is None else view.world_direction for view in views])
+        for views in (views0, views1)
+    )
+    source0, source1 = (np.array([view.is_source for view in views]) for views in (views0, views1))
+    return alike(directions0, directions1, source0, source1, Search.model_fields["max_direction_deg"].default)
 
 
 def measured(truth: Truth, sides0: Sequence[Side], sides1: Sequence[Side]) -> tuple[float, float, float, int]:
     """Figures and number of points of the like views with most points."""
     grid_px = sample_grid(sides0[0].camera, _SAMPLES)
     found: list[FloatArray] = [np.zeros((0, 2, 2))]
-    found += [jacobians(truth, a, b, grid_px) for a in sides0 for b in sides1 if like(a.view, b.view)]
+    compared = like([side.view for side in sides0], [side.view for side in sides1])
+    found += [jacobians(truth, sides0[i], sides1[j], grid_px) for i, j in np.argwhere(compared)]
     most = max(found, key=len)
     return *figures(most), len(most)
 
 
-def chosen(judge: BlockTruth, scene: str, args: argparse.Namespace) -> list[tuple[tuple[str, str], float, str]]:
-    """Pairs, their view angles and classes: at most args.pairs of each class, seeded."""
+def chosen(judge: BlockTruth, scene: str, seed: int, pairs: int) -> list[tuple[tuple[str, str], float, str]]:
+    """Pairs, their view angles and classes: at most `pairs` of each class, seeded."""
     classes: dict[str, list[tuple[tuple[str, str], float, str]]] = {name: [] for name, _ in VIEW_ANGLE_CLASSES}
     for pair in combinations(sorted(judge.cameras), 2):
         if judge.overlap_at_most(*pair) >= MIN_OVERLAP:
             found = judge.conditions(*pair)
             if found.overlap >= MIN_OVERLAP:
                 classes[found.view_angle_class].append((pair, found.view_angle_deg, found.view_angle_class))
-    rng = np.random.default_rng([args.seed, stable_hash(scene) % (1 << 32)])
-    return sorted(members[i] for members in classes.values() for i in rng.permutation(len(members))[: args.pairs])
+    rng = np.random.default_rng([seed, stable_hash(scene) % (1 << 32)])
+    return sorted(members[i] for members in classes.values() for i in rng.permutation(len(members))[:pairs])
 
 
-def rows_of(folder: Path, scene: str, args: argparse.Namespace) -> Iterator[Row]:
+def rows_of(folder: Path, scene: str, seed: int, args: argparse.Namespace) -> Iterator[Row]:
     """Of all pairs of a block under all simulators."""
     judge, truth = open_truth(folder), load_truth(folder)
-    pairs = chosen(judge, scene, args)
+    pairs = chosen(judge, scene, seed, args.pairs)
     poses = folder / (EXACT_POSES if args.exact else NOISY_POSES)
     listed = tuple(pair for pair, _, _ in pairs)
     described = Scene(scene, folder / "images", poses, folder / "block.json", judge.cameras, listed)
     for simulator in args.simulators.split(","):
-        options = Options(512, "image", THREADS, args.seed, None)
+        options = Options(512, "image", THREADS, seed, None)
         preset = Preset(described, options, preset="baseline", settings=(f"simulate={simulator}",))
         context, sides = preset.context, {}
         for name in sorted({name for pair in listed for name in pair}):
@@ -182,7 +188,7 @@ def rows_of(folder: Path, scene: str, args: argparse.Namespace) -> Iterator[Row]
             sides[name] = [Side(name, judge.cameras[name], view) for view in simulate.views_of(task)]
         for (name0, name1), angle_deg, angle_class in pairs:
             scale, turn_deg, stretch, points = measured(truth, sides[name0], sides[name1])
-            yield Row(scene, (name0, name1), angle_deg, angle_class, simulator, scale, turn_deg, stretch, points)
+            yield Row(scene, seed, (name0, name1), angle_deg, angle_class, simulator, scale, turn_deg, stretch, points)
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -224,13 +230,18 @@ def _cells(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def seed_list(text: str) -> tuple[int, ...]:
+    """As given on the command line; argparse says what is none."""
+    return tuple(int(part) for part in text.split(","))
+
+
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--simulators", default="none,ground,neighbours", help="comma-separated, with settings as for `simulate`")
     add("--scenes", help="comma-separated presets of rendered blocks")
-    add("--pairs", type=int, help="of each scene and class of view angle, at most")
-    add("--seed", type=int, default=0, help="another seed gives other scenes and pairs")
+    add("--pairs", type=int, help="of each block and class of view angle, at most")
+    add("--seeds", type=seed_list, default=(0,), help="comma-separated: each gives other scenes, poses, pairs")
     add("--size", metavar="WxH", help="of rendered images")
     add("--images", type=int, help="of each rendered block, five at every place")
     add("--exact", action="store_true", help="poses without noise")
@@ -244,7 +255,8 @@ def parse() -> argparse.Namespace:
 
 def command(args: argparse.Namespace) -> str:
     """This run's command line without machine paths."""
-    asked = f"--simulators {args.simulators} --scenes {args.scenes} --pairs {args.pairs} --seed {args.seed}"
+    seeds = ",".join(str(seed) for seed in args.seeds)
+    asked = f"--simulators {args.simulators} --scenes {args.scenes} --pairs {args.pairs} --seeds {seeds}"
     exact = " --exact" if args.exact else ""
     return f"scripts/bench_rectification {asked} --size {args.size} --images {args.images}{exact} --out DIR"
 
@@ -257,19 +269,19 @@ def main() -> None:
     (args.out / "rectification").mkdir(exist_ok=True)
     rows: list[Row] = []
     with errors_as_exits():
-        for scene in filter(None, args.scenes.split(",")):
-            print(scene, file=sys.stderr, flush=True)
+        for scene, seed in product(filter(None, args.scenes.split(",")), args.seeds):
+            print(f"{scene}, seed {seed}", file=sys.stderr, flush=True)
             folder = rendered_block(
                 args.out / "scenes",
                 scene,
-                args.seed,
+                seed,
                 "oblique",
                 size_px=size_px(args.size),
                 images=args.images,
                 jobs=THREADS,
                 code=code_digest("synthetic"),
             )
-            rows += rows_of(folder, scene, args)
+            rows += rows_of(folder, scene, seed, args)
             write_rows(args.out / "rectification" / "results.json", [row.listed() for row in rows])
     text = table(rows) + "\n"
     markers = "bench_rectification" if args.readme else None

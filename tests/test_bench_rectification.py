@@ -108,7 +108,7 @@ def test_the_views_with_most_points_are_taken(bench):
 
 
 def row(bench, scene, angle_class, simulator, scale, turn_deg):
-    return bench.Row(scene, ("a", "b"), 30.0, angle_class, simulator, scale, turn_deg, 1.1, 100)
+    return bench.Row(scene, 1, ("a", "b"), 30.0, angle_class, simulator, scale, turn_deg, 1.1, 100)
 
 
 def test_the_table_counts_pairs_within_the_goal(bench):
@@ -125,8 +125,8 @@ def test_the_table_counts_pairs_within_the_goal(bench):
 def test_rectified_views_of_a_rendered_block_agree_in_scale_and_turn(bench, tmp_path):
     """With exact poses every pair keeps the limits that nine of ten have to; as taken, few do."""
     render_block(tmp_path, "farmland", seed=2, width_px=160, height_px=120, images=10, flight="oblique")
-    args = argparse.Namespace(simulators="none,neighbours", seed=0, pairs=99, exact=True)
-    rows = list(bench.rows_of(tmp_path, "farmland", args))
+    args = argparse.Namespace(simulators="none,neighbours", pairs=99, exact=True)
+    rows = list(bench.rows_of(tmp_path, "farmland", 0, args))
     within = {name: [row.within for row in rows if row.simulator == name] for name in ("none", "neighbours")}
     assert len(within["neighbours"]) >= 6
     assert all(within["neighbours"])

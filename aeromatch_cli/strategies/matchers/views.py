@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, Features
+from aeromatch_cli.data import BoolArray, Features, FloatArray
 
 
 def like_views(features0: Features, features1: Features, max_direction_deg: float) -> BoolArray:
     """View pairs (V0, V1) worth comparing: source with source, and simulated views whose directions differ by at most
     max_direction_deg. A view of unknown direction is compared with every view.
     """
-    known0, known1 = (np.asarray(np.isfinite(f.view_directions).all(axis=1)) for f in (features0, features1))
-    source0, source1 = _is_source(features0), _is_source(features1)
+    directions0, directions1 = (np.asarray(f.view_directions, np.float64) for f in (features0, features1))
+    return alike(directions0, directions1, _is_source(features0), _is_source(features1), max_direction_deg)
+
+
+def alike(
+    directions0: FloatArray, directions1: FloatArray, source0: BoolArray, source1: BoolArray, max_direction_deg: float
+) -> BoolArray:
+    """`like_views` of views whose directions (V, 3) of length 1, NaN where unknown, and whose being the source (V,) are
+    given: (V0, V1)."""
+    known0, known1 = (np.asarray(np.isfinite(directions).all(axis=1)) for directions in (directions0, directions1))
     with np.errstate(invalid="ignore"):
-        cosines = features0.view_directions.astype(np.float64) @ features1.view_directions.astype(np.float64).T
-        alike = cosines >= np.cos(np.deg2rad(max_direction_deg)) - 1e-6
-    alike &= source0[:, None] == source1
-    alike |= source0[:, None] & source1
-    alike |= ~known0[:, None] | ~known1
-    return np.asarray(alike)
+        found = directions0 @ directions1.T >= np.cos(np.deg2rad(max_direction_deg)) - 1e-6
+    found &= source0[:, None] == source1
+    found |= source0[:, None] & source1
+    found |= ~known0[:, None] | ~known1
+    return np.asarray(found)
 
 
 def appearances(features0: Features, features1: Features) -> list[BoolArray]:
