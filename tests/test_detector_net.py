@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets.detector import FIELD_PX, REACH_PX, Detector, evened, load_detector
+from aeromatch_cli.nets.detector import FIELD_PX, PIECE_PX, REACH_PX, Detector, evened, load_detector
 from aeromatch_cli.nets.weights import shipped_path
 
 
@@ -36,6 +36,13 @@ def test_a_picture_turned_by_half_has_its_heat_turned_by_half(network: Detector)
     torch.testing.assert_close(turned, network(picture), atol=1e-5, rtol=0.0)
     lopsided = network.one_way(picture.flip(2, 3)).flip(2, 3)
     assert (lopsided - network.one_way(picture)).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("size", [(PIECE_PX + 1, 3 * PIECE_PX - 5), (2 * PIECE_PX, 7)])
+def test_the_pieces_that_the_layers_work_on_change_nothing(network: Detector, size: tuple[int, int]) -> None:
+    x = evened(noise(*size))
+    whole = (network._layered(x) + network._layered(x.flip(2, 3)).flip(2, 3)) / 2.0
+    torch.testing.assert_close(network(noise(*size)), whole, atol=1e-5, rtol=0.0)
 
 
 def test_gain_and_offset_of_the_light_change_nothing() -> None:

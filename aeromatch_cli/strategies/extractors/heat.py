@@ -19,8 +19,8 @@ from aeromatch_cli.strategies.extractors.tiles import tiles
 # Diameter of a keypoint in pixels of its level: its patch is then 48 of them (pyramid.SUPPORT). 32 give 3 % more
 # correct matches on renders and 4 to 14 % fewer on photographs, whose finest detail is the camera's own.
 SIZE_PX = 7.5
-# Pixels of a level that the network works on at once: what its layers hold stays small.
-TILE_AREA_PX = 500_000
+# Pixels of a level that the network is given at once: it holds two dozen bytes for each.
+TILE_AREA_PX = 4_000_000
 _TILE_MARGIN_PX = 64
 # Closer to a level's edge the zeros that the layers put around it make maxima of their own.
 BORDER_PX = 4
