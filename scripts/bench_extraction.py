@@ -20,6 +20,8 @@ from methods.goal_tables import markdown
 from methods.results import write_rows
 from methods.worker import limit_threads
 
+from aeromatch_cli.nets.precision import has_bfloat16
+
 # Row of the table: settings of `extract`.
 VARIANTS: dict[str, dict[str, Any]] = {
     "SIFT, upright": {"name": "sift", "orientation": "upright"},
@@ -110,8 +112,10 @@ def main() -> None:
     write_rows(args.out / "extraction" / "results.json", rows)
     asked = f"--size {args.size} --keypoints {args.keypoints} --runs {args.runs} --threads {args.threads}"
     command = f"scripts/bench_extraction {asked} --seed {args.seed} --out DIR"
-    path, markers = args.out / "extraction" / "table.md", "bench_extraction" if args.readme else None
-    publish(table(rows) + "\n", path, markers, command)
+    # A processor without bfloat16 has a table of its own.
+    kind = "" if has_bfloat16() else "_float32"
+    markers = f"bench_extraction{kind}" if args.readme else None
+    publish(table(rows) + "\n", args.out / "extraction" / "table.md", markers, command)
 
 
 if __name__ == "__main__":
