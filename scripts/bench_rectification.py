@@ -36,6 +36,7 @@ from methods.results import write_rows
 from methods.scenes import EXACT_POSES, MIN_OVERLAP, NOISY_POSES, rendered_block
 from methods.sources import code_digest
 from methods.worker import limit_threads
+from training_blocks import numbers
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.evaluate import BlockTruth, open_truth
@@ -230,18 +231,13 @@ def _cells(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def seed_list(text: str) -> tuple[int, ...]:
-    """As given on the command line; argparse says what is none."""
-    return tuple(int(part) for part in text.split(","))
-
-
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--simulators", default="none,ground,neighbours", help="comma-separated, with settings as for `simulate`")
     add("--scenes", help="comma-separated presets of rendered blocks")
     add("--pairs", type=int, help="of each block and class of view angle, at most")
-    add("--seeds", type=seed_list, default=(0,), help="comma-separated: each gives other scenes, poses, pairs")
+    add("--seeds", type=numbers, default=[0], help="as 1,2 or 1-4: each gives other scenes, poses, pairs")
     add("--size", metavar="WxH", help="of rendered images")
     add("--images", type=int, help="of each rendered block, five at every place")
     add("--exact", action="store_true", help="poses without noise")

@@ -36,7 +36,7 @@ def render(out: Path, block_idx: int) -> Path:
 
 
 def numbers(text: str) -> list[int]:
-    """The blocks that `0-4,29` means."""
+    """What `0-4,29` means, each once, in order."""
     found: set[int] = set()
     for part in text.split(","):
         first, _, last = part.partition("-")

@@ -40,8 +40,7 @@ def test_a_picture_turned_by_half_has_its_heat_turned_by_half(network: Detector)
 
 @pytest.mark.parametrize("size", [(PIECE_PX + 1, 3 * PIECE_PX - 5), (2 * PIECE_PX, 7)])
 def test_the_pieces_that_the_layers_work_on_change_nothing(network: Detector, size: tuple[int, int]) -> None:
-    x = evened(noise(*size))
-    whole = (network._layered(x) + network._layered(x.flip(2, 3)).flip(2, 3)) / 2.0
+    whole = network._both_ways(evened(noise(*size)))
     torch.testing.assert_close(network(noise(*size)), whole, atol=1e-5, rtol=0.0)
 
 

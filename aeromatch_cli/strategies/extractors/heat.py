@@ -19,7 +19,7 @@ from aeromatch_cli.strategies.extractors.tiles import tiles
 # Diameter of a keypoint in pixels of its level: its patch is then 48 of them (pyramid.SUPPORT). 32 give 3 % more
 # correct matches on renders and 4 to 14 % fewer on photographs, whose finest detail is the camera's own.
 SIZE_PX = 7.5
-# Pixels of a level that the network is given at once: it holds two dozen bytes for each.
+# Pixels of a level that the network is given at once: bounds its memory. On a CPU it cuts them into pieces itself.
 TILE_AREA_PX = 4_000_000
 _TILE_MARGIN_PX = 64
 # Closer to a level's edge the zeros that the layers put around it make maxima of their own.
