@@ -24,8 +24,8 @@ import typer
 from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
+from aeromatch_cli.cli.log import RecordedProgress, logged_to, record
 from aeromatch_cli.errors import AeromatchError, ConfigError
-from aeromatch_cli.record import RecordedProgress, logged_to, record
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result

@@ -8,7 +8,7 @@ import numpy as np
 from conftest import QUICK, Site, invoke
 from PIL import Image
 
-from aeromatch_cli.config_text import default_yaml
+from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.workspace import read_json
 

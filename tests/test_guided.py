@@ -10,10 +10,10 @@ from aeromatch_cli.data import Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project, undistort
 from aeromatch_cli.geometry.epipolar import essential, relative_pose
 from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, search_windows, stereo_of
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
-from aeromatch_cli.strategies.matchers.evidence import most_evident
-from aeromatch_cli.strategies.matchers.guided import SecondSearch, nearby
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
+from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch, nearby
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1000, 750, (900.0, 500.0, 375.0, -0.03))
 DOWN = np.diag([1.0, -1.0, -1.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.images import render_view
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.stages.simulate import ViewCost, cost_facts
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.simulators.tilts import Tilts

@@ -7,7 +7,7 @@ import pytest
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.warps import area_scale, source_from_view, view_from_source
-from aeromatch_cli.images import render_view
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.strategies.simulators.tilts import Tilts
 
 PINHOLE = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))

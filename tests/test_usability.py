@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 from conftest import IMAGES
 from make_images import write_image
+from read_inputs import read_inputs
 
 from aeromatch_cli import __version__
 from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.ground import ConstantGround
-from aeromatch_cli.blocks.read import BlockInputs, read_block_inputs
+from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.stages import report_map
 from aeromatch_cli.strategies.extractors.sift import Sift
 
@@ -165,7 +166,7 @@ def read_grid(folder: Path, crs: str, *positions: tuple[float, float]) -> BlockI
         write_image(folder / f"{index}.jpg")
         lines.append(f"{index}.jpg,{x},{y},100")
     (folder / "poses.csv").write_text("\n".join(lines) + "\n")
-    return read_block_inputs(folder, str(folder / "poses.csv"), crs=crs, sigma_position_m=1.0, sigma_angle_deg=1.0)
+    return read_inputs(folder, folder / "poses.csv", crs=crs)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32617", "auto"])

@@ -22,8 +22,8 @@ from aeromatch_cli.nets.lightglue_batch import match_batch
 from aeromatch_cli.nets.lightglue_file import load_lightglue
 from aeromatch_cli.nets.precision import has_bfloat16, layer_type
 from aeromatch_cli.stages import extract
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue as Matcher
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue as Matcher
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair, prepared
 

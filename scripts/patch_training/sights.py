@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
-from aeromatch_cli.images import shrink_camera
+from aeromatch_cli.images.scaling import shrink_camera
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, Level, levels_of
 from aeromatch_cli.strategies.extractors.sift import Sift

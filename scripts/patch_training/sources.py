@@ -15,7 +15,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages import pairs
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT

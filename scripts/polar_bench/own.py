@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
-from aeromatch_cli.images import shrink
+from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.lattice import Lattice
 from aeromatch_cli.strategies.matchers.polar import Polar, Registered

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.strategies import Enhanced
 from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.relight import relit

@@ -11,9 +11,9 @@ from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, stereo_of
 from aeromatch_cli.geometry.two_view import TwoView
-from aeromatch_cli.strategies.matchers.assignment import is_first, one_to_one
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.evidence import evidence_of
+from aeromatch_cli.strategies.matchers.descriptors.assignment import is_first, one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined
+from aeromatch_cli.strategies.matchers.descriptors.evidence import evidence_of
 
 # Matches around a point whose heights are tried.
 _NEIGHBOURS = 6

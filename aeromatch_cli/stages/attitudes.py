@@ -17,8 +17,8 @@ from dataclasses import replace
 from typing import Any
 
 from aeromatch_cli.data import FloatArray, Pose
-from aeromatch_cli.stages.common import Context
-from aeromatch_cli.stages.rotations import contradicting_images
+from aeromatch_cli.orientation.attitudes import contradicting_images
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import fingerprint, read_json, write_json
 
 # Images that share this much of their ground and are not tied make one of them a suspect.
@@ -26,7 +26,7 @@ _SUSPICIOUS_OVERLAP = 0.3
 Rotations = Sequence[tuple[str, str, FloatArray, int]]
 
 
-def without_distrusted(context: Context) -> Context:
+def without_ignored_attitudes(context: Context) -> Context:
     """The context with its suspects, in which images whose attitude pictures contradict keep only their position."""
     record = _on_file(context)
     wrong = _standing(context, record)
@@ -38,11 +38,11 @@ def without_distrusted(context: Context) -> Context:
 
 
 def judge(context: Context, rotations: Rotations, root: Mapping[str, str] | None) -> dict[str, float]:
-    """image_id -> degrees for every image whose attitude is not to be used; written to distrusted.json with suspects.
+    """image_id -> degrees for every image whose attitude is not to be used; written to ignored_attitudes.json.
 
     rotations: (id0, id1, cam1_from_cam0, matches) of the verified pairs. root: image_id -> the image that names the
-    connected component of verified pairs that it is part of, None while pairs wait to be judged. An image that was
-    distrusted before stays so in an unchanged block, whatever is found without its attitude: otherwise runs could swing
+    connected component of verified pairs that it is part of, None while pairs wait to be judged. An attitude that was
+    ignored before stays so in an unchanged block, whatever is found without its attitude: otherwise runs could swing
     between two results.
     """
     found, before = contradicting_images(context.given_poses, rotations), _on_file(context)
@@ -55,7 +55,7 @@ def judge(context: Context, rotations: Rotations, root: Mapping[str, str] | None
     suspects = _standing_suspects(context, before) | (_untied(context, root) - angles.keys())
     facts = {i: _facts(context, i) for i in sorted(suspects)}
     record = {"fingerprint": evidence, "settings": _settings(context), "images": images, "suspects": facts}
-    write_json(context.workspace.distrusted, record)
+    write_json(context.workspace.ignored_attitudes, record)
     return angles
 
 
@@ -84,7 +84,7 @@ def _standing_suspects(context: Context, record: dict[str, Any]) -> frozenset[st
 
 
 def _on_file(context: Context) -> dict[str, Any]:
-    path = context.workspace.distrusted
+    path = context.workspace.ignored_attitudes
     return read_json(path) if path.is_file() and not context.overwrite else {}
 
 

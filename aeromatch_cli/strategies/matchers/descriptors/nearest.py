@@ -6,8 +6,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from aeromatch_cli.strategies.matchers.comparison import RATIO, Comparison, Found, ratio_test
-from aeromatch_cli.strategies.matchers.search import Search
+from aeromatch_cli.strategies.matchers.descriptors.comparison import RATIO, Comparison, Found, ratio_test
+from aeromatch_cli.strategies.matchers.descriptors.search import Search
 
 
 class Nearest(Search):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +24,6 @@ _MAX_ERROR_PX = 3.0
 _MAX_STRAIN = 4.0
 _SIGMA_FLOOR = (np.deg2rad(0.01), 0.01)
 _MAX_UNCERTAINTY = 0.1
-
-MatchPair = Callable[[str, str], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True)
@@ -76,29 +74,29 @@ def choose_adjacent_pairs(poses: Mapping[str, Pose], seeds: int) -> list[tuple[s
     return list(chosen)
 
 
-def auto_ground(
-    pairs: Sequence[tuple[str, str]],
+def ground_height(
+    matches: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]],
     poses: Mapping[str, Pose],
     cameras: Mapping[str, Camera],
-    match_pair: MatchPair,
 ) -> GroundEstimate:
     """Height of the ground from matches of a few posed pairs, or the reason why there is none.
 
-    pairs: image ids, see `choose_adjacent_pairs`. poses, cameras: by image_id. match_pair(id0, id1): matched stored
-    pixels ((N, 2), (N, 2)); called once per pair; wrong matches may be among them.
+    matches: by the image ids of the pairs (see `choose_adjacent_pairs`), stored pixels ((N, 2), (N, 2)); wrong ones may
+    be among them. poses, cameras: by image_id.
     Each pair's poses are first fitted to its matches within their stated sigma (angles of a degree would spoil the
     height by ten percent), then its matches are triangulated; the pair gives the median height of its points. The
     result is the weighted mean of the pairs that agree. Refused: too few points, matches that contradict the poses,
     heights above the cameras, pairs that contradict each other.
     """
-    if not pairs:
+    if not matches:
         return GroundEstimate(None, "no adjacent images with attitude")
     attempts = [
-        pair_height(poses[id0], poses[id1], cameras[id0], cameras[id1], *match_pair(id0, id1)) for id0, id1 in pairs
+        pair_height(poses[id0], poses[id1], cameras[id0], cameras[id1], *points)
+        for (id0, id1), points in matches.items()
     ]
     found = [attempt for attempt in attempts if isinstance(attempt, PairHeight)]
     points = sum(pair.points for pair in found)
-    tried = f"{len(found)} of {len(pairs)} adjacent pairs"
+    tried = f"{len(found)} of {len(matches)} adjacent pairs"
     if points < _MIN_POINTS:
         causes = Counter(attempt for attempt in attempts if isinstance(attempt, str))
         why = "".join(f"; {count} x {cause}" for cause, count in sorted(causes.items()))

@@ -1,6 +1,6 @@
 """The commented default configuration, made from the schema.
 
-To bring the file up to date: `python -m aeromatch_cli.config_text > configs/default.yaml`.
+To bring the file up to date: `python -m aeromatch_cli.config.text > configs/default.yaml`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ the rest is taken from here. Paths are relative to the file that they stand in. 
 `--set extract.keypoints=8000` changes one setting, `--set match=NAME` takes another strategy, and
 `--set filter.poselib.threshold_px=2` reaches into a chain; a chain is also written NAME+NAME.
 Strategies that are not the default follow their section as comments.
-Made by `python -m aeromatch_cli.config_text`; edit the descriptions in the code, not this file."""
+Made by `python -m aeromatch_cli.config.text`; edit the descriptions in the code, not this file."""
 
 
 def default_yaml() -> str:

@@ -14,10 +14,10 @@ from aeromatch_cli.data import BoolArray, Features, FloatArray, Matches, PairGeo
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.prediction import Windows, search_windows
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, Where
-from aeromatch_cli.strategies.matchers.guided import SecondSearch
-from aeromatch_cli.strategies.matchers.views import appearances, like_views
+from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, Where
+from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
+from aeromatch_cli.strategies.matchers.descriptors.views import appearances, like_views
 
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0

@@ -7,9 +7,9 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined
-from aeromatch_cli.strategies.matchers.scan import mutual_nearest, ratios_of
-from aeromatch_cli.strategies.matchers.search import Search
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined
+from aeromatch_cli.strategies.matchers.descriptors.scan import mutual_nearest, ratios_of
+from aeromatch_cli.strategies.matchers.descriptors.search import Search
 
 
 class Bidirectional(Search):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
-    from aeromatch_cli.executor import Progress
+    pass
 
 LOGGER = "aeromatch"
 # What the screen shows in its own way: for the log file only.
@@ -48,25 +47,3 @@ def logged_to(log_file: Path | None, *, quiet: bool) -> Iterator[None]:
         for handler in handlers:
             logger.removeHandler(handler)
             handler.close()
-
-
-class RecordedProgress:
-    """Another progress, whose beginnings and ends go to the log file too."""
-
-    def __init__(self, shown: Progress) -> None:
-        self._shown = shown
-
-    def start(self, label: str, total: int) -> None:
-        self._label, self._total, self._count, self._started = label, total, 0, time.monotonic()
-        record.info("%s: %d to do", label, total)
-        self._shown.start(label, total)
-
-    def advance(self) -> None:
-        self._count += 1
-        self._shown.advance()
-
-    def stop(self) -> None:
-        self._shown.stop()
-        record.info(
-            "%s: %d of %d tried in %.1f s", self._label, self._count, self._total, time.monotonic() - self._started
-        )

@@ -12,8 +12,8 @@ from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.planes import plane_distances_px
 from aeromatch_cli.geometry.prediction import Windows
 from aeromatch_cli.geometry.two_view import H_SAMPLE, Sampling, chance_errors_px, log10_false_alarms
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
-from aeromatch_cli.strategies.matchers.evidence import LOG10_FALSE_ALARMS, MIN_INLIERS
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.descriptors.evidence import LOG10_FALSE_ALARMS, MIN_INLIERS
 
 # One plane stands for the ground with all that rises over it: so far beside it, in longer sides of the box of what
 # is matched, matches lie, and so far beyond the other picture's keypoints one may seem to lie.

@@ -17,13 +17,13 @@ from pydantic import Field
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.precision import DEVICE, Device, Precision, device_of
-from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found, joined, ratio_test
-from aeromatch_cli.strategies.matchers.evidence import most_evident
-from aeromatch_cli.strategies.matchers.guided import SecondSearch
-from aeromatch_cli.strategies.matchers.inference import Shown, Wanted, check_length, ready, shown_of
-from aeromatch_cli.strategies.matchers.overlap import in_overlap
-from aeromatch_cli.strategies.matchers.search import Search, Steps
+from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
+from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
+from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
+from aeromatch_cli.strategies.matchers.descriptors.search import Search, Steps
+from aeromatch_cli.strategies.matchers.lightglue.inference import Shown, Wanted, check_length, ready, shown_of
+from aeromatch_cli.strategies.matchers.lightglue.overlap import in_overlap
 
 # Cost at least of matches that are there without the network's having found them, beside those of 1 - probability.
 _DOUBTFUL = 0.7
@@ -81,7 +81,8 @@ class LightGlue(Search):
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
-        from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE, resolve_weights
+        from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
+        from aeromatch_cli.nets.folder import resolve_weights
 
         if self.weights is not None:
             return (str(resolve_weights(self.weights)),)

@@ -11,8 +11,8 @@ from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import sampson_distance_px
 from aeromatch_cli.geometry.two_view import Sampling, TwoView, chance_errors_px, estimate, log10_false_alarms
-from aeromatch_cli.strategies.matchers.assignment import one_to_one
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
 
 # Fewer matches support no model, whatever the odds that chance gives it.
 MIN_INLIERS = 12

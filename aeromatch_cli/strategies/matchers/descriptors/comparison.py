@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, PairGeometry
 from aeromatch_cli.geometry.prediction import Windows
-from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
 
 # Largest distance to the nearest over that to the next other keypoint, where nothing else is said.
 RATIO = 0.8

@@ -13,10 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli import tiff
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.images import shrink_in_strips
-from aeromatch_cli.stages.enhance import EnhanceTask, load_source, without_frames
+from aeromatch_cli.images import tiff
+from aeromatch_cli.images.masks import without_frames
+from aeromatch_cli.images.scaling import shrink_in_strips
+from aeromatch_cli.images.source import Source, read_source
 
 Picture = tuple[NDArray[Any], BoolArray | None]
 T = TypeVar("T")
@@ -35,13 +36,13 @@ _KNOWN = 0.999  # of the area of a reduced pixel
 class StoredRaster:
     """`data.Raster` of an image as it was taken, read when it is needed."""
 
-    def __init__(self, task: EnhanceTask) -> None:
-        self._task = task
-        self.width_px, self.height_px = task.camera.width_px, task.camera.height_px
-        self.finest = task.scale
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.width_px, self.height_px = source.camera.width_px, source.camera.height_px
+        self.finest = source.scale
 
     def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
-        return _kept(_reduced, (self._task.fingerprint, scale), _KEPT_REDUCED, lambda: self._made(scale))
+        return _kept(_reduced, (self._source.fingerprint, scale), _KEPT_REDUCED, lambda: self._made(scale))
 
     def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
         unit = self._unit()
@@ -66,13 +67,17 @@ class StoredRaster:
 
     def _unit(self) -> float | None:
         """What values of a TIFF that is read by parts are multiplied with; None where it is decoded whole."""
-        return _kept(_units, self._task.fingerprint, _KEPT_UNITS, self._glanced)
+        return _kept(_units, self._source.fingerprint, _KEPT_UNITS, self._glanced)
 
     def _glanced(self) -> float | None:
-        task = self._task
-        if task.path.suffix.lower() not in tiff.SUFFIXES or task.mask is not None or task.sky_rotation is not None:
+        source = self._source
+        if (
+            source.path.suffix.lower() not in tiff.SUFFIXES
+            or source.mask is not None
+            or source.sky_rotation is not None
+        ):
             return None
-        if tiff.tiff_size(task.path) != (self.width_px, self.height_px) or tiff.may_have_a_mask(task.path):
+        if tiff.tiff_size(source.path) != (self.width_px, self.height_px) or tiff.may_have_a_mask(source.path):
             return None  # where all is decoded the size is judged, and whether the last band is a mask
         small, valid = self._of_parts(_GLANCE, 1.0)
         if without_frames(small) is not None or (valid is not None and not valid.any()):
@@ -99,7 +104,7 @@ class StoredRaster:
         return small, np.asarray(shrink_in_strips(read_known, size, scale) > _KNOWN)
 
     def _part(self, part: tuple[int, int, int, int], unit: float) -> tuple[NDArray[np.float32], BoolArray | None]:
-        pixels, valid = tiff.read_tiff(self._task.path, part)
+        pixels, valid = tiff.read_tiff(self._source.path, part)
         gray = _gray(pixels).astype(np.float32) * np.float32(unit)
         if valid is None or valid.all():
             return gray, None
@@ -108,12 +113,12 @@ class StoredRaster:
 
     def _whole(self) -> Picture:
         """(H, W) gray at the working scale and where it is valid."""
-        return _kept(_wholes, self._task.fingerprint, _KEPT, self._decoded)
+        return _kept(_wholes, self._source.fingerprint, _KEPT, self._decoded)
 
     def _decoded(self) -> Picture:
         # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
-        straight = self._task.path.suffix.lower() in (".jpg", ".jpeg")
-        pixels, valid = load_source(self._task, colour=not straight)
+        straight = self._source.path.suffix.lower() in (".jpg", ".jpeg")
+        pixels, valid = read_source(self._source, colour=not straight)
         return _gray(pixels), valid
 
 
