@@ -7,12 +7,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from aeromatch_cli.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 LOGGER = "aeromatch"
 # What the screen shows in its own way: for the log file only.

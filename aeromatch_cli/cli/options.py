@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    pass
-
 
 Config = Annotated[str, typer.Argument(metavar="CONFIG|PRESET", help="YAML file or preset name.")]
 

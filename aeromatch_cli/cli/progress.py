@@ -1,4 +1,4 @@
-"""Progress: a bar on a terminal, plain lines elsewhere, and a record of it in the log file."""
+"""Progress: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from aeromatch_cli.cli.log import record
-
 if TYPE_CHECKING:
     from aeromatch_cli.executor import Progress
 
 
-def progress_shown(quiet: bool) -> Any:
+def progress_shown(quiet: bool) -> Progress:
     """How a command shows how far it is: nothing if quiet, a bar on a terminal, plain lines elsewhere."""
     from aeromatch_cli.executor import SilentProgress
 
     if quiet:
-        return RecordedProgress(SilentProgress())
-    return RecordedProgress(TerminalProgress() if sys.stderr.isatty() else LineProgress())
+        return SilentProgress()
+    return TerminalProgress() if sys.stderr.isatty() else LineProgress()
 
 
 class LineProgress:
@@ -65,25 +63,3 @@ class TerminalProgress:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
-
-
-class RecordedProgress:
-    """Another progress, whose beginnings and ends go to the log file too."""
-
-    def __init__(self, shown: Progress) -> None:
-        self._shown = shown
-
-    def start(self, label: str, total: int) -> None:
-        self._label, self._total, self._count, self._started = label, total, 0, time.monotonic()
-        record.info("%s: %d to do", label, total)
-        self._shown.start(label, total)
-
-    def advance(self) -> None:
-        self._count += 1
-        self._shown.advance()
-
-    def stop(self) -> None:
-        self._shown.stop()
-        record.info(
-            "%s: %d of %d tried in %.1f s", self._label, self._count, self._total, time.monotonic() - self._started
-        )

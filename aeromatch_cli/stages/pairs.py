@@ -54,20 +54,20 @@ def prepare(
     else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-    summary = summarise(found.block, pairs)
+    summary, pairs_csv = summarise(found.block, pairs), pairs_text(pairs)
     report.facts = {
         "summary": [*summary.lines(), *_remarks(settings, summary.oriented)],
         "block": summary.figures(),
         "warnings": [*found.warnings, *summary.warnings],
         "images": len(found.block.images),
         "ignored_attitudes": sorted(_ignored(context)),
-        "pairs_sha256": hashlib.sha256(pairs_text(pairs).encode("utf-8")).hexdigest(),
+        "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
     report.failures = list(found.failures)
     report.fingerprint = wanted
     context = replace(context, pairs=tuple(pairs))
     if not dry:
-        _write(context, found, pairs)
+        _write(context, found, pairs_csv)
         forget_absent(context)
         report.write(workspace)
     for warning in report.facts["warnings"]:
@@ -158,11 +158,15 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     return read_pairs(workspace.pairs)
 
 
-def _write(context: Context, found: BlockRead, pairs: list[Pair]) -> None:
+def _write(context: Context, found: BlockRead, pairs_csv: str) -> None:
     workspace, block = context.workspace, found.block
-    write_text(workspace.config, dump(context.settings))
+    texts = {
+        workspace.config: dump(context.settings),
+        workspace.images: images_text(block.images, context.image_fingerprints),
+        workspace.cameras: cameras_text(block.cameras),
+        workspace.poses: poses_text(block.poses),
+        workspace.pairs: pairs_csv,
+    }
     write_json(workspace.block, dict(found.record))
-    write_text(workspace.images, images_text(block.images, context.image_fingerprints))
-    write_text(workspace.cameras, cameras_text(block.cameras))
-    write_text(workspace.poses, poses_text(block.poses))
-    write_text(workspace.pairs, pairs_text(pairs))
+    for path, text in texts.items():
+        write_text(path, text)
