@@ -93,7 +93,7 @@ def test_no_enhancement_writes_no_pictures(site):
 @pytest.mark.parametrize("command", ["simulate", "extract", "run"])
 def test_the_summary_tells_what_views_cost(site, command):
     stage = "simulate" if command == "simulate" else "extract"
-    more = ("--set", "simulate.source=true")
+    more = ("--set", "simulate.keep_source=true")
     for _ in range(2):  # the second time it is up to date
         outcome = site(command, *more)
         facts = outcome.facts["stages"][stage]["facts"]

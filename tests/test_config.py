@@ -63,7 +63,7 @@ def test_other_strategies_in_default_yaml_are_valid_when_uncommented() -> None:
             if key == "filter":
                 tree[key].append("poselib")  # not every filter may stand alone
                 tree["extract"] = {"name": "sift", "colours": True}  # and one reads colours
-            if key == "extract" and tree[key]["name"] == "lattice":
+            if key == "extract" and tree[key]["name"] == "grid":
                 tree["match"] = {"name": "polar"}  # nothing else can compare what has no descriptors
             settings = validate(tree)
             strategy = getattr(settings, key)[0] if isinstance(tree[key], list) else getattr(settings, key)

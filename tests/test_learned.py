@@ -149,8 +149,8 @@ def test_flat_picture_has_no_features() -> None:
     ("extract", "match", "message"),
     [
         ("learned", "lightglue", "compares RootSIFT descriptors, extract learned makes GeoDesc; use match nearest or "),
-        ("lattice", "lightglue", "RootSIFT descriptors, extract lattice makes none; use match polar, or extract sift$"),
-        ("lattice", "nearest", "any descriptors, extract lattice makes none; use match polar, or extract sift or "),
+        ("grid", "lightglue", "RootSIFT descriptors, extract grid makes none; use match polar, or extract sift$"),
+        ("grid", "nearest", "any descriptors, extract grid makes none; use match polar, or extract sift or "),
     ],
 )
 def test_matcher_for_other_descriptors_is_refused(extract: str, match: str, message: str) -> None:

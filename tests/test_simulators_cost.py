@@ -14,7 +14,7 @@ from aeromatch_cli.strategies.simulators.tilts import Tilts
 def test_cost_is_counted_over_views() -> None:
 
     camera = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))
-    views = Tilts(levels=0, turns=4)(camera, None, None, None)
+    views = Tilts(levels=0, rotations=4)(camera, None, None, None)
     gray = np.zeros((300, 400), np.uint8)
     cost = ViewCost.of([ViewPixels(view, *render_view(gray, None, camera, view)) for view in views])
     assert cost == ViewCost(4, 0.48)

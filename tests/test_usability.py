@@ -252,7 +252,7 @@ def test_memory_estimate_counts_the_largest_view(site):
         return int(site("check", *more).facts["estimate"]["memory_mb"])
 
     # The source is view 0 beside the ground view: more pixels than either alone.
-    assert estimate("--set", "simulate.source=true") > estimate() >= estimate("--set", "simulate=none")
+    assert estimate("--set", "simulate.keep_source=true") > estimate() >= estimate("--set", "simulate=none")
 
 
 def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 STAGES = {
     "run": "Everything, over all overlapping pairs: pairs to report.",
     "pairs": "Read the block and choose the pairs.",
-    "enhance": "Write enhanced pictures; none of images that enhance.one_sun_minutes spares, none with enhance=none.",
+    "enhance": "Write enhanced pictures; none of images that need none.",
     "simulate": "Write simulated views.",
     "extract": "Find features in every image.",
     "match": "Match every pair; features that are missing are made first.",

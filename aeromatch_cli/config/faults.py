@@ -9,6 +9,8 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
+from aeromatch_cli.config.renamed import STRATEGIES, new_key
+
 Families = Mapping[str, Mapping[str, type[BaseModel]]]
 
 _LONGEST_VALUE = 60
@@ -42,12 +44,18 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
     kind = fault["type"]
     if kind == "extra_forbidden":
         siblings = _siblings(location[:-1], root, families)
+        renamed = new_key(str(location[0]), names[-1], frozenset(siblings))
+        if renamed:
+            return f"{place}: this setting is now named {renamed}; write {'.'.join([*names[:-1], renamed])}"
         owners = [name for name, strategy in family.items() if names[-1] in strategy.model_fields]
         if owners and len(names) > 1:
             return f"{place}: unknown key here, it belongs to {' and '.join(owners)}{nearest(names[-1], siblings)}"
         return f"{place}: unknown key{nearest(names[-1], siblings)}"
     if kind == "union_tag_invalid" or (kind == "literal_error" and family and location[-1] == "name"):
         name = str(fault["ctx"]["tag"] if kind == "union_tag_invalid" else fault["input"])
+        renamed = STRATEGIES.get(str(location[0]), {}).get(name)
+        if renamed:
+            return f"{place.removesuffix('.name')}: the strategy {name!r} is now named {renamed!r}"
         return f"{place.removesuffix('.name')}: no strategy is named {name!r}{nearest(name, list(family))}"
     if kind == "union_tag_not_found":
         return f"{place}: name the strategy (name: ...), one of {', '.join(family)} (got {_shown(fault['input'])})"

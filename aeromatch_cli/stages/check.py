@@ -139,7 +139,7 @@ def _pixels(image: Image, trial: _Trial) -> int:
     """What an image is worked on as: its own pixels, or those of all its views."""
     views = simulate.views_of(trial.task.views)
     enhancing = trial.task.views.enhance
-    if enhancing.enhancer.beside and not enhancing.skipped:
+    if enhancing.enhancer.keep_source and not enhancing.skipped:
         views *= 2
     return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
 

@@ -90,7 +90,7 @@ def source_of(context: Context, image: Image) -> Source:
 
 def _is_skipped(context: Context, image: Image) -> bool:
     enhancer = context.settings.enhance
-    return enhancer.beside and context.under_one_sun(image.image_id, enhancer.one_sun_minutes)
+    return enhancer.keep_source and context.under_one_sun(image.image_id, enhancer.same_illumination_minutes)
 
 
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
@@ -157,7 +157,9 @@ def run(context: Context) -> StageReport:
 
 def illumination_facts(tasks: Iterable[EnhanceTask]) -> dict[str, Any]:
     """How many of the images are skipped; {} where the settings skip none."""
-    asked = [task.skipped for task in tasks if task.enhancer.beside and task.enhancer.one_sun_minutes > 0.0]
+    asked = [
+        task.skipped for task in tasks if task.enhancer.keep_source and task.enhancer.same_illumination_minutes > 0.0
+    ]
     return {SKIPPED: sum(asked)} if asked else {}
 
 

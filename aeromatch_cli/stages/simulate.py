@@ -68,7 +68,7 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
     """
     pixels, valid, result = enhance.for_views(task.enhance)
     grays = [(to_gray8(result.pixels), False)]
-    if task.enhance.enhancer.beside and result.pixels is not pixels:
+    if task.enhance.enhancer.keep_source and result.pixels is not pixels:
         grays = [(to_gray8(pixels), False), (grays[0][0], True)]
     camera = task.enhance.source.working_camera
     views, pictures = views_of(task), []

@@ -148,7 +148,7 @@ def block_table(folder: Path, weights: Path, keypoints: int) -> str:
     """The matcher over some pairs of a rendered block, with what saves time switched on step by step; medians of the
     rounds' means.
     """
-    always = {"ample": keypoints + 1, "enough": keypoints + 1}
+    always = {"guide_below_matches": keypoints + 1, "network_below_matches": keypoints + 1}
     steps: Mapping[str, dict[str, Any]] = {
         "every keypoint": {"overlap": False, **always, **EVERYTHING},
         "+ only the predicted overlap": {**always, **EVERYTHING},

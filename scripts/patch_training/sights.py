@@ -88,7 +88,7 @@ class Sight(Picture):
 def sights_of(
     context: Context, cameras: Mapping[str, Camera] | None, poses: Mapping[str, Pose] | None, suns: Mapping[str, int]
 ) -> list[Sight]:
-    """Every image of a block as its preset looks at it; set `simulate.source=true` for the pictures as taken, too.
+    """Every image of a block as its preset looks at it; set `simulate.keep_source=true` for the pictures as taken, too.
 
     cameras, poses: the true ones by name where they are not those of the block.
     """

@@ -55,7 +55,7 @@ class Search(Strategy):
     guided: bool = Field(
         False, description="Search where the poses say, then once more around what verified matches predict."
     )
-    ample: int = Field(
+    guide_below_matches: int = Field(
         500,
         ge=1,
         description="Where so many matches are found at once, enhanced pictures and guided search are left out: they "
@@ -97,7 +97,7 @@ class Search(Strategy):
         found = self.scan(asked)
         asked = replace(asked, where=where)
         found = asked.within(found)
-        if len(found.rows) < self.ample:
+        if len(found.rows) < self.guide_below_matches:
             asked, found = yield from self._searched_harder(asked, found, enhanced)
         return _matches(asked, found)
 

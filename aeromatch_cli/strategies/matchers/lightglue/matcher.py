@@ -40,7 +40,7 @@ class LightGlue(Search):
     version: ClassVar[int] = 5
     reads_descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["lightglue"] = "lightglue"
-    enough: int = Field(
+    network_below_matches: int = Field(
         250,
         ge=1,
         description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
@@ -58,7 +58,7 @@ class LightGlue(Search):
         description="Smallest probability of a match of the network's, as far as the weights are calibrated. "
         "Matches of the other searches join whatever it is.",
     )
-    overlap: bool = Field(
+    only_overlap: bool = Field(
         True,
         description="Only keypoints that the other image may show are compared, as far as the plane of the matches "
         "found before, or else poses and ground, tell.",
@@ -77,7 +77,7 @@ class LightGlue(Search):
 
     def reads(self) -> frozenset[str]:
         """The cameras, in which a pair's matches are judged; more where guided or limited to the overlap."""
-        return self.needs if self.guided or self.overlap else frozenset({"camera"})
+        return self.needs if self.guided or self.only_overlap else frozenset({"camera"})
 
     def fingerprint_files(self) -> tuple[str, ...]:
         """Path of the file whose SHA-256 belongs to the fingerprint. Raises ConfigError where it is missing."""
@@ -114,9 +114,9 @@ class LightGlue(Search):
 
     def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
         """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""
-        if len(found.rows) >= self.enough:
+        if len(found.rows) >= self.network_below_matches:
             return found
-        shown = in_overlap(asked, found, self.windows) if self.overlap else None
+        shown = in_overlap(asked, found, self.windows) if self.only_overlap else None
         closer = yield from self.by_network(asked, shown)
         doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
         surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in self._least_probabilities()]

@@ -1,4 +1,4 @@
-"""The lattice: even, where there is texture, from the image alone."""
+"""The grid: even, where there is texture, from the image alone."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,14 @@ from make_ground import ground
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.extractors.grid import Grid
 from aeromatch_cli.strategies.simulators.none import source_view
 
 CAMERA = Camera("PINHOLE", 900, 600, (800.0, 800.0, 449.5, 299.5))
 
 
 def found(gray, valid=None, points=600):
-    return Lattice(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, valid)])
+    return Grid(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, valid)])
 
 
 def picture(seed=0):
@@ -49,7 +49,7 @@ def test_a_picture_without_texture_has_no_points():
 def test_a_large_picture_is_judged_reduced_and_its_points_lie_in_stored_pixels():
     gray = np.clip(ground(2, (4000, 800)), 0, 255).astype(np.uint8)
     camera = Camera("PINHOLE", 4000, 800, (3000.0, 3000.0, 1999.5, 399.5))
-    features = Lattice(points=500)(camera, [ViewPixels(source_view(camera), gray, None)])
+    features = Grid(points=500)(camera, [ViewPixels(source_view(camera), gray, None)])
     assert features.keypoints_px[:, 0].max() > 3900
     assert len(features.keypoints_px) == pytest.approx(500, abs=25)
 

@@ -1,4 +1,4 @@
-"""An even lattice of places to measure, chosen from the image alone: for matchers that compare pixels.
+"""An even grid of places to measure, chosen from the image alone: for matchers that compare pixels.
 
 In every cell of a square grid the place where a window can be matched best in all directions: the largest smaller
 eigenvalue of the structure tensor. No descriptors.
@@ -31,18 +31,18 @@ _RIM = 0.15
 _LEAST_CELL_PX = 3
 
 
-class Lattice(Strategy):
+class Grid(Strategy):
     """Points to measure, one per cell of an even grid, where the cell has texture."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 0
     follows_north: ClassVar[bool] = False
     colours: ClassVar[bool] = False
-    name: Literal["lattice"] = "lattice"
+    name: Literal["grid"] = "grid"
     points: int = Field(1200, ge=1, description="Cells over the image, about, and so points at most.")
 
-    def with_room_for(self, views: int) -> Lattice:
-        """The same: a lattice is of the source alone."""
+    def with_room_for(self, views: int) -> Grid:
+        """The same: a grid is of the source alone."""
         del views
         return self
 

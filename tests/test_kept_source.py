@@ -12,7 +12,7 @@ from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.formats import read_features
 from aeromatch_cli.workspace import read_json
 
-BESIDE = ("--set", "enhance=clahe", "--set", "enhance.beside=true")
+BESIDE = ("--set", "enhance=clahe", "--set", "enhance.keep_source=true")
 _EXIF_IFD, _DATE_TIME_ORIGINAL = 0x8769, 36867
 
 
@@ -49,17 +49,17 @@ def test_images_of_one_sun_are_left_as_they_are(site: Site) -> None:
     alone = site.another_workspace("alone")
     assert site("extract", "--workspace", alone).code == 0
     for path in sorted((site.work / "features").glob("*.npz")):
-        spared, plain = read_features(path), read_features(alone / "features" / path.name)
-        assert np.array_equal(spared.keypoints_px, plain.keypoints_px)
-        assert np.array_equal(spared.descriptors, plain.descriptors)
+        skipped, plain = read_features(path), read_features(alone / "features" / path.name)
+        assert np.array_equal(skipped.keypoints_px, plain.keypoints_px)
+        assert np.array_equal(skipped.descriptors, plain.descriptors)
 
 
 def test_without_beside_the_time_has_no_effect(site: Site) -> None:
     take_at(site, lambda _: "12:00:00")
-    clahe = ("--set", "enhance=clahe", "--set", "enhance.one_sun_minutes=20")
+    clahe = ("--set", "enhance=clahe", "--set", "enhance.same_illumination_minutes=20")
     outcome = site("enhance", *clahe)
     assert outcome.counts("enhance") == (5, 0, 0)
-    assert "one sun" not in outcome.stdout
+    assert "same illumination" not in outcome.stdout
     described = " ".join(default_yaml().replace("#", "").split())
     assert "Without beside it has no effect: every image is enhanced." in described
 
@@ -69,14 +69,14 @@ def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> 
     chained = (*BESIDE, "--set", "pairs=sequential", "--set", "pairs.window=1")
     assert site("extract", *chained).code == 0
     assert [both for _, both in sorted(enhanced_views(site).items())] == [True, True, False, False, False]
-    assert site("extract", *chained, "--set", "enhance.one_sun_minutes=21").code == 0
+    assert site("extract", *chained, "--set", "enhance.same_illumination_minutes=21").code == 0
     assert set(enhanced_views(site).values()) == {False}
 
 
-def test_spared_images_have_no_enhanced_picture_and_are_counted(site: Site) -> None:
+def test_skipped_images_have_no_enhanced_picture_and_are_counted(site: Site) -> None:
     take_at(site, lambda number: "12:00:00" if number else "12:21:00")
     chained = (*BESIDE, "--set", "pairs=sequential", "--set", "pairs.window=1")
-    said = "3 images not enhanced: one sun"
+    said = "3 images not enhanced (skipped: same illumination)"
 
     def pictures() -> list[str]:
         return sorted(path.stem for path in site.work.glob("enhanced/*.png"))
@@ -92,10 +92,10 @@ def test_spared_images_have_no_enhanced_picture_and_are_counted(site: Site) -> N
         assert said in outcome.stdout
         assert pictures() == ids[:2]
     facts = read_json(site.work / "reports" / "extract.json")["facts"]
-    assert facts["images_spared_by_one_sun"] == 3
-    assert "images spared by one sun 3" in (site.work / "report" / "index.html").read_text(encoding="utf-8")
-    # Enhanced once, spared now: nobody is to take the picture for one that is used.
-    assert site("enhance", *chained, "--set", "enhance.one_sun_minutes=0").counts("enhance") == (5, 0, 0)
+    assert facts["images_skipped_same_illumination"] == 3
+    assert "images skipped same illumination 3" in (site.work / "report" / "index.html").read_text(encoding="utf-8")
+    # Enhanced once, skipped now: nobody is to take the picture for one that is used.
+    assert site("enhance", *chained, "--set", "enhance.same_illumination_minutes=0").counts("enhance") == (5, 0, 0)
     assert pictures() == ids
     assert site("enhance", *chained).counts("enhance") == (2, 3, 0)
     assert pictures() == ids[:2]

@@ -9,15 +9,15 @@ from pydantic import Field
 from aeromatch_cli.strategies import Strategy
 
 
-class Beside(Strategy):
+class KeepsSource(Strategy):
     """An enhancer whose picture is used instead of the one that was taken, or beside it."""
 
     changes: ClassVar[bool] = True
-    beside: bool = Field(
+    keep_source: bool = Field(
         False,
         description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
     )
-    one_sun_minutes: float = Field(
+    same_illumination_minutes: float = Field(
         20.0,
         ge=0.0,
         description="With beside: an image whose partners were all taken within so many minutes of it is left as it "
