@@ -60,7 +60,7 @@ def test_only_the_overlap_goes_in_where_asked(monkeypatch: pytest.MonkeyPatch, o
     stand_in(monkeypatch, network)
     half = np.arange(40) < 20
     monkeypatch.setattr(lightglue, "in_overlap", lambda *_: (half, half))
-    matcher = LightGlue(overlap=overlap)
+    matcher = LightGlue(only_overlap=overlap)
     finished(matcher.look_closer(asked, joined([]), None), matcher.answers)
     side0, side1, _ = network.given[0]
     assert side0.places.shape[1] == side1.places.shape[1] == (20 if overlap else 40)
@@ -82,7 +82,7 @@ def test_sets_of_surer_matches_compete_and_the_winner_leads_the_search(monkeypat
         return found.take(np.arange(1))
 
     monkeypatch.setattr(lightglue, "most_evident", most_evident)
-    matcher = LightGlue(threshold=0.1, overlap=False)
+    matcher = LightGlue(threshold=0.1, only_overlap=False)
     second: Any = again
     found = finished(matcher.look_closer(asked_of(), before, second), matcher.answers)
     # At 0.1, 0.3, 0.5 and 0.8, each with the two from before, whose cost says that the network did not find them.

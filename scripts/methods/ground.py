@@ -80,7 +80,7 @@ class GroundViews:
     def picture(self, image: str) -> tuple[View, NDArray[np.uint8], BoolArray]:
         """View, colours (H, W, 3) RGB, and where it saw something (H, W)."""
         task = simulate.make_task(self.context, self.image_of[image])
-        pixels, valid, _ = enhance.for_views(task.source)
+        pixels, valid, _ = enhance.for_views(task.enhance)
         view = simulate.views_of(task)[-1]
         colours = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
         rendered, seen = render_view(colours, valid, self.camera(image), view)
