@@ -50,21 +50,38 @@ class Search(Strategy):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
     max_direction_deg: float = Field(
-        5.0, ge=0.0, le=180.0, description="Simulated views whose directions are farther apart are not compared."
+        5.0,
+        ge=0.0,
+        le=180.0,
+        description="Largest angle between the directions of two simulated views that are compared, degrees. Larger: "
+        "more view pairs, more time.",
     )
     guided: bool = Field(
-        False, description="Search where the poses say, then once more around what verified matches predict."
+        False,
+        description="Guided search: match again within the windows predicted by the poses, then around the places "
+        "predicted by verified matches.",
     )
     guide_below_matches: int = Field(
         500,
         ge=1,
-        description="Where so many matches are found at once, enhanced pictures and guided search are left out: they "
-        "cost more than they add.",
+        description="Guided search and enhanced pictures are used only for pairs with fewer matches than this. "
+        "Larger: more pairs are searched again, more time.",
     )
-    sigmas: float = Field(3.0, gt=0.0, description="Guided: half-width of the window in predicted standard deviations.")
-    sigma_px: float = Field(1.5, gt=0.0, description="Guided: standard deviation of a keypoint, pixels.")
+    sigmas: float = Field(
+        3.0,
+        gt=0.0,
+        description="Guided search: half-width of the window in predicted standard deviations. Larger: allows for "
+        "less accurate poses, more ambiguous matches.",
+    )
+    sigma_px: float = Field(
+        1.5, gt=0.0, description="Guided search: standard deviation of a keypoint, pixels. Larger: wider windows."
+    )
     relief: float = Field(
-        0.3, gt=0.0, lt=1.0, description="Guided: how far things rise over or fall below the ground, in flying heights."
+        0.3,
+        gt=0.0,
+        lt=1.0,
+        description="Guided search: largest height above or below the ground, in flying heights. Larger: longer "
+        "windows.",
     )
 
     def reads(self) -> frozenset[str]:

@@ -32,7 +32,7 @@ _SURER = (0.3, 0.5, 0.8)
 
 
 class LightGlue(Search):
-    """LightGlue (Lindenberger et al., ICCV 2023) for the pairs that the mutual ratio test leaves poor.
+    """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
@@ -43,35 +43,50 @@ class LightGlue(Search):
     network_below_matches: int = Field(
         250,
         ge=1,
-        description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
-        "asked: it takes half a second a pair. For it everywhere, raise this and `ample` above `extract.keypoints`.",
+        description="The network runs only for pairs with fewer matches than this after the ratio test and guided "
+        "search (about half a second per pair). Larger: more pairs use it; above extract.keypoints, and "
+        "guide_below_matches too: every pair.",
     )
     weights: str | None = Field(
         None,
-        description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`).",
+        description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`); null = the "
+        "package's own.",
         json_schema_extra={"path": "or name"},
     )
     threshold: float = Field(
         0.1,
         ge=0.0,
         le=1.0,
-        description="Smallest probability of a match of the network's, as far as the weights are calibrated. "
-        "Matches of the other searches join whatever it is.",
+        description="Smallest probability (0-1) of a match found by the network. Larger: fewer matches, fewer of them "
+        "wrong. Matches of the other searches are not affected.",
     )
     only_overlap: bool = Field(
         True,
-        description="Only keypoints that the other image may show are compared, as far as the plane of the matches "
-        "found before, or else poses and ground, tell.",
+        description="Give the network only the keypoints within the predicted overlap of both images (from earlier "
+        "matches, else from poses and ground).",
     )
-    depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
-    width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
+    depth_confidence: float = Field(
+        0.95,
+        ge=-1.0,
+        le=1.0,
+        description="Confidence (0-1) at which the network stops early; -1 = never. Larger: more layers, more time.",
+    )
+    width_confidence: float = Field(
+        0.99,
+        ge=-1.0,
+        le=1.0,
+        description="Confidence (0-1) at which the network drops keypoints; -1 = never. Larger: fewer are dropped, "
+        "more time.",
+    )
     max_keypoints: int = Field(
-        2048, ge=1, description="Strongest descriptors kept per view; time grows with its square."
+        2048,
+        ge=1,
+        description="Number of strongest descriptors per view that the network compares; time grows with its square.",
     )
     precision: Precision = Field(
         "auto",
-        description="Of the network's layers; auto is bfloat16 where the processor has it. Matches "
-        "depend on it: name one for shards on different processors.",
+        description="Number type of the network's layers; auto is bfloat16 where the processor has it. Matches depend "
+        "on it: set it explicitly for shards on different processors.",
     )
     device: Device = DEVICE
 
