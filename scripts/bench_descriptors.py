@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 from common import errors_as_exits, fill_in, publish, size_px
-from keypoint_bench.blocks import Asked, blocks
+from keypoint_bench.blocks import LoadedNetwork, blocks
 from keypoint_bench.correspondence import Partners, in_overlap, of_one_size, partners
 from keypoint_bench.descriptors import DESCRIBERS, Describer, Side, make_side, strongest_sift
 from keypoint_bench.figures import Store
@@ -160,7 +160,9 @@ def run(args: argparse.Namespace) -> list[Row]:
     store = Store(args.out / "scenes" / "figures", [args.keypoints, args.angles, args.seed])
     rows: list[Row] = []
     for flight in args.flights.split(","):
-        asked = Asked(tuple(args.scenes.split(",")), flight, size_px(args.size), args.images, args.pairs, args.seed)
+        asked = LoadedNetwork(
+            tuple(args.scenes.split(",")), flight, size_px(args.size), args.images, args.pairs, args.seed
+        )
         for judged, truth in blocks(args.out, asked):
             for row in rows_of(judged, truth, describers, args, store):
                 rows.append(row | {"flight": flight})

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 from common import errors_as_exits, fill_in, publish, size_px
-from keypoint_bench.blocks import Asked, blocks
+from keypoint_bench.blocks import LoadedNetwork, blocks
 from keypoint_bench.correspondence import in_overlap, partners
 from keypoint_bench.detectors import DETECTORS, Detector, Keypoints
 from keypoint_bench.figures import Store
@@ -52,7 +52,7 @@ from methods.worker import limit_threads
 from aeromatch_cli.evaluate import RenderedTruth
 
 Row = dict[str, Any]
-# Asked of a detector: enough that 1,000 lie in an overlap of a tenth of the picture.
+# LoadedNetwork of a detector: enough that 1,000 lie in an overlap of a tenth of the picture.
 MOST = 10_000
 FULL = {"scenes": "city,suburb,hills,farmland", "pairs": 12, "size": "1000x750", "images": 24, "keypoints": 1000}
 QUICK = {"scenes": "suburb", "pairs": 4, "size": "480x360", "images": 10, "keypoints": 200}
@@ -138,7 +138,9 @@ def orientation_rows(
 
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written as they come."""
-    asked = Asked(tuple(args.scenes.split(",")), args.flight, size_px(args.size), args.images, args.pairs, args.seed)
+    asked = LoadedNetwork(
+        tuple(args.scenes.split(",")), args.flight, size_px(args.size), args.images, args.pairs, args.seed
+    )
     options = Options(args.keypoints, "image", args.threads, args.seed, args.reference_weights)
     detectors = {method: make(DETECTORS, method, options) for method in named(args.detectors, DETECTORS)}
     orienters = {method: make(ORIENTERS, method, options) for method in named(args.orienters, ORIENTERS)}

@@ -13,7 +13,7 @@ from aeromatch_cli.evaluate import RenderedTruth
 
 
 @dataclass(frozen=True)
-class Asked:
+class LoadedNetwork:
     """Which blocks: presets, flight, width and height, images of each, pairs of each, seed."""
 
     scenes: tuple[str, ...]
@@ -25,7 +25,7 @@ class Asked:
     jobs: int = 2
 
 
-def blocks(folder: Path, asked: Asked) -> Iterator[tuple[Judged, RenderedTruth]]:
+def blocks(folder: Path, asked: LoadedNetwork) -> Iterator[tuple[Judged, RenderedTruth]]:
     """One after the other, pairs by class of view angle; rendered below folder/scenes unless they are there."""
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)

@@ -66,10 +66,10 @@ class Described(Strategy):
 
     @property
     @abstractmethod
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Whether descriptors of views with north up match no others."""
 
-    def with_room_for(self, views: int) -> Described:
+    def with_extra_views(self, views: int) -> Described:
         """With as many descriptors more for further views of an image."""
         return self.model_copy(update={"keypoints": self.keypoints * (1 + views)}) if self.budget == "image" else self
 

@@ -36,7 +36,7 @@ class Grid(Strategy):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 0
-    follows_north: ClassVar[bool] = False
+    north_up_only: ClassVar[bool] = False
     colours: ClassVar[bool] = False
     name: Literal["grid"] = "grid"
     points: int = Field(
@@ -46,7 +46,7 @@ class Grid(Strategy):
         "points, more time.",
     )
 
-    def with_room_for(self, views: int) -> Grid:
+    def with_extra_views(self, views: int) -> Grid:
         """The same: a grid is of the source alone."""
         del views
         return self

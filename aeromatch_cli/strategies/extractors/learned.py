@@ -66,7 +66,7 @@ class Learned(Described):
     device: Device = DEVICE
 
     @property
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Upright descriptors of views with north up match no others."""
         return self.orientation == "auto"
 

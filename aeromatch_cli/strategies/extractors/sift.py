@@ -63,7 +63,7 @@ class Sift(Described):
     )
 
     @property
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Upright descriptors of views with north up match no others."""
         return self.orientation == "auto"
 

@@ -119,6 +119,6 @@ class TwoViewGated(Gated):
         description="Largest Sampson error of an inlier, undistorted pixels. Larger: more matches, less accurate ones.",
     )
 
-    def tells_rotation(self) -> bool:
+    def gives_rotation(self) -> bool:
         """Known cameras have one; a fundamental matrix holds none."""
         return self.model == "relative_pose"

@@ -26,8 +26,12 @@ class PoseBand(Strategy):
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma"})
     verifies: ClassVar[bool] = False
     name: Literal["pose"] = "pose"
-    sigmas: float = Field(3.0, gt=0.0, description="Half-width of the band around the epipolar line in predicted standard deviations. Larger: more "
-        "matches are kept.")
+    sigmas: float = Field(
+        3.0,
+        gt=0.0,
+        description="Half-width of the band around the epipolar line in predicted standard deviations. Larger: more "
+        "matches are kept.",
+    )
     sigma_px: float = Field(1.5, gt=0.0, description="Standard deviation of a keypoint, pixels. Larger: a wider band.")
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:

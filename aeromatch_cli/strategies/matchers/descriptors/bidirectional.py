@@ -31,10 +31,10 @@ class Bidirectional(Search):
         "directions. Larger: more matches, more of them wrong.",
     )
 
-    def scan(self, asked: Comparison) -> Found:
-        """Matches of all view pairs that are alike, costs the larger d1/d2."""
+    def scan(self, comparison: Comparison) -> Found:
+        """Matches of all view pairs that are comparable, costs the larger d1/d2."""
         parts = []
-        for views in asked.view_pairs():
+        for views in comparison.view_pairs():
             rows, columns, ratios = mutual_nearest(
                 views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=self.ratio, limits=views.limits
             )

@@ -23,6 +23,6 @@ class Nearest(Search):
         "matches, more of them wrong.",
     )
 
-    def scan(self, asked: Comparison) -> Found:
-        """Matches of all view pairs that are alike, costs d1/d2."""
-        return ratio_test(asked, self.ratio)
+    def scan(self, comparison: Comparison) -> Found:
+        """Matches of all view pairs that are comparable, costs d1/d2."""
+        return ratio_test(comparison, self.ratio)
