@@ -159,7 +159,7 @@ def _draw(path: Path, pictures: Sequence[Any], sides: Sequence[Side]) -> None:
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.005, top=0.955, wspace=0.015)
     for axis, side in zip(axes, sides, strict=True):
         axis.imshow(stacked, interpolation="lanczos")
-        ends1 = side.points1_px + [0, height + gap]
+        ends1 = side.points1_px + np.array([0, height + gap])
         # Wrong ones first, so that they hide nothing.
         for kind, colour, strength in ((~side.correct, RED, 0.75), (side.correct, GREEN, 0.45)):
             lines = np.stack([side.points0_px[kind], ends1[kind]], axis=1)
