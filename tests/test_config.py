@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
 from aeromatch_cli.config import FAMILIES, Settings, dump, load, parse_method, preset_names, validate
-from aeromatch_cli.config_text import default_yaml
+from aeromatch_cli.config.page import page
+from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.workspace import fingerprint
 
@@ -32,7 +34,20 @@ def fault(source: str, *overrides: str) -> str:
 
 def test_default_yaml_is_up_to_date() -> None:
     stored = (CONFIGS / "default.yaml").read_text(encoding="utf-8")
-    assert stored == default_yaml(), "run: python -m aeromatch_cli.config_text > configs/default.yaml"
+    assert stored == default_yaml(), "run: python -m aeromatch_cli.config.text > configs/default.yaml"
+
+
+def test_the_configuration_page_is_up_to_date() -> None:
+    stored = (CONFIGS.parent / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert stored == page(), "run: python -m aeromatch_cli.config.page > docs/configuration.md"
+
+
+@pytest.mark.parametrize("name", [name for name in preset_names() if name != "default"])
+def test_the_page_says_what_a_preset_sets(name: str) -> None:
+    """What stands there as --set options makes the preset of the defaults."""
+    comment = next(line for line in page().splitlines() if line.startswith(f"- `{name}`:"))
+    written = page().splitlines()[page().splitlines().index(comment) + 1]
+    assert load("baseline", re.findall(r"`([^`]+)`", written)) == load(name)
 
 
 def test_default_and_baseline_are_the_defaults() -> None:
@@ -63,7 +78,7 @@ def test_other_strategies_in_default_yaml_are_valid_when_uncommented() -> None:
             if key == "filter":
                 tree[key].append("poselib")  # not every filter may stand alone
                 tree["extract"] = {"name": "sift", "colours": True}  # and one reads colours
-            if key == "extract" and tree[key]["name"] == "lattice":
+            if key == "extract" and tree[key]["name"] == "grid":
                 tree["match"] = {"name": "polar"}  # nothing else can compare what has no descriptors
             settings = validate(tree)
             strategy = getattr(settings, key)[0] if isinstance(tree[key], list) else getattr(settings, key)
