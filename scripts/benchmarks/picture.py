@@ -21,7 +21,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate.rendered import RenderedTruth
 from aeromatch_cli.formats import read_features, read_images, read_verified_row
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute
 from aeromatch_cli.synthetic import load_truth, render_block
