@@ -17,15 +17,15 @@ from make_lightglue import SIFT, features, seeded_tensors, write
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats import read_match_row, write_features
+from aeromatch_cli.formats.features import write_features
+from aeromatch_cli.formats.rows import read_match_row
 from aeromatch_cli.nets import lightglue_batch
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
-from aeromatch_cli.strategies.matchers.lightglue import inference
-from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue, inference
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))

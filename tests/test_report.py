@@ -16,7 +16,8 @@ from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import MatchEntry, VerifiedEntry, write_features, write_match_row, write_verified_row
+from aeromatch_cli.formats.features import write_features
+from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
 from aeromatch_cli.stages import report
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.report_rows import ImageRow, PairRow, gather, stage_rows

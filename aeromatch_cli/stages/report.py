@@ -16,7 +16,8 @@ from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import FloatArray, Matches
 from aeromatch_cli.errors import ItemError, WorkspaceError
-from aeromatch_cli.formats import read_keypoints, read_match_row, read_verified_row
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import read_match_row, read_verified_row
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages import report_figures as figures

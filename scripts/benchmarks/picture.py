@@ -20,7 +20,9 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate.rendered import RenderedTruth
-from aeromatch_cli.formats import read_features, read_images, read_verified_row
+from aeromatch_cli.formats.features import read_features
+from aeromatch_cli.formats.rows import read_verified_row
+from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute

@@ -10,7 +10,7 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Features, FloatArray, Pair
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import read_features
+from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract, pairs
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.strategies.filters import apply_chain

@@ -19,9 +19,8 @@ OUR_CODE = (
     "stages",
     "strategies",
     "data.py",
-    "formats.py",
-    "images.py",
-    "tiff.py",
+    "formats",
+    "images",
     "methods/ours.py",
 )
 # Peers on rectified views read what makes these, too.
@@ -33,8 +32,7 @@ GROUND_CODE = (
     "strategies/simulators",
     "strategies/pairings",
     "data.py",
-    "images.py",
-    "tiff.py",
+    "images",
     "methods/ground.py",
 )
 LIBRARIES = ("opencv-python-headless", "torch", "kornia", "pycolmap", "poselib", "numpy")
