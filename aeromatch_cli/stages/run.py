@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
+from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
 from aeromatch_cli.stages.common import Context, Shard, StageReport, gather_failures, owner
 from aeromatch_cli.stages.distrust import without_distrusted
 from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors

@@ -1,11 +1,12 @@
-"""Rows of the report's tables: one per pair, per image and per stage, gathered in one pass over the workspace."""
+"""What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation."""
 
 from __future__ import annotations
 
+import base64
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -85,6 +86,18 @@ class StageRow:
     skipped: int
     failed: int
     facts: str
+
+
+@dataclass(frozen=True)
+class EvaluationFigures:
+    """What `aeromatch evaluate` found. summary: (name, value). pictures: (name, data URI of a PNG).
+
+    outdated: matches were verified since.
+    """
+
+    summary: Sequence[tuple[str, str]]
+    pictures: Sequence[tuple[str, str]]
+    outdated: bool
 
 
 class _Coverage:
@@ -248,3 +261,18 @@ def failure_rows(context: Context) -> list[dict[str, str]]:
         if all(image_id in images for image_id in ids):
             row["item"] = " – ".join(images[image_id].name for image_id in ids)
     return rows
+
+
+def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
+    """None where the workspace was never evaluated."""
+    stated = workspace.evaluation / "evaluation.json"
+    if not stated.is_file():
+        return None
+    pictures = []
+    for path in sorted(workspace.evaluation.glob("*.png")):
+        coded = base64.b64encode(path.read_bytes()).decode("ascii")
+        pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
+    filtered = workspace.stage_report("filter")
+    outdated = filtered.is_file() and filtered.stat().st_mtime > stated.stat().st_mtime
+    summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
+    return EvaluationFigures(summary, pictures, outdated)
