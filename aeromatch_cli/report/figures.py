@@ -81,12 +81,14 @@ def svg(figure: Any, label: str, css: str, titles: Mapping[str, Sequence[str]]) 
 
 def _plain(element: ElementTree.Element) -> None:
     """Without namespaces, which inline SVG has no need of; short numbers; the page's font and colours."""
-    element.tag = element.tag.rpartition("}")[2]
+    element.tag, element.tail = element.tag.rpartition("}")[2], None
+    element.text = element.text if element.text and element.text.strip() else None
     element.attrib = {key.rpartition("}")[2]: value for key, value in element.attrib.items()}
-    if path := element.get("d"):
-        element.set("d", " ".join(re.sub(r"(\.\d\d)\d+", r"\1", path).split()))
+    for key in {"d", "x", "y", "width", "height", "transform"} & set(element.attrib):
+        element.set(key, " ".join(re.sub(r"(\.\d\d)\d+", r"\1", element.attrib[key]).split()))
     if style := element.get("style"):
-        style = re.sub(r"font: ([\d.]+px) [^;]+", r"font-size: \1", style)
+        # Releases of matplotlib write the font in one of two ways.
+        style = re.sub(r"font: ([\d.]+px) [^;]+", r"font-size: \1", re.sub("font-family: [^;]+(; )?", "", style))
         element.set("style", re.sub("#[0-9a-f]{6}", lambda found: _VARIABLES.get(found[0], found[0]), style))
 
 
@@ -100,7 +102,7 @@ def _shapes(group: ElementTree.Element) -> Iterator[ElementTree.Element]:
 
 
 def histogram(values: Sequence[int], label: str, unit: str) -> str:
-    """Bars over about 24 equal classes with rounded limits. values: at least one."""
+    """Bars over about 24 equal classes with rounded limits. values: at least one. unit: what they count, a plural."""
     from matplotlib.ticker import MaxNLocator
 
     axes = new_axes(7.0, 2.7)
@@ -117,7 +119,10 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_formatter("{x:,.0f}")
-    titles = [f"{edges[k]:,.0f} to {edges[k] + step - 1:,.0f}: {counts[k]:,} {unit}" for k in filled]
+    units = {1: unit.removesuffix("s")}
+    titles = [
+        f"{edges[k]:,.0f} to {edges[k] + step - 1:,.0f}: {counts[k]:,} {units.get(counts[k], unit)}" for k in filled
+    ]
     return svg(axes.figure, label, "histogram", {"bar": titles})
 
 

@@ -102,17 +102,17 @@ def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], lin
     _draw_footprints(axes, outlines)
     limits = match_classes(link.verified for link in placed if link.state == "verified")
     titles, handles = _draw_links(axes, place, drawn, limits)
-    radius = 3.6 if len(stations) <= 200 else 2.0 if len(stations) <= 2000 else 1.2
+    diameter = 6.4 if len(stations) <= 200 else 3.6 if len(stations) <= 2000 else 2.1
     for kind, (words, style) in _CAMERAS.items():
-        members = [s for s in stations if s.kind == kind]
-        if members:
-            area = math.pi * (radius * (1.0 if kind == "fine" else 1.4)) ** 2
+        if members := [s for s in stations if s.kind == kind]:
             places = np.array([place[s.image_id] for s in members])
+            area = diameter**2 * (1.0 if kind == "fine" else 2.0)
             handles.append(axes.scatter(*places.T, area, label=words, gid=kind, zorder=4, **style))
             titles[kind] = [s.title for s in members]
     axes.figure.legend(
         handles=handles, loc="outside right upper", alignment="left", frameon=False, title="Verified matches per pair"
     )
+    _scale_equally(axes)
     if len(stations) <= MAX_LABELS:
         _draw_labels(axes, stations)
     return MapFigure(svg(axes.figure, "Block map", "map", titles), tuple(remarks))
@@ -135,14 +135,24 @@ def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any
     height = float(np.clip((_WIDTH - _LEGEND_WIDTH) * half[1] / half[0], *_AXES_HEIGHTS))
     axes = new_axes(_WIDTH / 72, height / 72)
     axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
-    axes.update_datalim([middle - half, middle + half])
-    axes.set_aspect("equal", adjustable="datalim")  # what is left of the width or the height shows more ground
+    _show(axes, middle, half)
     axes.ticklabel_format(useOffset=False, style="plain")
     arrow = {"arrowstyle": "-|>", "color": COLOURS["ink"]}
     where = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "color": COLOURS["ink"]}
     axes.annotate("N", (0.975, 0.985), (0.0, -38.0), arrowprops=arrow, zorder=5, **where)
     return axes
+
+
+def _show(axes: Any, middle: FloatArray, half: FloatArray) -> None:
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+
+
+def _scale_equally(axes: Any) -> None:
+    """Settle where the axes stand, then let what is left of their width or height show more ground."""
+    axes.figure.draw_without_rendering()
+    axes.figure.set_layout_engine("none")
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
 
 
 def _draw_footprints(axes: Any, polygons: Sequence[FloatArray]) -> None:
@@ -199,10 +209,9 @@ def _draw_links(
 
 def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
     """Labels that do not lie on an earlier one; the tooltips name every camera. Weak and suspect ones come first."""
-    axes.figure.draw_without_rendering()
     taken: list[Any] = []
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):
-        where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "in_layout": False, "zorder": 5}
+        where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}
         text = axes.annotate(station.label, (station.x_m, station.y_m), gid="label", color=COLOURS["ink"], **where)
         box = text.get_window_extent()
         if any(box.overlaps(other) for other in taken):
