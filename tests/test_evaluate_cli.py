@@ -37,7 +37,7 @@ def test_the_report_shows_it(site: Path) -> None:
     page = (site / "work" / "report" / "index.html").read_text()
     assert "<h2>Evaluation</h2>" in page
     assert page.count("data:image/png;base64") == len(list((site / "work" / "evaluation").glob("*.png"))) == 3
-    assert "Evaluated before" not in page
+    assert "Matches were verified again" not in page
 
 
 def test_wrong_arguments_say_what_to_do(site: Path, tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from aeromatch_cli.report.rows import (
     NOT_JUDGED,
     ImageRow,
     PairRow,
-    StageRow,
     evaluation_figures,
     failure_rows,
     gather,
@@ -107,8 +106,6 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         weak_matches=WEAK_MATCHES,
         ignored=ignored,
         stages=stages,
-        longest_seconds=max((row.seconds for row in stages), default=0.0),
-        total=StageRow("sum", sum(row.seconds for row in stages), 0, 0, 0, sum(row.failed for row in stages), ""),
         settings=_settings_text(context),
     )
 
@@ -126,18 +123,18 @@ def _headline(
     full = sum(row.pose == "full" for row in images)
     verified = sum(row.state == "verified" for row in pairs)
     matches, parts, weak = facts["verified_matches"], len(facts["components"]), len(facts["weakly_tied"])
-    limit = f" (< {WEAK_MATCHES} matches)"
-    tiles: list[tuple[int, str, str, bool]] = [
-        (len(images), "image", "images", False),
-        (posed, f"with position, {full:,} with attitude", f"with position, {full:,} with attitude", False),
-        (len(pairs), "pair compared", "pairs compared", False),
-        (verified, "verified pair", "verified pairs", not verified),
-        (matches, "verified match", "verified matches", not matches),
-        (parts, "connected group", "unconnected groups", parts > 1),
-        (weak, f"weakly tied image{limit}", f"weakly tied images{limit}", weak > 0),
-        (len(failures), "failure", "failures", bool(failures)),
+    tiles = [
+        (_counted(len(images), "image", "images"), False),
+        (f"{posed:,} with position, {full:,} with attitude", False),
+        (_counted(len(pairs), "pair compared", "pairs compared"), False),
+        (_counted(verified, "verified pair", "verified pairs"), not verified),
+        (_counted(matches, "verified match", "verified matches"), not matches),
+        (_counted(parts, "connected group", "unconnected groups"), parts > 1),
+        (_counted(weak, "weakly tied image", "weakly tied images") + f" (< {WEAK_MATCHES} matches)", weak > 0),
+        (_counted(len(failures), "failure", "failures"), bool(failures)),
     ]
-    return [(f"{count:,}", one if count == 1 else several, "bad" if bad else "") for count, one, several, bad in tiles]
+    parted = [(text.partition(" "), bad) for text, bad in tiles]
+    return [(count, words, "bad" if bad else "") for (count, _, words), bad in parted]
 
 
 def notices(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -32,17 +31,6 @@ ERROR_LIMITS_PX = (0.5, 1.0, 2.0)
 
 _PREVIEW_SIDE_PX = 442
 _PREVIEW_GAP_PX = 12
-# (transpose, mirror x, mirror y) that turn the stored raster upright, by EXIF Orientation (TIFF 6.0, tag 274).
-_TURNS = {
-    1: (False, False, False),
-    2: (False, True, False),
-    3: (False, True, True),
-    4: (False, False, True),
-    5: (True, False, False),
-    6: (True, True, False),
-    7: (True, True, True),
-    8: (True, False, True),
-}
 
 
 @dataclass(frozen=True)
@@ -110,9 +98,14 @@ class Side:
     points_px: FloatArray
 
 
+def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:
+    """Transpose, mirror x, mirror y: what turns the stored raster upright (EXIF Orientation: TIFF 6.0, tag 274)."""
+    return exif_orientation in (5, 6, 7, 8), exif_orientation in (2, 3, 6, 7), exif_orientation in (3, 4, 7, 8)
+
+
 def turned(pixels: NDArray[Any], exif_orientation: int) -> NDArray[Any]:
     """The stored raster as a viewer shows it."""
-    transpose, mirror_x, mirror_y = _TURNS.get(exif_orientation, _TURNS[1])
+    transpose, mirror_x, mirror_y = _turn(exif_orientation)
     if transpose:
         pixels = np.swapaxes(pixels, 0, 1)
     return pixels[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]
@@ -120,7 +113,7 @@ def turned(pixels: NDArray[Any], exif_orientation: int) -> NDArray[Any]:
 
 def turned_points(points_px: FloatArray, width_px: int, height_px: int, exif_orientation: int) -> FloatArray:
     """Where stored pixels (N, 2) of a width_px x height_px raster lie after `turned`."""
-    transpose, mirror_x, mirror_y = _TURNS.get(exif_orientation, _TURNS[1])
+    transpose, mirror_x, mirror_y = _turn(exif_orientation)
     x, y = np.asarray(points_px, dtype=np.float64).T
     if transpose:
         x, y, width_px, height_px = y, x, height_px, width_px
@@ -134,7 +127,8 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
     offset = size0[0] + _PREVIEW_GAP_PX
     width, height = offset + size1[0], max(size0[1], size1[1])
     points1 = points1 + np.array([float(offset), 0.0])
-    classes = _error_classes(errors_px, len(points0))
+    errors = np.full(len(points0), np.nan) if errors_px is None else errors_px
+    classes = np.where(np.isnan(errors), 9, np.searchsorted(ERROR_LIMITS_PX, errors))
     chosen = _spread(points0, MAX_PREVIEW_LINES)
     dots = _spread(points0, MAX_PREVIEW_POINTS)
     parts = [
@@ -143,21 +137,15 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
         f'<image href="{uri0}" x="0" y="0" width="{size0[0]}" height="{size0[1]}"/>',
         f'<image href="{uri1}" x="{offset}" y="0" width="{size1[0]}" height="{size1[1]}"/>',
     ]
-    for name in sorted(set(classes)):
-        lines = "".join(f"M{_xy(points0[i])}L{_xy(points1[i])}" for i in chosen if classes[i] == name)
-        spots = "".join(f"M{_xy(points0[i])}h0M{_xy(points1[i])}h0" for i in dots if classes[i] == name)
-        parts.append(f'<path class="tie {name}" d="{lines}"/><path class="spot {name}" d="{spots}"/>')
+    for k in np.unique(classes):
+        lines = "".join(f"M{_xy(points0[i])}L{_xy(points1[i])}" for i in chosen if classes[i] == k)
+        spots = "".join(f"M{_xy(points0[i])}h0M{_xy(points1[i])}h0" for i in dots if classes[i] == k)
+        parts.append(f'<path class="tie e{k}" d="{lines}"/><path class="spot e{k}" d="{spots}"/>')
     return "".join([*parts, "</svg>"])
 
 
 def _xy(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
-
-
-def _error_classes(errors_px: FloatArray | None, count: int) -> list[str]:
-    if errors_px is None:
-        return ["e9"] * count
-    return ["e9" if math.isnan(e) else f"e{sum(e > limit for limit in ERROR_LIMITS_PX)}" for e in errors_px]
 
 
 def _upright(side: Side) -> tuple[str, tuple[int, int], FloatArray]:

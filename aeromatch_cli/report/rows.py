@@ -222,12 +222,9 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         report = read_json(path)
         groups.setdefault((str(report["stage"]), sharded), []).append(report)
 
-    def place(key: tuple[str, bool]) -> tuple[int, str, bool]:
-        name = key[0]
-        return (_STAGE_ORDER.index(name) if name in _STAGE_ORDER else len(_STAGE_ORDER), *key)
-
+    order = {name: place for place, name in enumerate(_STAGE_ORDER)}
     rows = []
-    for name, sharded in sorted(groups, key=place):
+    for name, sharded in sorted(groups, key=lambda key: (order.get(key[0], len(order)), key)):
         # The report stage is running now: what is on file of it is about an earlier page.
         if name == "report":
             continue
@@ -243,8 +240,8 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
 
 
 def _facts_words(facts: Mapping[str, Any]) -> str:
-    """The plain numbers and words among a stage's facts; what is nested has its own place on the page."""
-    plain = {key: value for key, value in facts.items() if isinstance(value, int | float | str)}
+    """The plain numbers and words among a stage's facts, without checksums; what is nested has its own place."""
+    plain = {k: value for k, value in facts.items() if isinstance(value, int | float | str) and "sha256" not in k}
     return ", ".join(f"{key.replace('_', ' ')} {_number(value)}" for key, value in plain.items())
 
 
