@@ -29,13 +29,13 @@ _UNJUDGED: dict[str, Any] = {"color": COLOURS["soft"], "linewidth": 0.8, "linest
 _CAMERAS = {
     "fine": ("image", {"facecolor": COLOURS["ink"], "edgecolor": COLOURS["panel"], "linewidth": 0.8}),
     "weak": ("weakly tied image", {"facecolor": COLOURS["panel"], "edgecolor": COLOURS["bad"], "linewidth": 2.0}),
-    "suspect": ("ignored attitude", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
+    "ignored": ("ignored attitude", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
 }
 
 
 @dataclass(frozen=True)
 class Station:
-    """One camera on the map. title: tooltip. kind: fine, weak (few verified matches) or suspect (ignored attitude)."""
+    """One camera on the map. title: tooltip. kind: fine, weak (few verified matches) or ignored (ignored attitude)."""
 
     image_id: str
     label: str
@@ -184,7 +184,7 @@ def _draw_links(
     for index, limit in enumerate(limits):
         words = f"{limit:,}–{limits[index + 1] - 1:,}" if index + 1 < len(limits) else f"{limit:,} or more"
         k = class_of(limit, limits)
-        classes[f"k{k}"] = words, {"color": COLOURS[f"k{k}"], "linewidth": (0.9 + 0.36 * k) * factor}
+        classes[f"k{k}"] = words, {"color": COLOURS[f"k{k}"], "linewidth": 0.9 + 0.36 * k}
     classes |= {"rejected": ("rejected", _REJECTED), "unjudged": ("not verifiable or not judged", _UNJUDGED)}
     members: dict[str, list[Link]] = {gid: [] for gid in classes}
     for link in links:
@@ -196,19 +196,19 @@ def _draw_links(
         lines = np.array([[place[k.image_id0], place[k.image_id1]] for k in members[gid]]).reshape(-1, 2, 2)
         if not len(lines):
             continue
-        known: dict[str, Any] = {"gid": gid, "zorder": 2 + 0.1 * order}
+        thinned = style | {"linewidth": factor * style["linewidth"], "gid": gid, "zorder": 2 + 0.1 * order}
         if len(links) <= MAX_TITLED_LINES:
-            axes.add_artist(LineCollection(list(lines), **known, **style))
+            axes.add_artist(LineCollection(list(lines), **thinned))
             titles[gid] = [link.title for link in members[gid]]
         else:
             joined = np.insert(lines, 2, np.nan, axis=1).reshape(-1, 2)
-            axes.plot(*joined.T, **style, **known)
+            axes.plot(*joined.T, **thinned)
         handles.insert(0, Line2D([], [], label=words, **style))
     return titles, handles
 
 
 def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
-    """Labels that do not lie on an earlier one; the tooltips name every camera. Weak and suspect ones come first."""
+    """Labels that do not lie on an earlier one; the tooltips name every camera. Weak and ignored ones come first."""
     taken: list[Any] = []
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):
         where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}

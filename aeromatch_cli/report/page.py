@@ -225,7 +225,7 @@ def _map(
         ties = _counted(row.verified_matches, "verified match", "verified matches")
         title = f"{row.name}: {ties} in {row.verified_pairs} of {_counted(row.pairs, 'pair', 'pairs')}, z {z:.1f} m"
         weak = "weak" if row.verified_matches < WEAK_MATCHES else "fine"
-        stations.append(Station(row.image_id, label, title, x, y, "suspect" if row.image_id in ignored else weak))
+        stations.append(Station(row.image_id, label, title, x, y, "ignored" if row.image_id in ignored else weak))
     if not stations:
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]

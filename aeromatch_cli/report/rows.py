@@ -1,4 +1,8 @@
-"""What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation."""
+"""What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
+
+Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
+`summary` and `warnings` of pairs and `rotation_contradicts_pose` of filter (page.py).
+"""
 
 from __future__ import annotations
 
