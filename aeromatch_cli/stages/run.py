@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
+from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
 from aeromatch_cli.stages.attitudes import without_ignored_attitudes
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
