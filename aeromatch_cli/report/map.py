@@ -208,13 +208,15 @@ def _draw_links(
 
 
 def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
-    """Labels that do not lie on an earlier one; the tooltips name every camera. Weak and ignored ones come first."""
+    """Labels that lie on no earlier one and on no other camera; the tooltips name all. Weak and ignored come first."""
     taken: list[Any] = []
+    places = axes.transData.transform([(s.x_m, s.y_m) for s in stations])
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):
         where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}
         text = axes.annotate(station.label, (station.x_m, station.y_m), gid="label", color=COLOURS["ink"], **where)
         box = text.get_window_extent()
-        if any(box.overlaps(other) for other in taken):
+        hides = station.kind == "fine" and box.count_contains(places)
+        if hides or any(box.overlaps(other) for other in taken):
             text.remove()
         else:
             taken.append(box)
