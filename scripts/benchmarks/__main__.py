@@ -9,6 +9,7 @@ from importlib import import_module
 # Name -> module with `main(arguments)`, imported when it is run, and what it does in a line.
 TABLE: Mapping[str, tuple[str, str]] = {
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
+    "pages": ("benchmarks.pages", "brings the first lines of docs/results up to date with the tables' stamps"),
 }
 
 
