@@ -12,6 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -24,6 +25,8 @@ from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger("aeromatch")
+# For the log file only: the screen shows progress in its own way.
+record = logging.getLogger("aeromatch.record")
 
 # One thread inside each worker: the processes are the parallelism, and results do not depend on thread counts.
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -158,6 +161,7 @@ class Executor:
         self.kind = kind
         self.jobs = 1 if kind == "serial" else jobs or available_cores()
         self.progress = progress or SilentProgress()
+        self._tried = 0
         self._pool: ProcessPoolExecutor | None = None
         self._client: Any = None
 
@@ -186,6 +190,9 @@ class Executor:
 
     def run(self, function: Callable[[T], R], tasks: Sequence[T], label: str) -> list[Outcome[R]]:
         """Outcomes in task order. Raises WorkspaceError when results can no longer be saved."""
+        started = time.monotonic()
+        record.info("%s: %d to do", label, len(tasks))
+        self._tried = 0
         self.progress.start(label, len(tasks))
         try:
             if self.kind == "dask":
@@ -195,13 +202,18 @@ class Executor:
             return self._run_processes(function, tasks)
         finally:
             self.progress.stop()
+            record.info("%s: %d of %d tried in %.1f s", label, self._tried, len(tasks), time.monotonic() - started)
+
+    def _advance(self) -> None:
+        self._tried += 1
+        self.progress.advance()
 
     def _run_serial(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
         outcomes = []
         with _one_thread():
             for task in tasks:
                 outcomes.append(guarded(function, task))
-                self.progress.advance()
+                self._advance()
         return outcomes
 
     def _run_processes(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
@@ -217,7 +229,7 @@ class Executor:
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
                     outcomes[index] = Outcome(None, "its worker process died (out of memory, or a crash in a library)")
-                    self.progress.advance()
+                    self._advance()
         return [outcomes[index] for index in range(len(tasks))]
 
     def _drain(
@@ -240,7 +252,7 @@ class Executor:
                 for future in finished:
                     outcomes[flying[future]] = future.result()
                     del flying[future]
-                    self.progress.advance()
+                    self._advance()
         except BrokenProcessPool:
             self._pool = None
             return sorted(flying.values())
@@ -281,7 +293,7 @@ class Executor:
             self._client.run(single_threaded)
         futures = self._client.map(guarded, [function] * len(tasks), tasks, pure=False)
         for _ in as_completed(futures):
-            self.progress.advance()
+            self._advance()
         return list(self._client.gather(futures))
 
 

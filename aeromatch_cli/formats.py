@@ -14,7 +14,8 @@ poses.csv       image_id, x, y, z (metres, world frame, projection centre), qw, 
                 the attitude is unknown), sigma_position_m, sigma_angle_deg
 pairs.csv       image_id0, image_id1 (id0 < id1), overlap (0-1), view_angle_deg, reason
 failures.csv    stage, item, reason
-distrusted.json images whose attitude contradicts the pictures: fingerprint (of all that the judgement rests on),
+ignored_attitudes.json
+                images whose attitude contradicts the pictures: fingerprint (of all that the judgement rests on),
                 settings (fingerprint of the strategies), images: image_id -> angle_deg, facts (fingerprint of the
                 image and its pose); suspects: image_id -> facts, of images that no verified pair ties to those that
                 they overlap with: they and their neighbours are also matched as they were taken
@@ -55,8 +56,8 @@ verified/<id0>.npz           the same row layout, only kept matches
 
 reports/<stage>[.i-of-n].json   stage, seconds, items, done, skipped (already up to date), failed, fingerprint, facts,
                              failures: [[item, reason], ...]. facts of pairs: summary lines, block figures, warnings,
-                             images, distrusted, pairs_sha256; of extract: keypoints, images_without_keypoints; of
-                             match: matches; of filter: pairs (state -> count), verified_matches, components (sizes),
+                             images, ignored_attitudes, pairs_sha256; of extract: keypoints, images_without_keypoints;
+                             of match: matches; of filter: pairs (state -> count), verified_matches, components (sizes),
                              weakly_tied, rotation_contradicts_pose (image_id -> degrees); of export: exporter ->
                              files and counts.
 

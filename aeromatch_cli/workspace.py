@@ -62,8 +62,8 @@ class Workspace:
         return self.root / "failures.csv"
 
     @property
-    def distrusted(self) -> Path:
-        return self.root / "distrusted.json"
+    def ignored_attitudes(self) -> Path:
+        return self.root / "ignored_attitudes.json"
 
     @property
     def reports(self) -> Path:

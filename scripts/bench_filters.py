@@ -93,11 +93,11 @@ def variants(threshold_px: float) -> list[Variant]:
             clustered = ClusteredRansac(threshold_px=threshold_px)
             found.append(Variant(pattern.format("clustered-ransac"), (*before, clustered, *after), words))
             for swept_px in SWEPT_PX:
-                direct = Homography(threshold_px=swept_px, false_alarms=EVERYTHING)
+                direct = Homography(threshold_px=swept_px, max_false_alarms=EVERYTHING)
                 found.append(Variant(pattern.format("homography"), (*before, direct, *after), words, swept_px))
     found.append(Variant("epipolar", (Epipolar(),)))
-    found.append(Variant("magsac", (Magsac(threshold_px=threshold_px, false_alarms=EVERYTHING),)))
-    poselib = Poselib(threshold_px=threshold_px, false_alarms=EVERYTHING)
+    found.append(Variant("magsac", (Magsac(threshold_px=threshold_px, max_false_alarms=EVERYTHING),)))
+    poselib = Poselib(threshold_px=threshold_px, max_false_alarms=EVERYTHING)
     found.append(Variant("poselib", (poselib,)))
     graph = Graph(threshold_px=threshold_px)
     found += [Variant("graph", (graph,)), Variant("graph + poselib", (graph, poselib))]

@@ -41,10 +41,10 @@ from lightglue_training.validation import (
 from training_blocks import render
 from training_runs import at_least_one, check_recipe
 
+from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration, load_lightglue, read_calibration
 from aeromatch_cli.nets.precision import has_bfloat16
-from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import write_text
 

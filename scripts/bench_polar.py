@@ -6,7 +6,7 @@ pictures, and reduced to 1/8. unknown: pairs of real blocks and of rendered ones
 poses, beside SIFT at four ratios. honesty: pairs from places apart on one ground, of different grounds, and of
 saturated or featureless content. Errors as in methods: displacement at the overlap's middle in px of picture 1,
 degrees, relative scale; of unknown pairs the differences to SIFT at ratio 0.8, where that is right. seconds: decoding
-excluded on both sides; seconds_tie_points: lattice and about 1,000 tie points included.
+excluded on both sides; seconds_tie_points: grid and about 1,000 tie points included.
 
 Writes OUT/results.json (a row for every method and pair) and OUT/polar.md. A section of no pairs, and kinds not asked
 for, keep their rows of an earlier run into OUT. Grounds and blocks are kept in OUT/grounds.

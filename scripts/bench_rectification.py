@@ -44,8 +44,8 @@ from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.strategies.matchers.search import Search
-from aeromatch_cli.strategies.matchers.views import alike
+from aeromatch_cli.strategies.matchers.descriptors.search import Search
+from aeromatch_cli.strategies.matchers.descriptors.views import alike
 from aeromatch_cli.synthetic import Truth, load_truth
 from aeromatch_cli.workspace import stable_hash
 

@@ -30,7 +30,7 @@ from common import peak_mb, publish, size_px
 from numpy.typing import NDArray
 
 from aeromatch_cli.errors import AeromatchError
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.synthetic import PRESETS, render_block
 from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path

@@ -319,7 +319,7 @@ def test_image_deleted_during_a_run(site, monkeypatch):
 
 
 def test_a_defect_in_one_pair_costs_that_pair_only(site, monkeypatch):
-    from aeromatch_cli.strategies.matchers.nearest import Nearest
+    from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 
     ids = [name.replace(".", "_") for name in site.names()]
     call = Nearest.__call__

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_nearest import GEOMETRY, descriptors, features
 
-from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Where
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Where
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 
 
 def squared_distances(d0, d1):

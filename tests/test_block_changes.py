@@ -14,7 +14,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.stages import export, extract, match
 from aeromatch_cli.stages import filter as filter_stage
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.pairs import prepare
 
 PAIRS = IMAGES * (IMAGES - 1) // 2

@@ -14,9 +14,11 @@ import pytest
 from conftest import IMAGES, Site, contents, invoke
 from typer.testing import CliRunner
 
-from aeromatch_cli import __version__, cli
-from aeromatch_cli.cli import STAGES, LineProgress, app
-from aeromatch_cli.stages.common import Shard
+from aeromatch_cli import __version__
+from aeromatch_cli.cli import app, output
+from aeromatch_cli.cli.progress import LineProgress
+from aeromatch_cli.cli.stage_commands import STAGES
+from aeromatch_cli.stages.shard import Shard
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 OPTIONS = (
@@ -91,7 +93,7 @@ def test_no_enhancement_writes_no_pictures(site):
 @pytest.mark.parametrize("command", ["simulate", "extract", "run"])
 def test_the_summary_tells_what_views_cost(site, command):
     stage = "simulate" if command == "simulate" else "extract"
-    more = ("--set", "simulate.source=true")
+    more = ("--set", "simulate.keep_source=true")
     for _ in range(2):  # the second time it is up to date
         outcome = site(command, *more)
         facts = outcome.facts["stages"][stage]["facts"]
@@ -224,7 +226,7 @@ def test_a_defect_is_no_success_and_leaves_a_traceback_in_the_log(site, monkeypa
 
 
 def test_numbers_that_json_lacks_become_null():
-    assert cli._finite({"a": [float("nan"), 1.5, {"b": float("inf")}], 3: "x"}) == {
+    assert output._finite({"a": [float("nan"), 1.5, {"b": float("inf")}], 3: "x"}) == {
         "a": [None, 1.5, {"b": None}],
         "3": "x",
     }
@@ -307,9 +309,9 @@ def test_every_other_command_as_a_process(done_site: Site, tmp_path: Path):
 
 
 def test_help_of_synth_names_every_scene_and_flight() -> None:
-    from aeromatch_cli import cli
+    from aeromatch_cli.cli import commands
     from aeromatch_cli.synthetic import PRESETS
     from aeromatch_cli.synthetic.flights import FLIGHTS
 
-    assert cli._SCENES.split(", ") == list(PRESETS)
-    assert cli._FLIGHTS.split(", ") == list(FLIGHTS)
+    assert commands._SCENES.split(", ") == list(PRESETS)
+    assert commands._FLIGHTS.split(", ") == list(FLIGHTS)

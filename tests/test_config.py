@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from aeromatch_cli.config import FAMILIES, Settings, dump, load, parse_method, preset_names, validate
-from aeromatch_cli.config_text import default_yaml
+from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.workspace import fingerprint
 
@@ -32,7 +32,7 @@ def fault(source: str, *overrides: str) -> str:
 
 def test_default_yaml_is_up_to_date() -> None:
     stored = (CONFIGS / "default.yaml").read_text(encoding="utf-8")
-    assert stored == default_yaml(), "run: python -m aeromatch_cli.config_text > configs/default.yaml"
+    assert stored == default_yaml(), "run: python -m aeromatch_cli.config.text > configs/default.yaml"
 
 
 def test_default_and_baseline_are_the_defaults() -> None:
@@ -63,7 +63,7 @@ def test_other_strategies_in_default_yaml_are_valid_when_uncommented() -> None:
             if key == "filter":
                 tree[key].append("poselib")  # not every filter may stand alone
                 tree["extract"] = {"name": "sift", "colours": True}  # and one reads colours
-            if key == "extract" and tree[key]["name"] == "lattice":
+            if key == "extract" and tree[key]["name"] == "grid":
                 tree["match"] = {"name": "polar"}  # nothing else can compare what has no descriptors
             settings = validate(tree)
             strategy = getattr(settings, key)[0] if isinstance(tree[key], list) else getattr(settings, key)

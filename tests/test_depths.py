@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import in_16_bits, read_pixels, to_gray8, write_png
+from aeromatch_cli.images.depth import in_16_bits, to_gray8
+from aeromatch_cli.images.files import read_pixels, write_png
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 
 

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.detector import FIELD_PX, PIECE_PX, REACH_PX, Detector, evened, load_detector
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 
 
 @pytest.fixture(scope="module")

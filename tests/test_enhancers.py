@@ -69,7 +69,7 @@ def test_local_contrast_grows(name, dtype, top):
 def test_hue_stays(name):
     gray = textured((96, 96), np.uint8, top=90) + 20
     pixels = np.stack([gray, gray // 2, gray // 4], axis=2)
-    after = enhance(name, pixels, **({"mean": 0.3, "spread": 0.1} if name == "wallis" else {})).pixels
+    after = enhance(name, pixels, **({"mean": 0.3, "standard_deviation": 0.1} if name == "wallis" else {})).pixels
     unclipped = after.max(axis=2) < 250
     hues = [colorsys.rgb_to_hsv(*pixel)[0] * 360.0 for pixel in after[unclipped][::97].astype(float)]
     wanted = [colorsys.rgb_to_hsv(*pixel)[0] * 360.0 for pixel in pixels[unclipped][::97].astype(float)]

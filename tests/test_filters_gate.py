@@ -35,7 +35,7 @@ def test_chance_is_rejected_however_many_inliers_it_has(one, count):
 
 
 def test_many_inliers_among_many_matches_are_no_evidence():
-    verdict = Poselib(false_alarms=1e300)(chance(500, 1), GEOMETRY, 0)
+    verdict = Poselib(max_false_alarms=1e300)(chance(500, 1), GEOMETRY, 0)
     assert verdict.state == "verified"
     assert verdict.keep.sum() >= 15
     assert "no more than chance" in Poselib()(chance(500, 1), GEOMETRY, 0).reason
@@ -65,7 +65,7 @@ def test_the_band_follows_the_noise_of_the_data():
     kept = {}
     for noise_px in (0.1, 0.4, 1.2):
         scene = houses(600, wrong=0.5, noise_px=noise_px, seed=8)
-        verdict = Epipolar(narrowest_px=1.0)(scene.candidates, GEOMETRY, 0)
+        verdict = Epipolar(min_band_px=1.0)(scene.candidates, GEOMETRY, 0)
         assert verdict.keep[scene.true].mean() > 0.97
         kept[noise_px] = verdict.errors_px[verdict.keep].max()
     assert kept[0.1] <= 1.0 < kept[0.4] < 2.5 < kept[1.2] <= 4.0
@@ -78,7 +78,7 @@ def test_the_band_leaves_few_matches_together():
     scene = houses(17, wrong=0.0, noise_px=0.2, seed=9)
     points1 = scene.candidates.points1_px.copy()
     points1[:6] += [[1.5, -1.5]]
-    strict = Epipolar(sigmas=0.1, narrowest_px=0.01)
+    strict = Epipolar(sigmas=0.1, min_band_px=0.01)
     verdict = strict(Candidates(scene.candidates.points0_px, points1), GEOMETRY, 0)
     assert verdict.state == "verified"
     assert verdict.keep.sum() >= 15

@@ -65,7 +65,7 @@ def test_two_layers_that_lie_over_each_other_stay():
     assert keep[true & roof].mean() > 0.92
     assert keep[true & ~roof].mean() > 0.95
     assert keep[~true].mean() < 0.02
-    assert kept(points0, points1, share=0.5)[true & roof].mean() > 0.95
+    assert kept(points0, points1, min_support_share=0.5)[true & roof].mean() > 0.95
 
 
 def test_a_strip_of_a_few_matches_on_a_roof_stays():
@@ -209,8 +209,8 @@ def test_mirrored_neighbourhoods_go():
 
 
 def test_support_that_cannot_be_had_is_refused():
-    with pytest.raises(ValueError, match="least 10 is never reached: 12 neighbours support by at most 10"):
-        Graph(least=10)
+    with pytest.raises(ValueError, match="min_support 10 is never reached: 12 neighbours support by at most 10"):
+        Graph(min_support=10)
 
 
 class First:

@@ -13,9 +13,9 @@ from patch_training.validation import Pair, pairs_of, sift, table
 from safetensors.torch import load_file, save_file
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.geodesc import LENGTH, GeoDesc, describe, load_geodesc
 from aeromatch_cli.nets.patches import SIDE_PX, fold, standardised
-from aeromatch_cli.nets.weights import shipped_path
 
 
 @pytest.fixture(scope="module", autouse=True)

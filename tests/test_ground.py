@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aeromatch_cli.blocks.auto_ground import auto_ground, choose_adjacent_pairs, pair_height
 from aeromatch_cli.blocks.ground import ConstantGround, DemGround, open_dem
 from aeromatch_cli.data import Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, rotation_x, rotation_y, rotation_z
+from aeromatch_cli.orientation.terrain import choose_adjacent_pairs, ground_height, pair_height
 
 CAMERA = Camera("OPENCV", 2000, 1500, (1600.0, 1600.0, 999.5, 749.5, -0.05, 0.01, 1e-4, -1e-4))
 ORIGIN = (333000.0, 3100000.0, 0.0)
@@ -175,6 +175,9 @@ class Matcher:
         self.noise_px, self.wrong, self.count = noise_px, wrong, count
         self.calls: list[tuple[str, str]] = []
 
+    def matched(self, pairs: list[tuple[str, str]]) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+        return {pair: self(*pair) for pair in pairs}
+
     def __call__(self, id0: str, id1: str) -> tuple[FloatArray, FloatArray]:
         self.calls.append((id0, id1))
         rng = np.random.default_rng(len(self.calls))
@@ -217,8 +220,7 @@ def test_exact_poses_give_the_ground(tilt_deg: float) -> None:
     poses = flight(tilt_deg)
     pairs = choose_adjacent_pairs(poses, 4)
     matcher = Matcher(poses)
-    estimate = auto_ground(pairs, poses, cameras(poses), matcher)
-    assert matcher.calls == pairs
+    estimate = ground_height(matcher.matched(pairs), poses, cameras(poses))
     assert estimate.z_m == pytest.approx(GROUND_Z, abs=1.0)
     assert estimate.pairs >= 6
     assert f"{estimate.pairs} adjacent pairs" in estimate.reason
@@ -230,7 +232,7 @@ def test_noisy_poses_are_fitted_before_they_are_used(position_m: float, angle_de
     errors = []
     for seed in range(3):
         poses = disturbed(truth, position_m, angle_deg, seed)
-        estimate = auto_ground(choose_adjacent_pairs(poses, 4), poses, cameras(poses), Matcher(truth))
+        estimate = ground_height(Matcher(truth).matched(choose_adjacent_pairs(poses, 4)), poses, cameras(poses))
         assert estimate.z_m is not None, estimate.reason
         errors.append(estimate.z_m - GROUND_Z)
     assert np.abs(errors).max() < within_m
@@ -239,19 +241,19 @@ def test_noisy_poses_are_fitted_before_they_are_used(position_m: float, angle_de
 def test_estimate_is_reproducible() -> None:
     poses = disturbed(flight(), 1.0, 1.0, 0)
     pairs = choose_adjacent_pairs(poses, 3)
-    first, second = (auto_ground(pairs, poses, cameras(poses), Matcher(flight())) for _ in range(2))
+    first, second = (ground_height(Matcher(flight()).matched(pairs), poses, cameras(poses)) for _ in range(2))
     assert first == second
 
 
 def test_too_few_points_are_refused() -> None:
     poses = flight()
     pairs = choose_adjacent_pairs(poses, 3)
-    nothing = auto_ground(pairs, poses, cameras(poses), lambda id0, id1: (np.zeros((0, 2)), np.zeros((0, 2))))
+    nothing = ground_height(dict.fromkeys(pairs, (np.zeros((0, 2)), np.zeros((0, 2)))), poses, cameras(poses))
     assert nothing.z_m is None
     assert "too few matches" in nothing.reason
-    random = auto_ground(pairs, poses, cameras(poses), Matcher(poses, wrong=1.0))
+    random = ground_height(Matcher(poses, wrong=1.0).matched(pairs), poses, cameras(poses))
     assert random.z_m is None
-    none = auto_ground([], poses, cameras(poses), Matcher(poses))
+    none = ground_height({}, poses, cameras(poses))
     assert (none.z_m, none.reason) == (None, "no adjacent images with attitude")
 
 
@@ -259,7 +261,7 @@ def test_wrong_angle_convention_is_refused() -> None:
     truth = flight()
     # The optical axis of every image points to the sky.
     upside = {i: Pose(p.center_m, rotation_y(180.0) @ p.world_rotation, 0.5, 1.0) for i, p in truth.items()}
-    estimate = auto_ground(choose_adjacent_pairs(upside, 4), upside, cameras(upside), Matcher(truth))
+    estimate = ground_height(Matcher(truth).matched(choose_adjacent_pairs(upside, 4)), upside, cameras(upside))
     assert estimate.z_m is None
     assert "contradict" in estimate.reason or "above the cameras" in estimate.reason
 
@@ -269,7 +271,7 @@ def test_shuffled_poses_are_refused() -> None:
     order = np.random.default_rng(2).permutation(len(truth))
     values = list(truth.values())
     shuffled = {image_id: values[idx] for image_id, idx in zip(truth, order, strict=True)}
-    estimate = auto_ground(choose_adjacent_pairs(shuffled, 4), shuffled, cameras(shuffled), Matcher(truth))
+    estimate = ground_height(Matcher(truth).matched(choose_adjacent_pairs(shuffled, 4)), shuffled, cameras(shuffled))
     assert estimate.z_m is None
 
 

@@ -10,10 +10,10 @@ from aeromatch_cli.data import Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project, undistort
 from aeromatch_cli.geometry.epipolar import essential, relative_pose
 from aeromatch_cli.geometry.prediction import inverse_depths, places_of_heights, search_windows, stereo_of
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
-from aeromatch_cli.strategies.matchers.evidence import most_evident
-from aeromatch_cli.strategies.matchers.guided import SecondSearch, nearby
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
+from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch, nearby
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1000, 750, (900.0, 500.0, 375.0, -0.03))
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -143,7 +143,7 @@ def test_rows_that_all_look_alike_are_matched_by_place():
     twins = noisy_twins(np.zeros(len(world), int), rng)
     sides = [described(s, d) for s, d in zip(seen, twins, strict=True)]
     assert len(Nearest()(*sides, pair_of(pose0, pose1)).indices) == 0
-    matches = Nearest(ample=9999, guided=True, relief=0.03)(*sides, pair_of(pose0, pose1))
+    matches = Nearest(guide_below_matches=9999, guided=True, relief=0.03)(*sides, pair_of(pose0, pose1))
     assert len(matches.indices) > 0.95 * len(world)
     assert np.array_equal(matches.indices[:, 0], matches.indices[:, 1])
 
@@ -156,7 +156,10 @@ def test_verified_matches_lead_to_those_that_are_ambiguous(with_poses):
     kinds = np.where(np.arange(400) % 2 == 0, np.arange(400), 1 + 2 * (np.arange(400) % 50))
     sides = [described(s, d) for s, d in zip(seen, noisy_twins(kinds, rng), strict=True)]
     geometry = pair_of(POSE0, POSE1) if with_poses else pair_of(None, None, None)
-    plain, guided = Nearest()(*sides, geometry).indices, Nearest(ample=9999, guided=True)(*sides, geometry).indices
+    plain, guided = (
+        Nearest()(*sides, geometry).indices,
+        Nearest(guide_below_matches=9999, guided=True)(*sides, geometry).indices,
+    )
     assert len(plain) < 280
     assert len(guided) > 380
     assert (guided[:, 0] == guided[:, 1]).mean() > 0.99
@@ -170,7 +173,7 @@ def test_wrong_sizes_and_wrong_places_are_refused():
     sizes[240:270] *= 3.0
     angles = rng.uniform(0, 2 * np.pi, 30)
     places[270:] += 15.0 * np.column_stack([np.cos(angles), np.sin(angles)])
-    found = Nearest(ample=9999, guided=True)(
+    found = Nearest(guide_below_matches=9999, guided=True)(
         first, replace(second, sizes_px=sizes, keypoints_px=places), pair_of(POSE0, POSE1)
     )
     assert (found.indices < 240).all()
@@ -194,7 +197,7 @@ def test_without_a_model_nothing_lies_outside_the_windows():
         described(rng.uniform([0, 0], [1000, 750], (500, 2)), rng.integers(0, 160, (500, 128), np.uint8))
         for _ in range(2)
     ]
-    strategy = Nearest(ample=9999, guided=True, ratio=1.0)
+    strategy = Nearest(guide_below_matches=9999, guided=True, ratio=1.0)
     idx0, idx1 = strategy(*sides, pair_of(POSE0, POSE1)).indices.T
     assert len(idx0) > 20
     limits = windows(sides[0].keypoints_px[idx0], POSE0, POSE1, relief_m=30.0, sigma_px=1.5)
@@ -217,7 +220,7 @@ def test_twice_the_same_and_much_the_same_from_either_side():
     rng = np.random.default_rng(11)
     seen = scene(rng, 300)
     sides = [described(s, d) for s, d in zip(seen, noisy_twins(np.arange(300) % 150, rng), strict=True)]
-    strategy = Nearest(ample=9999, guided=True, ratio=0.95)
+    strategy = Nearest(guide_below_matches=9999, guided=True, ratio=0.95)
     first, second = (strategy(*sides, pair_of(POSE0, POSE1)) for _ in range(2))
     assert np.array_equal(first.indices, second.indices)
     assert np.array_equal(first.scores, second.scores)
@@ -230,12 +233,12 @@ def test_twice_the_same_and_much_the_same_from_either_side():
 def test_few_keypoints_do_no_harm(counts):
     rng = np.random.default_rng(12)
     sides = [described(rng.uniform(0, 700, (n, 2)), rng.integers(0, 160, (n, 128), np.uint8)) for n in counts]
-    assert len(Nearest(ample=9999, guided=True)(*sides, pair_of(POSE0, POSE1)).indices) <= min(counts)
+    assert len(Nearest(guide_below_matches=9999, guided=True)(*sides, pair_of(POSE0, POSE1)).indices) <= min(counts)
 
 
 def test_poses_are_read_only_when_guided():
     assert Nearest().reads() == frozenset()
-    assert Nearest(ample=9999, guided=True).reads() == {"camera", "pose", "sigma", "ground"}
+    assert Nearest(guide_below_matches=9999, guided=True).reads() == {"camera", "pose", "sigma", "ground"}
 
 
 def test_pairs_with_ample_matches_are_not_searched_again():
@@ -244,7 +247,7 @@ def test_pairs_with_ample_matches_are_not_searched_again():
     first, second = (described(s, d) for s, d in zip(scene(rng, 200), noisy_twins(np.arange(200), rng), strict=True))
     plain = Nearest(ratio=0.6)(first, second, pair_of(POSE0, POSE1))
     assert len(plain.indices) >= 30
-    settled = Nearest(ratio=0.6, ample=30, guided=True)(first, second, pair_of(POSE0, POSE1))
+    settled = Nearest(ratio=0.6, guide_below_matches=30, guided=True)(first, second, pair_of(POSE0, POSE1))
     np.testing.assert_array_equal(settled.indices, plain.indices)
 
 

@@ -16,19 +16,11 @@ from aeromatch_cli.geometry.cameras import distort, normalise, project, undistor
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.geometry.warps import undistorted_from_ground
-from aeromatch_cli.images import (
-    below_horizon,
-    mask_path,
-    read_mask,
-    read_pixels,
-    render_view,
-    sample_colours,
-    sees_sky,
-    shrink,
-    shrink_camera,
-    view_maps,
-    write_png,
-)
+from aeromatch_cli.images.depth import sample_colours
+from aeromatch_cli.images.files import read_mask, read_pixels, write_png
+from aeromatch_cli.images.masks import below_horizon, mask_path, sees_sky
+from aeromatch_cli.images.scaling import shrink, shrink_camera
+from aeromatch_cli.images.views import render_view, view_maps
 from aeromatch_cli.strategies.simulators.ground import GroundView
 
 PINHOLE = Camera("PINHOLE", 640, 480, (700.0, 700.0, 319.5, 239.5))
@@ -217,7 +209,7 @@ def test_masks_of_another_size_are_fitted(tmp_path: Path) -> None:
 
 
 def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:
-    from aeromatch_cli.stages.enhance import without_frames
+    from aeromatch_cli.images.masks import without_frames
 
     pixels = np.full((60, 80), 100, np.uint8)
     pixels[20:30, 20:30] = 0
@@ -412,13 +404,13 @@ def test_colours_are_averages_around_the_points_in_eight_bits() -> None:
 def test_strips_make_the_same_reduced_picture(scale, monkeypatch):
     import cv2
 
-    from aeromatch_cli import images
+    from aeromatch_cli.images import scaling
 
-    monkeypatch.setattr(images, "_STRIP_PX", 20_000)
+    monkeypatch.setattr(scaling, "_STRIP_PX", 20_000)
     rng = np.random.default_rng(0)
     picture = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (403, 605)).astype(np.float32), (0, 0), 4.0)
-    found = images.shrink_in_strips(lambda top, count: picture[top : top + count], (605, 403), scale)
-    wanted = images.shrink(picture, scale)
+    found = scaling.shrink_in_strips(lambda top, count: picture[top : top + count], (605, 403), scale)
+    wanted = scaling.shrink(picture, scale)
     height, width = found.shape
     assert 0 <= wanted.shape[0] - height <= 1
     assert 0 <= wanted.shape[1] - width <= 1

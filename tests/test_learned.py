@@ -16,11 +16,11 @@ from safetensors.torch import load_file, save_file
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.precision import device_of
-from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.learned import Learned
-from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.workspace import fingerprint
 
 SIDE = 320
@@ -149,8 +149,8 @@ def test_flat_picture_has_no_features() -> None:
     ("extract", "match", "message"),
     [
         ("learned", "lightglue", "compares RootSIFT descriptors, extract learned makes GeoDesc; use match nearest or "),
-        ("lattice", "lightglue", "RootSIFT descriptors, extract lattice makes none; use match polar, or extract sift$"),
-        ("lattice", "nearest", "any descriptors, extract lattice makes none; use match polar, or extract sift or "),
+        ("grid", "lightglue", "RootSIFT descriptors, extract grid makes none; use match polar, or extract sift$"),
+        ("grid", "nearest", "any descriptors, extract grid makes none; use match polar, or extract sift or "),
     ],
 )
 def test_matcher_for_other_descriptors_is_refused(extract: str, match: str, message: str) -> None:

@@ -19,9 +19,9 @@ from aeromatch_cli.data import Camera, Features, FloatArray, Matches, Pair, Pair
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Side
 from aeromatch_cli.nets.lightglue_file import CALIBRATION_KEY, read_calibration
-from aeromatch_cli.strategies.matchers.comparison import Found, joined
-from aeromatch_cli.strategies.matchers.inference import wrapped_rad
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Found, joined
+from aeromatch_cli.strategies.matchers.lightglue.inference import wrapped_rad
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
@@ -288,7 +288,7 @@ def test_other_descriptors_are_refused(weights: str) -> None:
 
 def test_missing_weights_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    monkeypatch.setattr("aeromatch_cli.nets.weights.SHIPPED_LIGHTGLUE", tmp_path / "absent.safetensors")
+    monkeypatch.setattr("aeromatch_cli.nets.files.SHIPPED_LIGHTGLUE", tmp_path / "absent.safetensors")
     with pytest.raises(ConfigError, match=r"needs a weights file.*aeromatch weights add"):
         LightGlue().fingerprint_files()
     with pytest.raises(ConfigError, match=r"no such file.*aeromatch weights add"):

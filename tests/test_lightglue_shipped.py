@@ -9,8 +9,8 @@ import torch
 from lightglue_training.blocks import Pair, block_pairs
 from lightglue_training.validation import Found, compared
 
+from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
-from aeromatch_cli.nets.weights import SHIPPED_LIGHTGLUE
 from aeromatch_cli.synthetic import render_block
 
 # Far from the seeds of scripts/training_blocks.

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets import weights
+from aeromatch_cli.nets import files
 from aeromatch_cli.nets.context import Context, load_context
 from aeromatch_cli.nets.detector import Detector, load_detector
 from aeromatch_cli.nets.geodesc import load_geodesc
@@ -34,7 +34,7 @@ LOADERS = {
 def test_a_missing_shipped_file_is_named(
     name: str, load: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(weights, "SHIPPED_FOLDER", tmp_path)
+    monkeypatch.setattr(files, "SHIPPED_FOLDER", tmp_path)
     with pytest.raises(ConfigError, match=rf"{name}\.safetensors is missing: install aeromatch again"):
         load.__wrapped__()  # what the process knows already is no matter
 
@@ -51,9 +51,9 @@ def test_another_networks_file_is_named(load: Callable[..., Any], network: str, 
 
 def test_numbers_are_the_files_and_random_ones_stay() -> None:
     before = torch.get_rng_state()
-    network = load_network(Detector, weights.shipped_path("detector"))
+    network = load_network(Detector, files.shipped_path("detector"))
     assert torch.equal(torch.get_rng_state(), before)
-    given = weights.read_tensors(weights.shipped_path("detector"))
+    given = files.read_tensors(files.shipped_path("detector"))
     assert all(torch.equal(value, given[name].float()) for name, value in network.state_dict().items())
     assert not network.training
 

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from aeromatch_cli.data import Features, Pair, PairGeometry
 from aeromatch_cli.geometry.cameras import from_colmap
-from aeromatch_cli.strategies.matchers import MATCHERS, scan
-from aeromatch_cli.strategies.matchers.assignment import distinct, one_to_one
-from aeromatch_cli.strategies.matchers.nearest import Nearest
-from aeromatch_cli.strategies.matchers.scan import Limits, mutual_nearest
-from aeromatch_cli.strategies.matchers.views import like_views
+from aeromatch_cli.strategies.matchers import MATCHERS
+from aeromatch_cli.strategies.matchers.descriptors import scan
+from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
+from aeromatch_cli.strategies.matchers.descriptors.views import like_views
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
 GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)

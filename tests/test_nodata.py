@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 
 from aeromatch_cli.data import BoolArray, Camera, Features, View
-from aeromatch_cli.images import read_pixels, read_raster
-from aeromatch_cli.stages.enhance import EnhanceTask, load_source
+from aeromatch_cli.images.files import read_pixels, read_raster
+from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.strategies.enhancers.shadow_mask import make_overview
 from aeromatch_cli.strategies.enhancers.tone import tone_of, white_of
 from aeromatch_cli.strategies.extractors.sift import Sift
-from aeromatch_cli.workspace import Workspace
 
 HEIGHT, WIDTH, FRAME = 240, 320, 80
 
@@ -138,7 +137,7 @@ def test_the_nodata_value_counts_where_all_bands_have_it(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("nodata", [-9999.0, 0.5, 256.0, float("nan")])
 def test_nodata_values_that_the_type_cannot_hold_are_passed_over(nodata: float) -> None:
-    from aeromatch_cli.tiff import _has_values
+    from aeromatch_cli.images.tiff import _has_values
 
     assert _has_values(np.zeros((1, 4, 4), np.uint8), [nodata]) is None
     assert _has_values(np.zeros((2, 4, 4), np.uint8), [None, 0.0]) is None
@@ -184,9 +183,7 @@ def test_ordinary_pictures_have_no_mask(tmp_path: Path) -> None:
 
 def loaded(path: Path, mask: Path | None = None, *, colour: bool = True) -> tuple[NDArray[Any], BoolArray | None]:
     camera = Camera("PINHOLE", WIDTH, HEIGHT, (400.0, 400.0, 159.5, 119.5))
-    work = Workspace(path.parent / "work")
-    none = ENHANCERS["none"]()
-    return load_source(EnhanceTask("a", path, mask, camera, None, 1.0, colour, none, False, work, ""), colour=colour)
+    return read_source(Source(path, mask, camera, None, 1.0, ""), colour=colour)
 
 
 def features(pixels: NDArray[Any], valid: BoolArray | None) -> Features:

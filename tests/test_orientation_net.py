@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save_file
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.orientation import OrientationNet, directions, load_orientation
 from aeromatch_cli.nets.patches import SIDE_PX, fold
-from aeromatch_cli.nets.weights import shipped_path
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 
 

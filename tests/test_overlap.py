@@ -6,9 +6,9 @@ from make_features import described
 
 from aeromatch_cli.data import Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap
-from aeromatch_cli.strategies.matchers.comparison import Comparison, Found
-from aeromatch_cli.strategies.matchers.nearest import Nearest
-from aeromatch_cli.strategies.matchers.overlap import in_overlap
+from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.overlap import in_overlap
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 1000, 750, (900.0, 500.0, 375.0))
 DOWN = np.diag([1.0, -1.0, -1.0])

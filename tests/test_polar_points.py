@@ -10,7 +10,7 @@ from make_ground import Shot, pair
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.extractors.grid import Grid
 from aeromatch_cli.strategies.matchers.polar import Polar
 from aeromatch_cli.strategies.matchers.polar.relief import agreed
 from aeromatch_cli.strategies.simulators.none import source_view
@@ -19,14 +19,14 @@ CAMERA = Camera("PINHOLE", 720, 540, (700.0, 700.0, 359.5, 269.5))
 GEOMETRY = PairGeometry(Pair("a", "b", float("nan"), float("nan"), "name"), CAMERA, CAMERA, None, None, None)
 
 
-def lattice(image: Shot, points: int = 800) -> Features:
+def grid(image: Shot, points: int = 800) -> Features:
     gray = image.pixels.astype(np.uint8)
-    return Lattice(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, image.valid)])
+    return Grid(points=points)(CAMERA, [ViewPixels(source_view(CAMERA), gray, image.valid)])
 
 
 def test_points_are_measured_to_a_few_hundredths_of_a_pixel_both_ways():
     first, second, truth = pair(40.0, 0.95, (80.0, 50.0), seed=12, gain=0.9, offset=10.0)
-    sides = lattice(first), lattice(second)
+    sides = grid(first), grid(second)
     matches = Polar()(*sides, GEOMETRY, (first, second))
     assert ((matches.indices < 0).sum(axis=1) == 1).all()
     assert matches.remark == ""
@@ -45,7 +45,7 @@ def test_points_are_measured_to_a_few_hundredths_of_a_pixel_both_ways():
 
 def test_the_order_of_the_images_makes_no_difference_to_where_points_lie():
     first, second, _ = pair(12.0, 1.05, (50.0, 20.0), seed=18)
-    sides = lattice(first, 300), lattice(second, 300)
+    sides = grid(first, 300), grid(second, 300)
     one = Polar()(*sides, GEOMETRY, (first, second))
     other = Polar()(*sides[::-1], GEOMETRY, (second, first))
     found, turned = ({tuple(row): place for row, place in zip(rows, places, strict=True)} for rows, places in (
@@ -63,7 +63,7 @@ def test_sigmas_are_as_large_as_errors(noise, blur_px):
     if blur_px:
         first, second = (Shot(cv2.GaussianBlur(side.pixels, (0, 0), blur_px)) for side in (first, second))
     found = Polar().registered(first, second, GEOMETRY)
-    points = Polar().measured(found, lattice(first).keypoints_px, np.zeros((0, 2)))
+    points = Polar().measured(found, grid(first).keypoints_px, np.zeros((0, 2)))
     off = np.linalg.norm(points.points1_px - apply_homography(truth, points.points0_px), axis=1)
     assert 0.5 < np.sqrt(np.mean((off / points.sigmas_px) ** 2)) < 1.6
 
@@ -75,7 +75,7 @@ def test_relief_is_followed_point_by_point():
     hills = 6.0 * np.sin(x / 130.0) * np.cos(y / 110.0)
     moved = cv2.remap(second.pixels, x + hills, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     other = Shot(moved.astype(np.float32))
-    matches = Polar()(lattice(first), lattice(other), GEOMETRY, (first, other))
+    matches = Polar()(grid(first), grid(other), GEOMETRY, (first, other))
     flat = apply_homography(truth, matches.points0_px)
     # What stands at (x, y) stood at (x + hills, y).
     found = matches.points1_px + np.column_stack(
@@ -92,7 +92,7 @@ def test_nothing_is_measured_where_one_side_is_masked():
     valid = np.ones(second.pixels.shape, bool)
     valid[:, :300] = False
     masked = replace(second, valid=valid)
-    matches = Polar()(lattice(first), lattice(masked), GEOMETRY, (first, masked))
+    matches = Polar()(grid(first), grid(masked), GEOMETRY, (first, masked))
     assert len(matches.indices) > 400
     assert matches.points1_px[:, 0].min() > 300.0
     off = np.linalg.norm(matches.points1_px - apply_homography(truth, matches.points0_px), axis=1)
@@ -102,14 +102,14 @@ def test_nothing_is_measured_where_one_side_is_masked():
 def test_a_smaller_working_size_measures_as_well_as_its_pixels_allow():
     first, second, truth = pair(12.0, 1.05, (60.0, 30.0), seed=17)
     half = tuple(replace(side, finest=0.5) for side in (first, second))
-    matches = Polar()(lattice(first, 400), lattice(second, 400), GEOMETRY, half)
+    matches = Polar()(grid(first, 400), grid(second, 400), GEOMETRY, half)
     off = np.linalg.norm(matches.points1_px - apply_homography(truth, matches.points0_px), axis=1)
     assert len(off) > 300
     assert np.median(off) < 0.15
 
 
 @pytest.mark.parametrize(("settings", "said"), [
-    ({"smallest_scale": 1.3, "largest_scale": 0.8}, "larger than largest_scale"), ({"window": 30}, "give 31"),
+    ({"min_scale": 1.3, "max_scale": 0.8}, "larger than max_scale"), ({"window_px": 30}, "give 31"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_are_refused(settings, said):
     with pytest.raises(ValueError, match=said):
@@ -118,13 +118,13 @@ def test_settings_that_cannot_be_are_refused(settings, said):
 
 def test_one_scale_alone_may_be_asked_for():
     first, second, _ = pair(10.0, 1.0, (40.0, 0.0), seed=3)
-    assert Polar(smallest_scale=1.0, largest_scale=1.0).registered(first, second, GEOMETRY).registration.accepted
+    assert Polar(min_scale=1.0, max_scale=1.0).registered(first, second, GEOMETRY).registration.accepted
 
 
 def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():
     first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
     _, second, _ = pair(0.0, 1.0, (0.0, 0.0), seed=16)
-    features = lattice(first)
+    features = grid(first)
     matches = Polar()(features, features, GEOMETRY, (first, second))
     assert len(matches.indices) == 0
     assert matches.remark
@@ -132,7 +132,7 @@ def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():
 
 def test_without_rasters_it_says_what_it_needs():
     first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
-    features = lattice(first, 20)
+    features = grid(first, 20)
     with pytest.raises(ValueError, match="needs both rasters"):
         Polar()(features, features, GEOMETRY)
 

@@ -10,20 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from make_images import PARROT_XMP, gps_tags, write_dji, write_image
+from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import exif_or_reason
-from aeromatch_cli.blocks.read import BlockInputs, read_block_inputs
+from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.blocks.scan import image_id, image_ids, scan_images
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError, InputError
 
 EAST, NORTH, UP = np.eye(3)
-
-
-def read(images: Path, poses: Path | str | None = None, **options: object) -> BlockInputs:
-    settings: dict = {"sigma_position_m": 2.0, "sigma_angle_deg": 3.0} | options
-    return read_block_inputs(images, None if poses is None else str(poses), **settings)
 
 
 def axes(inputs: BlockInputs, image: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -108,7 +104,7 @@ def test_image_ids_are_unique_plain_and_independent_of_each_other(names: list[st
 def test_dji_gimbal_at_yaw_90_pitch_minus_90_has_its_top_to_the_east(tmp_path: Path) -> None:
     write_dji(tmp_path / "e.jpg", 28.0, -81.0, 150.0, yaw=90.0)  # on UTM 17's central meridian: no convergence
     write_dji(tmp_path / "n.jpg", 28.0, -81.0, 150.0, yaw=0.0, pitch=-45.0)
-    inputs = read(tmp_path, "exif")
+    inputs = read_inputs(tmp_path, "exif")
     right, top, sight = axes(inputs, "e_jpg")
     assert [*right, *top, *sight] == pytest.approx([*-NORTH, *EAST, *-UP], abs=1e-9)
     right, top, sight = axes(inputs, "n_jpg")
@@ -119,7 +115,7 @@ def test_parrot_zero_angles_have_their_top_to_the_north_and_positive_pitch_looks
     gps = gps_tags(28.0, -81.0, 150.0)
     for name, pitch in (("0.jpg", 0), ("10.jpg", 10)):
         write_image(tmp_path / name, gps=gps, xmp=PARROT_XMP.format(yaw=0, pitch=pitch, roll=0))
-    inputs = read(tmp_path, "exif")
+    inputs = read_inputs(tmp_path, "exif")
     right, top, sight = axes(inputs, "0_jpg")
     assert [*right, *top, *sight] == pytest.approx([*EAST, *NORTH, *-UP], abs=1e-9)
     assert axes(inputs, "10_jpg")[2] @ NORTH == pytest.approx(np.sin(np.deg2rad(10)))
@@ -128,7 +124,7 @@ def test_parrot_zero_angles_have_their_top_to_the_north_and_positive_pitch_looks
 def test_zero_omega_phi_kappa_and_the_matching_quaternion(tmp_path: Path) -> None:
     write_image(tmp_path / "a.jpg")
     for columns in ("omega_deg,phi_deg,kappa_deg\na.jpg,1,2,3,0,0,0", "qw,qx,qy,qz\na.jpg,1,2,3,0,1,0,0"):
-        inputs = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{columns}\n"))
+        inputs = read_inputs(tmp_path, write_poses(tmp_path, f"image,x,y,z,{columns}\n"))
         right, top, sight = axes(inputs, "a_jpg")
         assert [*right, *top, *sight] == pytest.approx([*EAST, *NORTH, *-UP], abs=1e-9)
         assert (inputs.crs, inputs.origin_m) == ("local", (0.0, 0.0, 0.0))
@@ -139,17 +135,17 @@ def test_true_yaw_is_turned_to_the_grid_and_grid_yaw_is_not(tmp_path: Path) -> N
     """One degree east of the meridian at 28 N, true north lies 0.4695 degrees left of grid north."""
     write_image(tmp_path / "a.jpg")
     angles = "yaw_deg,pitch_deg,roll_deg"
-    geographic = read(tmp_path, write_poses(tmp_path, f"image,lat,lon,alt,{angles}\na.jpg,28,-80,150,0,-90,0\n"))
+    geographic = read_inputs(tmp_path, write_poses(tmp_path, f"image,lat,lon,alt,{angles}\na.jpg,28,-80,150,0,-90,0\n"))
     top = axes(geographic, "a_jpg")[1]
     assert np.rad2deg(np.arctan2(top[0], top[1])) == pytest.approx(-0.4695, abs=1e-3)
-    grid = read(
+    grid = read_inputs(
         tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,598300,3097600,150,0,-90,0\n"), crs="EPSG:32617"
     )
     assert axes(grid, "a_jpg")[1] == pytest.approx(NORTH, abs=1e-9)
     assert geographic.poses["a_jpg"].center_m == pytest.approx([308.9, 584.1, 150.0], abs=400)
-    nadir = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"), angles="nadir")
+    nadir = read_inputs(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"), angles="nadir")
     assert axes(nadir, "a_jpg")[2] == pytest.approx(-UP, abs=1e-9)
-    gimbal = read(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"))
+    gimbal = read_inputs(tmp_path, write_poses(tmp_path, f"image,x,y,z,{angles}\na.jpg,1,2,3,0,0,0\n"))
     assert axes(gimbal, "a_jpg")[2] == pytest.approx(NORTH, abs=1e-9)
 
 
@@ -159,7 +155,7 @@ def test_true_yaw_is_turned_to_the_grid_and_grid_yaw_is_not(tmp_path: Path) -> N
 def test_exif_block(tmp_path: Path) -> None:
     for row in range(3):
         write_dji(tmp_path / f"{row}.jpg", 46.84, -91.99 + row * 1e-4, 200.0 + row, relative=41.0 + row)
-    inputs = read(tmp_path, "exif")
+    inputs = read_inputs(tmp_path, "exif")
     assert (inputs.crs, inputs.origin_m) == ("EPSG:32615", (577000.0, 5187000.0, 0.0))
     assert [image.image_id for image in inputs.images] == ["0_jpg", "1_jpg", "2_jpg"]
     assert set(inputs.cameras) == {"dji-fc6310_8.8mm_f30_40x30"}
@@ -181,7 +177,7 @@ def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
     (tmp_path / "corrupt.jpg").write_bytes(b"\xff\xd8\xff\xe1 no picture")
     (tmp_path / "empty.jpg").touch()
     (tmp_path / "._good.jpg").write_bytes(b"x")
-    inputs = read(tmp_path, "exif")
+    inputs = read_inputs(tmp_path, "exif")
     assert {image.image_id for image in inputs.images} == {
         *("good_jpg", "noposition_jpg", "noangles_jpg", "zero_jpg", "noaltitude_jpg")
     }
@@ -201,16 +197,16 @@ def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
 
 def test_nothing_usable(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no image"):
-        read(tmp_path)
+        read_inputs(tmp_path)
     (tmp_path / "a.jpg").touch()
     with pytest.raises(InputError, match=r"none of the 1 images .* a\.jpg: file is empty"):
-        read(tmp_path)
+        read_inputs(tmp_path)
 
 
 def test_without_poses_every_image_is_unposed(tmp_path: Path) -> None:
     write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
     for poses in (None, ""):
-        inputs = read(tmp_path, poses)
+        inputs = read_inputs(tmp_path, poses)
         assert (len(inputs.images), dict(inputs.poses), inputs.crs) == (1, {}, "local")
 
 
@@ -218,23 +214,23 @@ def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:
     for name in ("a/1.jpg", "b/1.jpg", "b/2.JPG", "c/3.jpg"):
         write_image(tmp_path / name)
     table = "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,2,0,9\n2.jpg,3,0,9\n1.jpg,4,0,9\nlost.jpg,5,0,9\n3,6,0,9\n"
-    inputs = read(tmp_path, write_poses(tmp_path, table))
+    inputs = read_inputs(tmp_path, write_poses(tmp_path, table))
     found = {image.name: inputs.poses[image.image_id].center_m[0] for image in inputs.images}
     assert found == {"a/1.jpg": 1.0, "b/1.jpg": 2.0, "b/2.JPG": 3.0, "c/3.jpg": 6.0}
     text = "\n".join(inputs.warnings)
     assert "names 1 images that are not in the folder: lost.jpg" in text
     assert "names that several images have (1.jpg)" in text
 
-    partial = read(tmp_path, write_poses(tmp_path, "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,,,\n"))
+    partial = read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,,,\n"))
     assert set(partial.poses) == {"a--1_jpg"}
     assert any("2 of 4 images are not in" in warning for warning in partial.warnings)
     assert "poses.csv, line 3: no number in column x, treated as unposed: b/1.jpg" in partial.warnings
     with pytest.raises(
         ConfigError, match=r"names none of the 4 images .* it says lost\.jpg, the folder holds a/1\.jpg"
     ):
-        read(tmp_path, write_poses(tmp_path, "image,x,y,z\nlost.jpg,1,0,9\n"))
+        read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\nlost.jpg,1,0,9\n"))
     with pytest.raises(ConfigError, match=r"both mean the image b/2\.JPG"):
-        read(tmp_path, write_poses(tmp_path, "image,x,y,z\nb/2.JPG,1,0,9\n2.jpg,1,0,9\n"))
+        read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\nb/2.JPG,1,0,9\n2.jpg,1,0,9\n"))
 
 
 def test_block_json_gives_camera_crs_and_ground(tmp_path: Path) -> None:
@@ -245,7 +241,7 @@ def test_block_json_gives_camera_crs_and_ground(tmp_path: Path) -> None:
     block = tmp_path / "block.json"
     block.write_text(json.dumps({"crs": "EPSG:32615", "cameras": {"1": camera}, "ground_z": {"p50": 161.6}}))
     poses = write_poses(tmp_path, "image,x,y,z,sigma_position_m\na.jpg,576663.2,5188164.9,197.4,0.5\n")
-    inputs = read(images, poses, cameras=str(block))
+    inputs = read_inputs(images, poses, cameras=str(block))
     assert (inputs.crs, inputs.origin_m) == ("EPSG:32615", (576000.0, 5188000.0, 0.0))
     assert (inputs.ground_hint_z_m, inputs.ground_hint_source) == (161.6, "ground height of block.json")
     (image,) = inputs.images
@@ -254,47 +250,47 @@ def test_block_json_gives_camera_crs_and_ground(tmp_path: Path) -> None:
     assert inputs.poses["a_jpg"].center_m == pytest.approx([663.2, 164.9, 197.4])
     assert inputs.poses["a_jpg"].sigma_position_m == 0.5
     assert inputs.failures[0].name == "cropped.jpg"
-    other = read(images, poses, cameras=str(block), crs="EPSG:32616")
+    other = read_inputs(images, poses, cameras=str(block), crs="EPSG:32616")
     assert (other.crs, other.ground_hint_z_m, other.ground_hint_source) == ("EPSG:32616", None, "")
 
 
 def test_cameras_by_folder_and_by_column(tmp_path: Path) -> None:
     for name in ("l/1.jpg", "r/1.jpg", "top.jpg"):
         write_dji(tmp_path / name, 46.84, -91.99, 200.0)
-    assert len(read(tmp_path).cameras) == 1
-    assert len(read(tmp_path, cameras="folder").cameras) == 3
+    assert len(read_inputs(tmp_path).cameras) == 1
+    assert len(read_inputs(tmp_path, cameras="folder").cameras) == 3
     table = "image,x,y,z,camera\nl/1.jpg,1,0,9,A\nr/1.jpg,2,0,9,A\ntop.jpg,3,0,9,B\n"
-    by_column = read(tmp_path, write_poses(tmp_path, table))
+    by_column = read_inputs(tmp_path, write_poses(tmp_path, table))
     ids = {image.name: image.camera_id for image in by_column.images}
     assert ids["l/1.jpg"] == ids["r/1.jpg"] != ids["top.jpg"]
 
 
 def test_a_growing_block_keeps_its_frame(tmp_path: Path) -> None:
     write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
-    first = read(tmp_path, "exif")
+    first = read_inputs(tmp_path, "exif")
     for row in range(3):
         write_dji(tmp_path / f"b{row}.jpg", 46.9, -89.99, 200.0)  # moves the median two kilometres and one zone on
-    grown = read(tmp_path, "exif", known_frame=WorldFrame(first.crs, first.origin_m))
+    grown = read_inputs(tmp_path, "exif", known_frame=WorldFrame(first.crs, first.origin_m))
     assert (grown.crs, grown.origin_m) == (first.crs, first.origin_m)
     assert grown.poses["a_jpg"].center_m.tolist() == first.poses["a_jpg"].center_m.tolist()
-    assert read(tmp_path, "exif").crs == "EPSG:32616"
+    assert read_inputs(tmp_path, "exif").crs == "EPSG:32616"
 
 
 def test_positions_outside_the_crs_and_bad_arguments(tmp_path: Path) -> None:
     write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
     with pytest.raises(ConfigError, match="unknown"):
-        read(tmp_path, "exif", crs="EPSG:nothing")
+        read_inputs(tmp_path, "exif", crs="EPSG:nothing")
     with pytest.raises(ConfigError, match="local frame"):
-        read(tmp_path, "exif", crs="local")
+        read_inputs(tmp_path, "exif", crs="local")
     with pytest.raises(ConfigError, match="angles 'down' is unknown"):
-        read(tmp_path, "exif", angles="down")
+        read_inputs(tmp_path, "exif", angles="down")
     with pytest.raises(ConfigError, match="camera file"):
-        read(tmp_path, "exif", cameras=str(tmp_path / "none.yaml"))
+        read_inputs(tmp_path, "exif", cameras=str(tmp_path / "none.yaml"))
 
 
 def test_facts_may_be_read_elsewhere(tmp_path: Path) -> None:
     write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
     write_image(tmp_path / "b.jpg")
-    inputs = read(tmp_path, read_facts=lambda paths: ["refused", *map(exif_or_reason, paths[1:])])
+    inputs = read_inputs(tmp_path, read_header=lambda path: "refused" if path.name == "a.jpg" else exif_or_reason(path))
     assert inputs.failures[0].reason == "refused"
     assert [image.name for image in inputs.images] == ["b.jpg"]

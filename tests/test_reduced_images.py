@@ -13,8 +13,8 @@ from aeromatch_cli.config import validate
 from aeromatch_cli.data import Block, Camera, Features, FloatArray, Image
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
-from aeromatch_cli.stages import assemble, extract
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages import extract, ground
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import Workspace
 
 WIDTH_PX, HEIGHT_PX = 640, 480
@@ -95,7 +95,7 @@ def test_the_half_pixel_in_numbers():
 
 def test_points_for_the_ground_height_are_stored_pixels(tmp_path, monkeypatch):
     """A reduced picture and a window of it at full size: points differ by the corner of the window."""
-    monkeypatch.setattr(assemble, "_GROUND_SIZE_PX", 300)
+    monkeypatch.setattr(ground, "_GROUND_SIZE_PX", 300)
     rng = np.random.default_rng(6)
     texture = cv2.GaussianBlur(rng.normal(size=(600, 750)), (0, 0), 4.0)
     picture = np.clip(128 + 40 * texture / texture.std(), 0, 255).astype(np.uint8)
@@ -105,7 +105,7 @@ def test_points_for_the_ground_height_are_stored_pixels(tmp_path, monkeypatch):
         cv2.imwrite(str(paths[-1]), part)
         height, width = part.shape
         cameras.append(Camera("SIMPLE_PINHOLE", width, height, (700.0, (width - 1) / 2, (height - 1) / 2)))
-    points0, points1 = assemble._match_reduced(assemble._GroundTask(tuple(paths), tuple(cameras)))
+    points0, points1 = ground._match_reduced(ground._GroundTask(tuple(paths), tuple(cameras)))
     assert len(points0) > 40
     assert points0[:, 0].max() > 400  # scale 0.4: not reduced pixels
     # Without the half pixel the median would be 0.75 px off.

@@ -18,8 +18,9 @@ from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Po
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import MatchEntry, VerifiedEntry, write_features, write_match_row, write_verified_row
 from aeromatch_cli.stages import report
-from aeromatch_cli.stages.common import Context, StageReport
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.report_rows import ImageRow, PairRow, gather, stage_rows
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace, write_atomically, write_json
 
 NASTY = '<img src=x onerror=alert(1)> & "ü b".png'

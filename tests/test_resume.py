@@ -170,7 +170,7 @@ def test_an_edited_pose_redoes_one_image(done_site):
     assert outcome.counts("match") == (IMAGES - 1, PAIRS - IMAGES + 1, 0)
 
 
-def test_a_distrusted_attitude_stays_distrusted_until_it_changes(done_site):
+def test_an_ignored_attitude_stays_ignored_until_it_changes(done_site):
     def turn(rows):
         return [{**row, "kappa_deg": str((float(row["kappa_deg"]) + 360) % 360 - 180)} if i == 1 else row
                 for i, row in enumerate(rows)]  # fmt: skip
@@ -182,7 +182,7 @@ def test_a_distrusted_attitude_stays_distrusted_until_it_changes(done_site):
     assert outcome.facts["stages"]["filter"]["facts"]["rotation_contradicts_pose"] == {
         image_id: pytest.approx(180, abs=8)
     }
-    assert outcome.facts["stages"]["pairs"]["facts"]["distrusted"] == [image_id]
+    assert outcome.facts["stages"]["pairs"]["facts"]["ignored_attitudes"] == [image_id]
     assert done_site("run").done() == {}
     os.utime(done_site.image(3), (1_700_000_000, 1_700_000_000))  # another image changes: the judgement stands
     assert done_site("run").counts("extract") == (1, IMAGES - 1, 0)
@@ -241,7 +241,7 @@ def test_keep_images_makes_the_pictures_of_features_that_exist(done_site):
         "images.csv",
         "reports/filter.json",
         "reports/export.json",
-        "distrusted.json",
+        "ignored_attitudes.json",
     ],
 )
 def test_damaged_files_are_made_again(done_site, name, damage):
@@ -360,7 +360,7 @@ def test_sigterm_is_heard_while_pycolmap_is_loaded():
     """Importing pycolmap installs a handler of its own."""
     code = (
         "import os, signal\n"
-        "from aeromatch_cli.cli import _terminated_like_interrupt\n"
+        "from aeromatch_cli.cli.output import _terminated_like_interrupt\n"
         "from aeromatch_cli.strategies.exporters.colmap import _import_pycolmap\n"
         "with _terminated_like_interrupt():\n"
         "    _import_pycolmap()\n"

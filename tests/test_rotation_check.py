@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.rotations import rotation_z
-from aeromatch_cli.stages.rotations import LARGEST_DIFFERENCE_DEG, LEAST_MATCHES, contradicting_images
+from aeromatch_cli.orientation.attitudes import LARGEST_DIFFERENCE_DEG, LEAST_MATCHES, contradicting_images
 
 RelativeRotation = tuple[str, str, FloatArray, int]
 

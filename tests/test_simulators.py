@@ -147,7 +147,7 @@ def test_far_ground_is_not_enlarged_beyond_the_stretch() -> None:
 
 
 def test_source_is_view_0_on_request() -> None:
-    source, ground = GroundView(source=True)(PINHOLE, pose(20.0, 0, 0), GROUND_Z, 0.2)
+    source, ground = GroundView(keep_source=True)(PINHOLE, pose(20.0, 0, 0), GROUND_Z, 0.2)
     assert source.is_source
     assert not ground.is_source
     assert ground.angle_deg == pytest.approx(20.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.images import render_view
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.stages.simulate import ViewCost, cost_facts
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.simulators.tilts import Tilts
@@ -14,7 +14,7 @@ from aeromatch_cli.strategies.simulators.tilts import Tilts
 def test_cost_is_counted_over_views() -> None:
 
     camera = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))
-    views = Tilts(levels=0, turns=4)(camera, None, None, None)
+    views = Tilts(levels=0, rotations=4)(camera, None, None, None)
     gray = np.zeros((300, 400), np.uint8)
     cost = ViewCost.of([ViewPixels(view, *render_view(gray, None, camera, view)) for view in views])
     assert cost == ViewCost(4, 0.48)

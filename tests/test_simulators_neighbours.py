@@ -43,7 +43,7 @@ def neighbour(pose: Pose, camera: Camera = NADIR) -> Neighbour:
 
 
 def views_of(pose: Pose, *others: Pose, camera: Camera = NADIR, **settings: float) -> dict[str, View]:
-    strategy = NeighbourViews(**{"min_tilt": 1.6, **settings})
+    strategy = NeighbourViews(**{"min_stretch": 1.6, **settings})
     made = strategy(camera, pose, GROUND_Z, GSD_M, [neighbour(other) for other in others])
     return {view.name: view for view in made}
 
@@ -148,10 +148,10 @@ def test_crossed_obliques_are_served_by_the_ground_view() -> None:
 def test_order_of_neighbours_changes_nothing() -> None:
     others = [looking(20.0, 65.0), looking(75.0, 70.0), looking(110.0, 68.0), looking(200.0, 60.0), looking(0.0, 2.0)]
     own = looking(10.0, 8.0)
-    expected = views_of(own, *others, max_views=3, min_tilt=1.3)
+    expected = views_of(own, *others, max_views=3, min_stretch=1.3)
     assert len(expected) == 3
     for order in itertools.islice(itertools.permutations(others), 0, 120, 17):
-        found = views_of(own, *order, max_views=3, min_tilt=1.3)
+        found = views_of(own, *order, max_views=3, min_stretch=1.3)
         assert list(found) == list(expected)
         for name, view in found.items():
             np.testing.assert_array_equal(view.undistorted_from_view, expected[name].undistorted_from_view)
@@ -161,7 +161,7 @@ def test_order_of_neighbours_changes_nothing() -> None:
 def test_views_are_bounded_in_number_and_size() -> None:
     others = [looking(azimuth, 66.0) for azimuth in range(0, 180, 20)]
     for most in (1, 2, 4):
-        made = views_of(looking(0.0, 0.0), *others, max_views=most, max_megapixels=0.05, min_tilt=1.3)
+        made = views_of(looking(0.0, 0.0), *others, max_views=most, max_megapixels=0.05, min_stretch=1.3)
         assert len(made) == most
         assert all(view.width_px * view.height_px <= 0.05e6 for view in made.values())
 
@@ -197,7 +197,7 @@ def test_a_sliver_of_overlap_keeps_the_whole_ground_view() -> None:
 
 
 def test_source_is_view_0_on_request() -> None:
-    made = views_of(looking(0.0, 60.0), looking(180.0, 60.0), source=True)
+    made = views_of(looking(0.0, 60.0), looking(180.0, 60.0), keep_source=True)
     assert list(made) == ["source", "ground", "tilt60-azimuth0"]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.warps import area_scale, source_from_view, view_from_source
-from aeromatch_cli.images import render_view
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.strategies.simulators.tilts import Tilts
 
 PINHOLE = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))
@@ -21,7 +21,7 @@ def inner_points(camera: Camera) -> FloatArray:
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
 def test_every_view_shows_the_whole_image_and_maps_back(camera: Camera) -> None:
-    views = Tilts(levels=3, turns=4)(camera, None, None, None)
+    views = Tilts(levels=3, rotations=4)(camera, None, None, None)
     assert len(views) == 1 + 3 + 4 + 5 + 8
     assert len({view.name for view in views}) == len(views)
     points = inner_points(camera)
@@ -45,7 +45,7 @@ def test_tilts_shrink_one_axis_by_their_factor() -> None:
 
 
 def test_a_quarter_turn_is_exact() -> None:
-    _, turned, *_ = Tilts(levels=0, turns=4)(PINHOLE, None, None, None)
+    _, turned, *_ = Tilts(levels=0, rotations=4)(PINHOLE, None, None, None)
     pixels = np.random.default_rng(5).integers(0, 255, (300, 400), dtype=np.uint8)
     picture, seen = render_view(pixels, None, PINHOLE, turned)
     assert seen is not None
@@ -54,7 +54,7 @@ def test_a_quarter_turn_is_exact() -> None:
 
 
 def test_views_are_bounded() -> None:
-    for view in Tilts(levels=1, turns=3, max_megapixels=0.05)(LENS, None, None, None)[1:]:
+    for view in Tilts(levels=1, rotations=3, max_megapixels=0.05)(LENS, None, None, None)[1:]:
         assert view.width_px * view.height_px <= 0.05e6
         assert float(area_scale(view.undistorted_from_view, np.zeros((1, 2)))[0]) > 1.0
 

@@ -8,11 +8,12 @@ import pytest
 import rasterio
 from make_ground import ground
 
-from aeromatch_cli import tiff
 from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.stages import enhance, pairs, sources
-from aeromatch_cli.stages.sources import StoredRaster
+from aeromatch_cli.images import stored as sources
+from aeromatch_cli.images import tiff
+from aeromatch_cli.images.stored import StoredRaster
+from aeromatch_cli.stages import enhance, pairs
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 WIDTH, HEIGHT = 700, 500
@@ -32,7 +33,7 @@ def raster(tmp_path: Path, *settings: str) -> StoredRaster:
     context, _ = pairs.prepare(
         load("polar", ["pairs=exhaustive", *settings], block, workspace=str(tmp_path / "work")), Executor("serial", 1)
     )
-    return StoredRaster(enhance.make_task(context, context.block.images[0]))
+    return StoredRaster(enhance.source_of(context, context.block.images[0]))
 
 
 @pytest.fixture
@@ -87,7 +88,7 @@ def test_a_tiff_is_never_decoded_whole(tmp_path, images, monkeypatch):
         return read(path, part)
 
     monkeypatch.setattr(tiff, "read_tiff", watched)
-    monkeypatch.setattr("aeromatch_cli.images._STRIP_PX", 60 * WIDTH)
+    monkeypatch.setattr("aeromatch_cli.images.scaling._STRIP_PX", 60 * WIDTH)
     sources._units.clear()
     found.reduced(0.125)
     found.window(100, 200, 64, 48)

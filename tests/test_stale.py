@@ -10,7 +10,7 @@ from conftest import IMAGES, Site, invoke
 
 from aeromatch_cli.formats import read_pairs
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.stages import common
+from aeromatch_cli.stages import context
 from aeromatch_cli.workspace import Workspace, read_json
 
 
@@ -54,7 +54,7 @@ def test_the_ground_is_where_an_oblique_image_looks() -> None:
     images = (Image("a", "a.jpg", 400, 300, "1"), Image("b", "b.jpg", 400, 300, "1"))
     position_only = Pose(pose.center_m, None, 1.0, 1.0)
     block = Block(images, {"1": camera}, {"a": pose, "b": position_only}, "local", (0.0, 0.0, 0.0), ground, "DEM", None)
-    heights_m = common._ground_heights(block)
+    heights_m = context._ground_heights(block)
     assert heights_m["a"] == pytest.approx(20.0)
     assert heights_m["b"] == 0.0
 

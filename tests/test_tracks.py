@@ -1,4 +1,4 @@
-"""Lattice points and their measurements as keypoints and multi-view tracks."""
+"""Grid points and their measurements as keypoints and multi-view tracks."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ LATTICE = {
 
 
 def measured(id0, id1, rows, places, kept=None, state="verified"):
-    """A pair in which lattice points `rows` of id0 were measured at `places`, of which `kept` passed the filters."""
+    """A pair in which grid points `rows` of id0 were measured at `places`, of which `kept` passed the filters."""
 
     def matches(which):
         indices = np.column_stack([np.array(rows)[which], np.full(len(which), -1)]).astype(np.int32)

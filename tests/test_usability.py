@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 from conftest import IMAGES
 from make_images import write_image
+from read_inputs import read_inputs
 
 from aeromatch_cli import __version__
 from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.ground import ConstantGround
-from aeromatch_cli.blocks.read import BlockInputs, read_block_inputs
+from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.stages import report_map
 from aeromatch_cli.strategies.extractors.sift import Sift
 
@@ -165,7 +166,7 @@ def read_grid(folder: Path, crs: str, *positions: tuple[float, float]) -> BlockI
         write_image(folder / f"{index}.jpg")
         lines.append(f"{index}.jpg,{x},{y},100")
     (folder / "poses.csv").write_text("\n".join(lines) + "\n")
-    return read_block_inputs(folder, str(folder / "poses.csv"), crs=crs, sigma_position_m=1.0, sigma_angle_deg=1.0)
+    return read_inputs(folder, folder / "poses.csv", crs=crs)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32617", "auto"])
@@ -251,7 +252,7 @@ def test_memory_estimate_counts_the_largest_view(site):
         return int(site("check", *more).facts["estimate"]["memory_mb"])
 
     # The source is view 0 beside the ground view: more pixels than either alone.
-    assert estimate("--set", "simulate.source=true") > estimate() >= estimate("--set", "simulate=none")
+    assert estimate("--set", "simulate.keep_source=true") > estimate() >= estimate("--set", "simulate=none")
 
 
 def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):

@@ -11,21 +11,17 @@ import torch
 from safetensors.torch import save_file
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.nets import weights
-from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
-from aeromatch_cli.nets.weights import (
+from aeromatch_cli.nets import files
+from aeromatch_cli.nets.files import (
     SHIPPED_FOLDER,
     WeightsCheck,
-    add_weights,
-    list_weights,
     read_tensors,
-    resolve_weights,
     sha256_of_file,
     shipped_weights,
     verify_shipped,
-    verify_weights,
-    weights_folder,
 )
+from aeromatch_cli.nets.folder import add_weights, list_weights, resolve_weights, verify_weights, weights_folder
+from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.stages.weights import manage_weights
 
 DIMENSIONS = Dimensions(input_dim=8, descriptor_dim=16, n_layers=2, num_heads=2, add_scale_ori=True)
@@ -209,8 +205,8 @@ def test_what_ships_is_what_its_sums_say(tmp_path: Path, monkeypatch: pytest.Mon
     assert {check.name for check in verify_shipped()} == names
     assert {check.state for check in verify_shipped()} == {"ok"}
     copy = tmp_path / "trained"
-    shutil.copytree(weights.SHIPPED_FOLDER, copy)
-    monkeypatch.setattr(weights, "SHIPPED_FOLDER", copy)
+    shutil.copytree(files.SHIPPED_FOLDER, copy)
+    monkeypatch.setattr(files, "SHIPPED_FOLDER", copy)
     (copy / "shadow.safetensors").unlink()
     with (copy / "lightglue.safetensors").open("r+b") as stream:
         stream.truncate(1_000_000)

@@ -6,7 +6,7 @@ One bad image never stops the rest: it is left out and recorded. A bad list or s
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, get_args
@@ -16,8 +16,8 @@ import numpy as np
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
 from aeromatch_cli.blocks.cameras import CameraAssignment, cameras_from_exif, cameras_from_file, listed
 from aeromatch_cli.blocks.crs import WorldFrame, checked_crs
-from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
-from aeromatch_cli.blocks.orient import (
+from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Observation,
     observation_of_exif,
@@ -25,14 +25,12 @@ from aeromatch_cli.blocks.orient import (
     oriented,
 )
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, read_poses
-from aeromatch_cli.blocks.scan import ScanFailure, image_ids, scan_images
+from aeromatch_cli.blocks.scan import ScanFailure, image_ids
 from aeromatch_cli.data import Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 
 EXIF = "exif"
 FOLDER = "folder"
-
-FactsReader = Callable[[Sequence[Path]], Sequence[ExifFacts | str]]
 
 
 class ReadFailure(NamedTuple):
@@ -66,56 +64,78 @@ class BlockInputs:
     failures: tuple[ReadFailure, ...]
 
 
-def read_facts_serially(paths: Sequence[Path]) -> list[ExifFacts | str]:
-    """Header facts of each file, or the reason why it is unusable; about a millisecond per file."""
-    return [exif_or_reason(path) for path in paths]
+@dataclass(frozen=True, eq=False)
+class GivenLists:
+    """The files that describe a block.
+
+    poses, cameras: as the user wrote them: a path, "exif", "folder" (a camera for every folder), "" for none. angles:
+    what yaw, pitch, roll mean; "auto": by the tags' origin in EXIF (DJI gimbal, Camera:* nadir), gimbal in a pose list.
+    pose_list, camera_file: None where no file was given.
+    """
+
+    poses: str
+    cameras: str
+    angles: AngleConvention
+    pose_list: PoseList | None
+    camera_file: CameraFile | None
 
 
-def read_block_inputs(
+def read_lists(poses: str | None, cameras: str = EXIF, angles: AngleConvention = "auto") -> GivenLists:
+    """Read the pose list and the camera file. To be called first: they are quick, and a mistake in them should not
+    cost a walk over 10,000 files.
+
+    poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder".
+    Raises ConfigError for a bad argument, pose list or camera file.
+    """
+    if angles not in get_args(AngleConvention):
+        raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
+    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
+    camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
+    return GivenLists(poses or "", cameras, angles, pose_list, camera_file)
+
+
+def block_inputs(
     images_dir: Path,
-    poses: str | None,
-    cameras: str = EXIF,
-    crs: str = "auto",
-    angles: AngleConvention = "auto",
+    lists: GivenLists,
+    headers: Mapping[str, ExifFacts | str],
+    passed_over: Sequence[ScanFailure] = (),
     *,
+    crs: str = "auto",
     sigma_position_m: float,
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
-    read_facts: FactsReader = read_facts_serially,
-    exclude: Sequence[Path] = (),
 ) -> BlockInputs:
-    """Reads everything that is known of a block, except its ground.
+    """Everything that is known of a block, except its ground.
 
-    poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder" (a
-    camera of its own for every folder). crs: a code, "local" or "auto". angles: what yaw, pitch, roll mean; "auto":
-    by the tags' origin in EXIF (DJI gimbal, Camera:* nadir), gimbal in a pose list. sigmas: of a pose that states
-    none. known_frame: of an earlier run in the same workspace, kept so that a growing block does not move.
-    read_facts: maps `exif.exif_or_reason` over paths, in order; give a parallel one for large blocks. exclude: folders
-    whose pictures are no images of the block (masks, a workspace).
+    images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
+    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
+    "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
+    that a growing block does not move.
 
-    Raises ConfigError for a bad argument, pose list or camera file, InputError where no image is left.
+    Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
-    # Lists first: they are quick, and a mistake in them should not cost a walk over 10,000 files.
-    pose_list, camera_file = _read_lists(poses, cameras, angles)
-    names, facts, warnings, failures = _read_folder(images_dir, exclude, read_facts)
+    warnings, failures = _report_scan(passed_over)
+    failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
+    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
     rows: dict[str, PoseRow] = {}
-    if pose_list is not None:
-        rows, remarks = _matched(pose_list, names, f"pose list {poses}")
-        warnings += [*pose_list.warnings, *remarks]
-    assignment = _assign_cameras(cameras, camera_file, facts, {name: row.camera for name, row in rows.items()})
+    if lists.pose_list is not None:
+        rows, remarks = _matched(lists.pose_list, list(headers), f"pose list {lists.poses}")
+        warnings += [*lists.pose_list.warnings, *remarks]
+    assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
     warnings += assignment.warnings
     failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
     facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
     if not facts:
         raise InputError(_nothing_left(images_dir, failures))
 
-    observations, remarks = _observations(poses or "", rows, facts, angles)
+    observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
+    camera_file = lists.camera_file
     frame, named_poses, unusable = oriented(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
-    stated = _stated_ground(camera_file, frame, Path(cameras).name)
+    stated = _stated_ground(camera_file, frame, Path(lists.cameras).name)
     hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
     ids = image_ids(facts)
     return BlockInputs(
@@ -131,26 +151,6 @@ def read_block_inputs(
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
     )
-
-
-def _read_lists(poses: str | None, cameras: str, angles: AngleConvention) -> tuple[PoseList | None, CameraFile | None]:
-    """The pose list and the camera file, None where they are not files."""
-    if angles not in get_args(AngleConvention):
-        raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
-    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
-    return pose_list, read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
-
-
-def _read_folder(
-    images_dir: Path, exclude: Sequence[Path], read_facts: FactsReader
-) -> tuple[Sequence[str], dict[str, ExifFacts], list[str], list[ReadFailure]]:
-    """Names of all pictures, header facts of the readable ones, warnings, and failures."""
-    names, scan_failures = scan_images(images_dir, exclude)
-    warnings, failures = _report_scan(scan_failures)
-    outcomes = dict(zip(names, read_facts([images_dir / name for name in names]), strict=True))
-    failures += [ReadFailure(name, reason) for name, reason in outcomes.items() if isinstance(reason, str)]
-    facts = {name: fact for name, fact in outcomes.items() if not isinstance(fact, str)}
-    return names, facts, warnings, failures
 
 
 def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: Mapping[str, str]) -> tuple[Image, ...]:
@@ -170,7 +170,7 @@ def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: 
     return tuple(sorted(images, key=lambda image: image.image_id))
 
 
-def _report_scan(scan_failures: list[ScanFailure]) -> tuple[list[str], list[ReadFailure]]:
+def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[ReadFailure]]:
     """Warnings of by-products, one per kind, and failures of pictures that are missing."""
     failures = [ReadFailure(item.name, item.reason) for item in scan_failures if item.image_lost]
     passed: dict[str, list[str]] = defaultdict(list)
@@ -186,14 +186,12 @@ def _nothing_left(images_dir: Path, failures: list[ReadFailure]) -> str:
     return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
 
 
-def _assign_cameras(
-    cameras: str, camera_file: CameraFile | None, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]
-) -> CameraAssignment:
-    if camera_file is not None:
+def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]) -> CameraAssignment:
+    if lists.camera_file is not None:
         sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
-        return cameras_from_file(camera_file.cameras, sizes_px, columns)
+        return cameras_from_file(lists.camera_file.cameras, sizes_px, columns)
     groups = dict(columns)
-    if cameras == FOLDER:
+    if lists.cameras == FOLDER:
         groups = {name: columns.get(name) or str(PurePosixPath(name).parent) for name in facts}
         groups = {name: "" if group == "." else group for name, group in groups.items()}
     return cameras_from_exif(facts, groups)
@@ -249,19 +247,19 @@ def _matched(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[di
 
 
 def _observations(
-    poses: str, rows: Mapping[str, PoseRow], facts: Mapping[str, ExifFacts], angles: AngleConvention
+    lists: GivenLists, rows: Mapping[str, PoseRow], facts: Mapping[str, ExifFacts]
 ) -> tuple[dict[str, Observation], list[str]]:
     """Observations by image name, and remarks on what the headers lack where poses come from EXIF."""
     observations: dict[str, Observation] = {}
-    if poses != EXIF:
+    if lists.poses != EXIF:
         for name in facts:
-            stated = observation_of_row(rows[name], angles) if name in rows else None
+            stated = observation_of_row(rows[name], lists.angles) if name in rows else None
             if stated is not None:
                 observations[name] = stated
         return observations, []
     without: dict[str, list[str]] = defaultdict(list)
     for name, fact in facts.items():
-        observation = observation_of_exif(fact, angles)
+        observation = observation_of_exif(fact, lists.angles)
         if observation is not None:
             observations[name] = observation
             if observation.attitude is None:

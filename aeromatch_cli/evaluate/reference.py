@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
-from aeromatch_cli.blocks.orient import observation_of_row, oriented
+from aeromatch_cli.blocks.observations import observation_of_row, oriented
 from aeromatch_cli.blocks.poses import PoseRow, read_poses
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError, InputError

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 
 _LONGER_SIDE_PX, _CELL_PX = 1000, 16
 _SMOOTHING_PX, _PERCENTILE = 1.0, 75

@@ -16,8 +16,8 @@ import torch
 import torch.nn.functional as nnf
 from torch import Tensor, nn
 
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.loading import load_network, once_per_file
-from aeromatch_cli.nets.weights import shipped_path
 
 DESCRIPTOR, VISUAL, GEOMETRIC = 128, 64, 64
 NEIGHBOURS = 12

@@ -19,9 +19,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.precision import Precision
-from aeromatch_cli.nets.weights import shipped_path
 
 CHANNELS = 16
 _GAPS = (1, 1, 2, 2, 1)

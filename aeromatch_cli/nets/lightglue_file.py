@@ -13,9 +13,9 @@ from torch import Tensor
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import read_tensors
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.loading import check_same_tensors
-from aeromatch_cli.nets.weights import read_tensors
 
 # kornia's constructor makes it from the number of layers, so a file may have it or leave it out.
 _DERIVED = frozenset({"confidence_thresholds"})

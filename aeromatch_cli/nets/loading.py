@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.nets.files import read_tensors
 from aeromatch_cli.nets.precision import Precision, layer_type
-from aeromatch_cli.nets.weights import read_tensors
 
 _MAX_NAMED = 3
 Network = TypeVar("Network", bound=nn.Module)

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
-from aeromatch_cli.nets.weights import shipped_path
 
 BINS = 36
 _QUARTERS = 4

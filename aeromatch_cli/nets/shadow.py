@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 
 SCALES = 5
 MULTIPLE_PX = 2**SCALES  # the first scale works on 2 x 2 pixels at once

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.data import Features, Image, Pair
-from aeromatch_cli.images import shrink_camera
-from aeromatch_cli.stages import enhance, extract, simulate
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.stages import extract, simulate
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.rows import PairTask
@@ -58,7 +58,7 @@ class _PairTrial:
     pair: PairTask
     matcher: Matcher
     chain: tuple[Filter, ...]
-    sources: tuple[enhance.EnhanceTask, enhance.EnhanceTask] | None
+    sources: tuple[Source, Source] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +78,11 @@ def _try_image(trial: _Trial) -> _Tried:
     views = trial.task.views
     started = time.perf_counter()
     if not trial.sample:
-        enhance.load_source(views.source, colour=False)
+        read_source(views.enhance.source, colour=False)
         return _Tried(0.0, time.perf_counter() - started)
-    _features(trial, replace(views, source=replace(views.source, scale=views.source.scale * _WARM_UP_SCALE)))
+    source = views.enhance.source
+    reduced = replace(views.enhance, source=replace(source, scale=source.scale * _WARM_UP_SCALE))
+    _features(trial, replace(views, enhance=reduced))
     ready = time.perf_counter()
     features = _features(trial, views)
     return _Tried(ready - started, time.perf_counter() - ready, features)
@@ -88,7 +90,7 @@ def _try_image(trial: _Trial) -> _Tried:
 
 def _features(trial: _Trial, views: simulate.SimulateTask) -> Features:
     pictures, _ = simulate.render(views)
-    return trial.task.extractor(shrink_camera(views.source.camera, views.source.scale), pictures)
+    return trial.task.extractor(views.enhance.source.working_camera, pictures)
 
 
 def _try_pair(trial: _PairTrial) -> _Tried:
@@ -136,8 +138,8 @@ def _sample(context: Context) -> list[Pair]:
 def _pixels(image: Image, trial: _Trial) -> int:
     """What an image is worked on as: its own pixels, or those of all its views."""
     views = simulate.views_of(trial.task.views)
-    source = trial.task.views.source
-    if source.enhancer.beside and not source.spared:
+    enhancing = trial.task.views.enhance
+    if enhancing.enhancer.keep_source and not enhancing.skipped:
         views *= 2
     return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
 
@@ -157,7 +159,7 @@ def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _
             shown = None
             if settings.match.reads_pixels:
                 tasks = [extract.task_of(context, image_id) for image_id in (pair.image_id0, pair.image_id1)]
-                shown = tasks[0].views.source, tasks[1].views.source
+                shown = tasks[0].views.enhance.source, tasks[1].views.enhance.source
             trials.append(_PairTrial((features0, features1), task, settings.match, settings.filter, shown))
     return [o.value for o in context.executor.run(_try_pair, trials, "check") if o.value is not None]
 

@@ -13,8 +13,9 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import MatchEntry, read_keypoints, read_match_row
-from aeromatch_cli.stages.common import Context, StageReport, run_stage, unexplained
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import outdated_pairs, pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents

@@ -11,9 +11,10 @@ import numpy as np
 from aeromatch_cli.data import Features, Image
 from aeromatch_cli.formats import features_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
-from aeromatch_cli.images import sample_colours, shrink_camera
+from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.stages import enhance, simulate
-from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Extractor
 from aeromatch_cli.workspace import fingerprint, write_atomically
 
@@ -29,11 +30,11 @@ class ExtractTask:
 
     @property
     def image_id(self) -> str:
-        return self.views.source.image_id
+        return self.views.enhance.image_id
 
     @property
     def path(self) -> Path:
-        return self.views.source.workspace.features(self.image_id)
+        return self.views.enhance.workspace.features(self.image_id)
 
 
 def make_task(context: Context, image: Image) -> ExtractTask:
@@ -56,15 +57,14 @@ class Extracted:
 def run_task(task: ExtractTask) -> Extracted:
     """Write features/<id>.npz."""
     pictures, enhancement = simulate.render(task.views)
-    source = task.views.source
-    camera = shrink_camera(source.camera, source.scale)
+    source = task.views.enhance.source
     further = simulate.further_views(pictures)
-    features = (task.extractor.with_room_for(further) if further else task.extractor)(camera, pictures)
+    features = (task.extractor.with_room_for(further) if further else task.extractor)(source.working_camera, pictures)
     if task.extractor.colours:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)
     features = _in_stored_frame(features, source.scale)
-    enhance.keep(source, enhancement, picture=task.keep_images)
+    enhance.keep(task.views.enhance, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
     return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
@@ -105,7 +105,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     if made:
         counts = [item.keypoints for item in made]
         facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
-        facts |= enhance.sun_facts(task.views.source for task in tasks)
+        facts |= enhance.illumination_facts(task.views.enhance for task in tasks)
         summed = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
         report.facts = summed | simulate.cost_facts([item.cost for item in made], report.facts)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
@@ -115,8 +115,7 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 def _is_done(task: ExtractTask) -> bool:
     if features_fingerprint(task.path) != task.fingerprint:
         return False
-    source = task.views.source
-    return not task.keep_images or (enhance.is_done(source) and simulate.is_done(task.views))
+    return not task.keep_images or (enhance.is_done(task.views.enhance) and simulate.is_done(task.views))
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:

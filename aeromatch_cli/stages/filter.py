@@ -22,9 +22,11 @@ from aeromatch_cli.formats import (
     row_fingerprints,
     write_verified_row,
 )
-from aeromatch_cli.stages import distrust, extract, match, rows
-from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage, unexplained
+from aeromatch_cli.stages import attitudes, extract, match, rows
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
+from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
@@ -174,7 +176,7 @@ def run(context: Context) -> StageReport:
     root = components(context)
     report.facts = summarise(context, root)
     if context.shard is None:
-        judged = distrust.judge(context, _rotations(context), None if missing else root)
+        judged = attitudes.judge(context, _rotations(context), None if missing else root)
         report.facts["rotation_contradicts_pose"] = judged
     return report.write(context.workspace, context.shard)
 

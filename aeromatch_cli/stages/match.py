@@ -9,12 +9,14 @@ from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
+from aeromatch_cli.images.source import Source
+from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import asked_together
-from aeromatch_cli.stages.common import Context, StageReport, library_version, run_stage
-from aeromatch_cli.stages.enhance import EnhanceTask
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.rows import PairTask
-from aeromatch_cli.stages.sources import StoredRaster
+from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
@@ -29,7 +31,7 @@ class MatchTask:
     workspace: Workspace
     overwrite: bool
     # By image_id, for a matcher that reads pixels.
-    sources: Mapping[str, EnhanceTask] = field(default_factory=dict)
+    sources: Mapping[str, Source] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def make_tasks(context: Context) -> list[MatchTask]:
         row = tuple(PairTask(context.geometry(p), pair_fingerprint(context, p), seed=0) for p in usable)
         if row:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
-            sources = {image_id: extract.task_of(context, image_id).views.source for image_id in ids}
+            sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
             task = MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite, sources)
             tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
@@ -102,7 +104,7 @@ def compared(
     matcher: Matcher,
     features: tuple[Features, Features],
     geometry: PairGeometry,
-    sources: tuple[EnhanceTask, EnhanceTask] | None,
+    sources: tuple[Source, Source] | None,
 ) -> Matches:
     """Matches of one pair. sources: of both images, for a matcher that reads pixels."""
     if sources is None:

@@ -14,9 +14,11 @@ from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import cameras_text, images_text, pairs_text, poses_text, read_pairs
-from aeromatch_cli.stages.assemble import Assembled, assemble
-from aeromatch_cli.stages.common import Context, Shard, StageReport, forget_absent
-from aeromatch_cli.stages.distrust import without_distrusted
+from aeromatch_cli.stages.attitudes import without_ignored_attitudes
+from aeromatch_cli.stages.block import BlockRead, read_block
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import Workspace, file_digest, fingerprint, read_json, write_json, write_text
 
@@ -43,8 +45,8 @@ def prepare(
         workspace.check_version()
     else:
         workspace.create()
-    assembled = assemble(settings, workspace, executor)
-    context = without_distrusted(_context(settings, workspace, executor, assembled, shard, overwrite))
+    found = read_block(settings, workspace, executor)
+    context = without_ignored_attitudes(_context(settings, workspace, executor, found, shard, overwrite))
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
     if pairs is not None:
@@ -52,20 +54,20 @@ def prepare(
     else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-    summary = summarise(assembled.block, pairs)
+    summary, pairs_csv = summarise(found.block, pairs), pairs_text(pairs)
     report.facts = {
         "summary": [*summary.lines(), *_remarks(settings, summary.oriented)],
         "block": summary.figures(),
-        "warnings": [*assembled.warnings, *summary.warnings],
-        "images": len(assembled.block.images),
-        "distrusted": sorted(_turned(context)),
-        "pairs_sha256": hashlib.sha256(pairs_text(pairs).encode("utf-8")).hexdigest(),
+        "warnings": [*found.warnings, *summary.warnings],
+        "images": len(found.block.images),
+        "ignored_attitudes": sorted(_ignored(context)),
+        "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
-    report.failures = list(assembled.failures)
+    report.failures = list(found.failures)
     report.fingerprint = wanted
     context = replace(context, pairs=tuple(pairs))
     if not dry:
-        _write(context, assembled, pairs)
+        _write(context, found, pairs_csv)
         forget_absent(context)
         report.write(workspace)
     for warning in report.facts["warnings"]:
@@ -84,7 +86,7 @@ def _context(
     settings: Settings,
     workspace: Workspace,
     executor: Executor,
-    assembled: Assembled,
+    found: BlockRead,
     shard: Shard | None,
     overwrite: bool,
 ) -> Context:
@@ -93,11 +95,11 @@ def _context(
         settings=settings,
         workspace=workspace,
         executor=executor,
-        block=assembled.block,
+        block=found.block,
         pairs=(),
-        image_fingerprints=assembled.image_fingerprints,
-        given_poses=assembled.block.poses,
-        guessed_cameras=assembled.guessed_cameras,
+        image_fingerprints=found.image_fingerprints,
+        given_poses=found.block.poses,
+        guessed_cameras=found.guessed_cameras,
         shard=shard,
         overwrite=overwrite,
     )
@@ -129,7 +131,7 @@ def _remarks(settings: Settings, oriented: int) -> list[str]:
     return found
 
 
-def _turned(context: Context) -> set[str]:
+def _ignored(context: Context) -> set[str]:
     """Images whose given attitude is not used."""
     return {
         i
@@ -156,11 +158,15 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     return read_pairs(workspace.pairs)
 
 
-def _write(context: Context, assembled: Assembled, pairs: list[Pair]) -> None:
-    workspace, block = context.workspace, assembled.block
-    write_text(workspace.config, dump(context.settings))
-    write_json(workspace.block, dict(assembled.record))
-    write_text(workspace.images, images_text(block.images, context.image_fingerprints))
-    write_text(workspace.cameras, cameras_text(block.cameras))
-    write_text(workspace.poses, poses_text(block.poses))
-    write_text(workspace.pairs, pairs_text(pairs))
+def _write(context: Context, found: BlockRead, pairs_csv: str) -> None:
+    workspace, block = context.workspace, found.block
+    texts = {
+        workspace.config: dump(context.settings),
+        workspace.images: images_text(block.images, context.image_fingerprints),
+        workspace.cameras: cameras_text(block.cameras),
+        workspace.poses: poses_text(block.poses),
+        workspace.pairs: pairs_csv,
+    }
+    write_json(workspace.block, dict(found.record))
+    for path, text in texts.items():
+        write_text(path, text)

@@ -18,13 +18,14 @@ from aeromatch_cli.data import FloatArray, Matches
 from aeromatch_cli.errors import ItemError, WorkspaceError
 from aeromatch_cli.formats import read_keypoints, read_match_row, read_verified_row
 from aeromatch_cli.geometry.footprints import block_footprints
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages import report_figures as figures
 from aeromatch_cli.stages import report_map
-from aeromatch_cli.stages.common import Context, StageReport
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, components, match_points, summarise
 from aeromatch_cli.stages.report_evaluation import evaluation_figures
 from aeromatch_cli.stages.report_rows import NOT_JUDGED, ImageRow, PairRow, StageRow, failure_rows, gather, stage_rows
+from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import fingerprint, read_json, write_text
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.

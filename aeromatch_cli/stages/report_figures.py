@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.images import shrink, to_gray8
+from aeromatch_cli.images.depth import to_gray8
+from aeromatch_cli.images.scaling import shrink
 
 MAX_PREVIEW_LINES = 150
 MAX_PREVIEW_POINTS = 2000

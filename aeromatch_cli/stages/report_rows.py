@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats import VerifiedEntry, read_csv, read_keypoints
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points, verified_pairs
 from aeromatch_cli.workspace import Workspace, read_json
 

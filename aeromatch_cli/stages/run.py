@@ -13,8 +13,10 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, report, simulate  # noqa: A004
-from aeromatch_cli.stages.common import Context, Shard, StageReport, gather_failures, owner
-from aeromatch_cli.stages.distrust import without_distrusted
+from aeromatch_cli.stages.attitudes import without_ignored_attitudes
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
 from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
@@ -31,7 +33,7 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # What a command rests on: everything before it in this chain.
 _CHAIN = ("pairs", "extract", "match", "filter", "export", "report")
-# How often attitudes may be distrusted and their images done again; each pass can only add images.
+# How often attitudes may be ignored and their images done again; each pass can only add images.
 _MAX_PASSES = 10
 
 
@@ -106,7 +108,7 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
 
 def _report_turned(context: Context, judged: StageReport) -> None:
     """Images that lost their attitude in this very stage: their views, pairs and verdicts are out of date now."""
-    trusted = without_distrusted(replace(context, overwrite=False))
+    trusted = without_ignored_attitudes(replace(context, overwrite=False))
     remedy = "run `aeromatch run`, or match and filter again, to go on without it"
     doubted = dict.fromkeys(trusted.suspects - context.suspects, f"nothing matches by its attitude: {remedy}")
     turned = dict.fromkeys(_attitudes(context) - _attitudes(trusted), f"matches contradict its attitude: {remedy}")
@@ -125,7 +127,7 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
             if reports
             else again
         )
-        trusted = without_distrusted(replace(context, overwrite=False))
+        trusted = without_ignored_attitudes(replace(context, overwrite=False))
         unchanged = _attitudes(trusted) == _attitudes(context) and trusted.suspects == context.suspects
         if context.shard is not None or unchanged:
             break
@@ -218,8 +220,8 @@ def _picture_lines(stage: StageReport) -> list[str]:
     if "views_per_image" in facts:
         views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
         words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
-    if facts.get(enhance.SPARED):
-        words.append(f"{facts[enhance.SPARED]} images not enhanced: one sun")
+    if facts.get(enhance.SKIPPED):
+        words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
     if "remark" in facts:
         words.append(facts["remark"])
     return [f"          {'; '.join(words)}"] if words else []

@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Image, Neighbour, Pose, View
-from aeromatch_cli.images import render_view, shrink_camera, to_gray8, write_png
+from aeromatch_cli.images.depth import to_gray8
+from aeromatch_cli.images.files import write_png
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.stages import enhance
-from aeromatch_cli.stages.common import Context, StageReport, run_stage
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
 from aeromatch_cli.workspace import fingerprint, read_json, write_atomically, write_json
@@ -26,7 +29,7 @@ _ADDED = "as-taken"
 class SimulateTask:
     """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown. as_taken: also as it is."""
 
-    source: enhance.EnhanceTask
+    enhance: enhance.EnhanceTask
     pose: Pose | None
     ground_z_m: float | None
     gsd_m: float | None
@@ -38,20 +41,20 @@ class SimulateTask:
 
 def make_task(context: Context, image: Image) -> SimulateTask:
     """The task of one image, with the fingerprint of everything that its result depends on."""
-    source = enhance.make_task(context, image)
+    enhancing = enhance.make_task(context, image)
     simulator = context.settings.simulate
     ground_z_m = context.ground_z_m(image.image_id)
     geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
     as_taken = context.settings.extract.follows_north and context.lacks_north(image.image_id)
-    own = fingerprint(source.fingerprint, source.spared, simulator, geometry, as_taken)
+    own = fingerprint(enhancing.fingerprint, enhancing.skipped, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)
-    return SimulateTask(source, pose, ground_z_m, context.block.gsd_m, neighbours, as_taken, simulator, own)
+    return SimulateTask(enhancing, pose, ground_z_m, context.block.gsd_m, neighbours, as_taken, simulator, own)
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:
     """The views of one image: geometry only."""
-    camera = shrink_camera(task.source.camera, task.source.scale)
+    camera = task.enhance.source.working_camera
     views = task.simulator(camera, task.pose, task.ground_z_m, task.gsd_m, task.neighbours)
     if task.as_taken and not any(view.is_source for view in views):
         return (replace(source_view(camera, task.pose), name=_ADDED), *views)
@@ -63,11 +66,11 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
 
     With an enhancement `beside` the source that changed anything, all views of the source and then all of that.
     """
-    pixels, valid, result = enhance.for_views(task.source)
+    pixels, valid, result = enhance.for_views(task.enhance)
     grays = [(to_gray8(result.pixels), False)]
-    if task.source.enhancer.beside and result.pixels is not pixels:
+    if task.enhance.enhancer.keep_source and result.pixels is not pixels:
         grays = [(to_gray8(pixels), False), (grays[0][0], True)]
-    camera = shrink_camera(task.source.camera, task.source.scale)
+    camera = task.enhance.source.working_camera
     views, pictures = views_of(task), []
     for gray, enhanced in grays:
         for view in views:
@@ -96,7 +99,7 @@ class ViewCost:
 
 def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: bool) -> None:
     """Write views.json, and with `with_pictures` a PNG of every view; those of the very same views stay anyway."""
-    workspace, image_id = task.source.workspace, task.source.image_id
+    workspace, image_id = task.enhance.workspace, task.enhance.image_id
     stay = with_pictures or is_done(task)
     stale = set(workspace.views(image_id).parent.glob("*.png"))
     if stay:
@@ -112,7 +115,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
         {
             "fingerprint": task.fingerprint,
             "pictures": stay,
-            "scale": task.source.scale,
+            "scale": task.enhance.source.scale,
             "views": [
                 {
                     "name": view.name,
@@ -155,7 +158,7 @@ def run(context: Context) -> StageReport:
     tasks = [make_task(context, image) for image in context.images()]
     todo = [task for task in tasks if context.overwrite or not is_done(task)]
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
-    costs = run_stage(context, report, _run_task, todo, [task.source.image_id for task in todo])
+    costs = run_stage(context, report, _run_task, todo, [task.enhance.image_id for task in todo])
     if costs:
         report.facts = cost_facts(costs, {})
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
@@ -164,7 +167,7 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    workspace, image_id = task.source.workspace, task.source.image_id
+    workspace, image_id = task.enhance.workspace, task.enhance.image_id
     path = workspace.views(image_id)
     if not path.is_file():
         return False

@@ -1,7 +1,7 @@
 """Multi-view tracks of points that were measured without a detector.
 
-A lattice point of an image and its measurements in others are one track. Exporters want keypoints: those of an image
-become its lattice and then what others measured in it. Where a measurement falls on a lattice point, or on another
+A grid point of an image and its measurements in others are one track. Exporters want keypoints: those of an image
+become its grid and then what others measured in it. Where a measurement falls on a grid point, or on another
 image's measurement, both are one keypoint if all that is known of their tracks agrees; and what two images measured of
 the same track is a match of theirs too, where the pair's model says so.
 """
@@ -34,7 +34,7 @@ class MatchedPair:
 
     @property
     def kept(self) -> BoolArray:
-        """(M,) which of the raw matches the filters kept: a lattice point is measured once in a pair."""
+        """(M,) which of the raw matches the filters kept: a grid point is measured once in a pair."""
         raw, kept = self.raw.indices, self.verified.matches.indices
         forward = np.isin(raw[:, 0], kept[kept[:, 1] < 0, 0])
         return np.where(raw[:, 1] < 0, forward, np.isin(raw[:, 1], kept[kept[:, 0] < 0, 1]))
@@ -50,13 +50,13 @@ class Tracks:
 
 
 def tracks_of(
-    pairs: Sequence[MatchedPair], lattice_px: Callable[[str], FloatArray], camera_of: Callable[[str], Camera]
+    pairs: Sequence[MatchedPair], grid_px: Callable[[str], FloatArray], camera_of: Callable[[str], Camera]
 ) -> Tracks:
     """Of pairs whose matches lead from a keypoint of one image to a place in the other."""
     table = _Table()
     for item in pairs:
-        table.add_image(item.pair.image_id0, lattice_px)
-        table.add_image(item.pair.image_id1, lattice_px)
+        table.add_image(item.pair.image_id0, grid_px)
+        table.add_image(item.pair.image_id1, grid_px)
     numbered = [table.number(item) for item in pairs]
     table.join()
     verified = {
@@ -82,11 +82,11 @@ class _Table:
         self._joined: dict[str, IntArray] = {}
         self._standing: dict[str, IntArray] = {}
 
-    def add_image(self, image_id: str, lattice_px: Callable[[str], FloatArray]) -> None:
-        """Its lattice, every point a track of its own."""
+    def add_image(self, image_id: str, grid_px: Callable[[str], FloatArray]) -> None:
+        """Its grid, every point a track of its own."""
         if image_id in self.sizes:
             return
-        points = np.asarray(lattice_px(image_id), np.float64)
+        points = np.asarray(grid_px(image_id), np.float64)
         self.sizes[image_id], self._first[image_id] = len(points), self._count
         self._places[image_id] = [points]
         self._tracks[image_id] = [np.arange(self._count, self._count + len(points))]

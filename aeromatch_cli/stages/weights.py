@@ -9,20 +9,20 @@ from aeromatch_cli.stages.run import Result
 
 def manage_weights(action: str, path: str | None) -> Result:
     """List, verify or add network weights; a file that does not match its record is a failure."""
-    from aeromatch_cli.nets import weights
+    from aeromatch_cli.nets import files, folder
 
     if action == "add":
-        entry = weights.add_weights(Path(path or ""))
+        entry = folder.add_weights(Path(path or ""))
         return Result((f"added {entry.name} ({entry.architecture}), SHA-256 {entry.sha256}",), {"name": entry.name})
-    nothing = f"no weights in {weights.weights_folder()}"
+    nothing = f"no weights in {folder.weights_folder()}"
     if action == "verify":
-        ships, checks = weights.verify_shipped(), weights.verify_weights()
+        ships, checks = files.verify_shipped(), folder.verify_weights()
         lines = tuple(f"{c.name}: {c.state}  (ships)" for c in ships)
         lines += tuple(f"{c.name}: {c.state}" for c in checks) or (nothing,)
         wrong = tuple(("weights", c.name, c.state) for c in (*ships, *checks) if c.state != "ok")
         facts = {"weights": {c.name: c.state for c in checks}, "shipped": {c.name: c.state for c in ships}}
         return Result(lines, facts, wrong)
-    entries, shipped = weights.list_weights(), weights.shipped_weights()
+    entries, shipped = folder.list_weights(), files.shipped_weights()
     table = [(e, "  (ships, used without a setting)") for e in shipped] + [(e, "") for e in entries]
     listed = tuple(f"{e.name}  {e.architecture}  {e.size_bytes / 1e3:,.0f} kB  {e.sha256}{note}" for e, note in table)
     return Result(

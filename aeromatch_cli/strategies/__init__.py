@@ -89,18 +89,18 @@ class ViewPixels:
 class Enhancer(Protocol):
     """needs_colour: False where the strategy takes gray pixels, which decode faster.
     changes: False where pictures always pass as they are, so that none of them is worth a file.
-    beside: whether the picture as it was taken has views too, so that every pair can use what suits it.
-    one_sun_minutes: with beside, images whose partners were all taken within this time are left as they are.
+    keep_source: whether the picture as it was taken has views too, so that every pair can use what suits it.
+    same_illumination_minutes: with beside, images whose partners were all taken within this time are left as they are.
     """
 
     needs_colour: ClassVar[bool]
     changes: ClassVar[bool]
 
     @property
-    def beside(self) -> bool: ...
+    def keep_source(self) -> bool: ...
 
     @property
-    def one_sun_minutes(self) -> float: ...
+    def same_illumination_minutes(self) -> float: ...
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced: ...
 

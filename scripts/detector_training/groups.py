@@ -14,7 +14,7 @@ import numpy as np
 from lightglue_training.homographies import developed
 from numpy.typing import NDArray
 
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies.extractors.pyramid import STEP
 from detector_training.scenes import Sight, angles_deg, transfer
 

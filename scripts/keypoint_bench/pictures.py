@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
-from aeromatch_cli.images import read_pixels, to_gray8
+from aeromatch_cli.images.depth import to_gray8
+from aeromatch_cli.images.files import read_pixels
 
 SOURCE, GROUND = "source", "ground"
 

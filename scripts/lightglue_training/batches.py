@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from aeromatch_cli.nets.lightglue import Side, normalised
-from aeromatch_cli.strategies.matchers.inference import FRAME_PX
+from aeromatch_cli.strategies.matchers.lightglue.inference import FRAME_PX
 from lightglue_training.sides import UNKNOWN, Array, Partners, Seen
 
 

@@ -22,8 +22,8 @@ from aeromatch_cli.nets.lightglue_batch import match_batch
 from aeromatch_cli.nets.lightglue_file import load_lightglue
 from aeromatch_cli.nets.precision import has_bfloat16, layer_type
 from aeromatch_cli.stages import extract
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue as Matcher
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue as Matcher
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair, prepared
 
@@ -148,7 +148,7 @@ def block_table(folder: Path, weights: Path, keypoints: int) -> str:
     """The matcher over some pairs of a rendered block, with what saves time switched on step by step; medians of the
     rounds' means.
     """
-    always = {"ample": keypoints + 1, "enough": keypoints + 1}
+    always = {"guide_below_matches": keypoints + 1, "network_below_matches": keypoints + 1}
     steps: Mapping[str, dict[str, Any]] = {
         "every keypoint": {"overlap": False, **always, **EVERYTHING},
         "+ only the predicted overlap": {**always, **EVERYTHING},

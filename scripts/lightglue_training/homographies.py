@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from aeromatch_cli.data import Camera, View
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
 from lightglue_training.sides import Array, Partners, Seen, partners, seen

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Features
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.strategies.matchers.inference import wrapped_rad
+from aeromatch_cli.strategies.matchers.lightglue.inference import wrapped_rad
 
 CORRECT_PX, WRONG_PX = 3.0, 5.0  # a partner lies within the one; without any within the other there is none
 NONE, UNKNOWN = -1, -2

@@ -11,7 +11,7 @@ import numpy as np
 
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration
-from aeromatch_cli.strategies.matchers.scan import mutual_nearest
+from aeromatch_cli.strategies.matchers.descriptors.scan import mutual_nearest
 from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair
 from lightglue_training.sides import NONE, UNKNOWN, Array

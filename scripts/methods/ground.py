@@ -16,7 +16,7 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.warps import source_from_view
-from aeromatch_cli.images import render_view
+from aeromatch_cli.images.views import render_view
 from aeromatch_cli.stages import enhance, pairs, simulate
 from methods.base import Described, Found, Method, Options, Scene
 

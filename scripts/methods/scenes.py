@@ -15,7 +15,8 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.geometry.cameras import colmap_params, from_colmap
-from aeromatch_cli.images import read_pixels, shrink, shrink_camera
+from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.images.scaling import shrink, shrink_camera
 from aeromatch_cli.synthetic import render_block
 from aeromatch_cli.workspace import fingerprint, stable_hash, write_json
 from methods.base import Scene

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
-from aeromatch_cli.images import shrink_camera
+from aeromatch_cli.images.scaling import shrink_camera
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, Level, levels_of
 from aeromatch_cli.strategies.extractors.sift import Sift
@@ -88,7 +88,7 @@ class Sight(Picture):
 def sights_of(
     context: Context, cameras: Mapping[str, Camera] | None, poses: Mapping[str, Pose] | None, suns: Mapping[str, int]
 ) -> list[Sight]:
-    """Every image of a block as its preset looks at it; set `simulate.source=true` for the pictures as taken, too.
+    """Every image of a block as its preset looks at it; set `simulate.keep_source=true` for the pictures as taken, too.
 
     cameras, poses: the true ones by name where they are not those of the block.
     """

@@ -15,7 +15,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages import pairs
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT
@@ -40,7 +40,7 @@ def rendered(folder: Path) -> dict[str, Tracks]:
     truth = load_truth(folder)
     rng = np.random.default_rng([truth.scene.seed, 31])
     with tempfile.TemporaryDirectory() as scratch:
-        context = prepared(folder, scratch, ("simulate.source=true", "pairs=exhaustive"))
+        context = prepared(folder, scratch, ("simulate.keep_source=true", "pairs=exhaustive"))
         sights = sights_of(context, truth.cameras, truth.poses, truth.sorties)
 
     def visible(sight: Sight, points_m: FloatArray) -> BoolArray:
@@ -92,7 +92,7 @@ def reference(folder: Path, name: str) -> dict[str, Tracks]:
     rng = np.random.default_rng([len(name), *name.encode(), 32])
     with tempfile.TemporaryDirectory() as scratch:
         top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        settings = load("baseline", ["simulate.source=true", "pairs=exhaustive"], block, **top)
+        settings = load("baseline", ["simulate.keep_source=true", "pairs=exhaustive"], block, **top)
         context = pairs.prepare(settings, Executor("serial", 1))[0]
         sights = sights_of(context, None, None, {})
     with np.load(folder / "reference" / "points.npz") as archive:

@@ -20,8 +20,8 @@ from aeromatch_cli.evaluate import BlockTruth, open_truth
 from aeromatch_cli.evaluate.scores import PairScore
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
-from aeromatch_cli.images import read_pixels
-from aeromatch_cli.stages.common import Context
+from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.pairs import prepare
 from aeromatch_cli.synthetic import render_block
 from polar_bench.grounds import RENDERED, block

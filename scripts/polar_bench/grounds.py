@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate import open_truth
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.synthetic import render_block
 
 RENDERED, REAL = ("grass", "desert", "farmland"), ("seneca", "caliterra")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
-from aeromatch_cli.images import shrink
+from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.extractors.grid import Grid
 from aeromatch_cli.strategies.matchers.polar import Polar, Registered
 from aeromatch_cli.strategies.matchers.polar.registration import Registration
 from aeromatch_cli.strategies.simulators.none import source_view
@@ -54,7 +54,7 @@ class Shot:
 @dataclass(frozen=True, eq=False)
 class PolarResult:
     """matrix: (3, 3) px1 from px0 of stored pixels. found: what it is of. points0, points1: (M, 2) tie points. seconds:
-    of the registration; seconds_tie_points: of everything. Everything but decoding, as for SIFT: the lattice too.
+    of the registration; seconds_tie_points: of everything. Everything but decoding, as for SIFT: the grid too.
     """
 
     matrix: FloatArray
@@ -97,15 +97,15 @@ def registered(
     started = time.perf_counter()
     found = polar.registered(*shots, geometry)
     seconds = time.perf_counter() - started
-    lattices = [np.zeros((0, 2)), np.zeros((0, 2))]
+    grids = [np.zeros((0, 2)), np.zeros((0, 2))]
     shared0, shared1 = _shared(found)
     if tie_points and found.registration.accepted:
-        # Half of them are measured either way, on lattices that are as dense on the ground.
+        # Half of them are measured either way, on grids that are as dense on the ground.
         cells = int(np.ceil(0.5 * tie_points * _PROBES**2 / max(len(shared0), 1)))
         for side, (camera, picture) in enumerate(((geometry.camera0, first), (geometry.camera1, second))):
-            found_points = Lattice(points=cells)(camera, [ViewPixels(source_view(camera), picture, None)])
-            lattices[side] = found_points.keypoints_px.astype(np.float64)
-    points = polar.measured(found, *lattices)
+            found_points = Grid(points=cells)(camera, [ViewPixels(source_view(camera), picture, None)])
+            grids[side] = found_points.keypoints_px.astype(np.float64)
+    points = polar.measured(found, *grids)
     total = time.perf_counter() - started
     # Of frames that look from above, the similarity of stored pixels that is closest.
     straight = found.registration.matrix if found.side0.camera is None else np.eye(3)

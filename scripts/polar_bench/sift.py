@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
-from aeromatch_cli.images import shrink
+from aeromatch_cli.images.scaling import shrink
 
 FEATURES = 20_000
 RATIO = 0.8

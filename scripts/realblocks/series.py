@@ -11,7 +11,7 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Block
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.images import read_pixels
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages.pairs import prepare
 from aeromatch_cli.strategies.pairings import PAIRINGS
 

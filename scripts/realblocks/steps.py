@@ -45,7 +45,7 @@ def preset(task: Task) -> dict[str, Any]:
     work, reference = Path(task["work"]), Path(task["reference"])
     block = {"images": task["images"], "poses": str(reference / "poses.csv"), "cameras": str(reference / "block.json")}
     top: dict[str, Any] = {"workspace": str(work / "workspace"), "run": {"jobs": task["jobs"]}}
-    # A lattice has points of its own number, no keypoints.
+    # A grid has points of its own number, no keypoints.
     limited = task["keypoints"] and hasattr(load(task["preset"], task["set"], block, **top).extract, "keypoints")
     own = [f"extract.keypoints={task['keypoints']}"] if limited else []
     own += ["pairs=file", f"pairs.path={task['pairs']}"] if task["pairs"] else []

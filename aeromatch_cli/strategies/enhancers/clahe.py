@@ -10,11 +10,11 @@ from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.strategies import Enhanced
-from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+from aeromatch_cli.strategies.enhancers.kept_source import KeepsSource
 
 
-class ClaheEnhancement(Beside):
+class ClaheEnhancement(KeepsSource):
     """Local contrast everywhere, shadow or not; hue stays, except where a band reaches white."""
 
     needs_colour: ClassVar[bool] = False

@@ -15,8 +15,8 @@ class NoEnhancement(Strategy):
 
     needs_colour: ClassVar[bool] = False
     changes: ClassVar[bool] = False
-    beside: ClassVar[bool] = False
-    one_sun_minutes: ClassVar[float] = 0.0
+    keep_source: ClassVar[bool] = False
+    same_illumination_minutes: ClassVar[float] = 0.0
     name: Literal["none"] = "none"
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:

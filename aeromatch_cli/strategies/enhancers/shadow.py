@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
-from aeromatch_cli.nets.weights import shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.strategies import Enhanced
-from aeromatch_cli.strategies.enhancers.beside import Beside
+from aeromatch_cli.strategies.enhancers.kept_source import KeepsSource
 from aeromatch_cli.strategies.enhancers.relight import relit
 from aeromatch_cli.strategies.enhancers.shadow_mask import make_overview, shadow_share, soft_mask
 from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regions, gain_field, region_table
 
 
-class ShadowEnhancement(Beside):
+class ShadowEnhancement(KeepsSource):
     """Shadows lifted to the light around them; a picture without shadow passes unchanged."""
 
     version: ClassVar[int] = 2
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
-    beside: bool = Field(True, description=Beside.model_fields["beside"].description)
+    keep_source: bool = Field(True, description=KeepsSource.model_fields["keep_source"].description)
     detection_px: int = Field(768, ge=64, le=4096, description="Longer side at which shadow is looked for.")
     max_gain: float = Field(
         6.0, ge=1.0, le=64.0, description="Most light given to a region, as a factor; a clear sky lacks this much sun."

@@ -13,14 +13,14 @@ from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.strategies import Enhanced
-from aeromatch_cli.strategies.enhancers.beside import Beside
 from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+from aeromatch_cli.strategies.enhancers.kept_source import KeepsSource
 from aeromatch_cli.strategies.enhancers.tone import white_of
 
 _STRIP_ROWS = 256
 
 
-class WallisEnhancement(Beside):
+class WallisEnhancement(KeepsSource):
     """Local mean and contrast made alike everywhere, shadow or not; hue stays, except where a band reaches white."""
 
     needs_colour: ClassVar[bool] = False
@@ -29,7 +29,9 @@ class WallisEnhancement(Beside):
         0.04, gt=0.0, le=1.0, description="Side of the neighbourhood as a share of the picture's longer side."
     )
     mean: float = Field(0.5, ge=0.0, le=1.0, description="Mean that brightness is brought to, as a share of white.")
-    spread: float = Field(0.2, gt=0.0, le=0.5, description="Standard deviation that it is brought to, likewise.")
+    standard_deviation: float = Field(
+        0.2, gt=0.0, le=0.5, description="Standard deviation that it is brought to, likewise."
+    )
     contrast: float = Field(0.8, ge=0.0, le=1.0, description="How far the spread is changed: 0 not, 1 wholly.")
     brightness: float = Field(0.9, ge=0.0, le=1.0, description="How far the mean is changed: 0 not, 1 wholly.")
 
@@ -45,7 +47,7 @@ class WallisEnhancement(Beside):
 
         half = max(1, round(0.5 * self.window_share * max(source.shape)))
         side, top_value = 2 * half + 1, float(np.iinfo(source.dtype).max)
-        wanted = self.spread * white
+        wanted = self.standard_deviation * white
         out = np.empty_like(source)
         for top in range(0, len(source), _STRIP_ROWS):
             first, last = max(0, top - half), min(len(source), top + _STRIP_ROWS + half)

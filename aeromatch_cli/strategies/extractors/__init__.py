@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.extractors.lattice import Lattice
+from aeromatch_cli.strategies.extractors.grid import Grid
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
 
-EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift, "lattice": Lattice, "learned": Learned}
+EXTRACTORS: Mapping[str, type[Strategy]] = {"sift": Sift, "grid": Grid, "learned": Learned}

@@ -113,7 +113,7 @@ class Learned(Described):
         return [name for name, asked in needed.items() if asked]
 
     def _path(self, name: str) -> Path:
-        from aeromatch_cli.nets.weights import shipped_path
+        from aeromatch_cli.nets.files import shipped_path
 
         return self._own(name) or shipped_path(name)
 

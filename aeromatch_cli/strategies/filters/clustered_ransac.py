@@ -42,7 +42,7 @@ class ClusteredRansac(Strategy):
     threshold_px: float = Field(
         3.0, gt=0.0, description="Largest distance to a plane, larger of both directions, undistorted pixels."
     )
-    support: float = Field(
+    min_support: float = Field(
         3.0,
         gt=0.0,
         description="Neighbours that must move with a match on no plane, weighted by how well (0-6); fewer where this "
@@ -73,9 +73,9 @@ class ClusteredRansac(Strategy):
 
     def _explained(self, found: Planes) -> BoolArray:
         """Which matches (N,) lie on planes or have support enough."""
-        strictly = (found.labels >= 0) | (found.support >= self.support)
+        strictly = (found.labels >= 0) | (found.support >= self.min_support)
         wrong = 1.0 - strictly.mean() if len(strictly) else 1.0
-        needed = self.support * min(1.0, 2.0 * wrong)
+        needed = self.min_support * min(1.0, 2.0 * wrong)
         return np.asarray((found.labels >= 0) | ((found.support > 0.0) & (found.support >= needed)))
 
     def find_planes(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> tuple[Planes, BoolArray]:

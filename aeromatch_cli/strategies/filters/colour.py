@@ -32,10 +32,10 @@ class Colour(Strategy):
     needs: ClassVar[frozenset[str]] = frozenset({"colour"})
     verifies: ClassVar[bool] = False
     name: Literal["colour"] = "colour"
-    limit: float = Field(
+    max_distance: float = Field(
         0.15, gt=0.0, description="Largest distance in log chromaticity: 0.15 is green stronger by a fifth."
     )
-    medians: float = Field(
+    max_distance_medians: float = Field(
         4.0, ge=0.0, description="The limit is no less than this many times the pair's median distance: noisy colours."
     )
 
@@ -47,7 +47,7 @@ class Colour(Strategy):
         if len(candidates) < _FEWEST:
             return Verdict(keep=everything, state="not verifiable", reason="too few matches to compare exposures")
         distances = chromaticity_distances(candidates.colours0, candidates.colours1)
-        keep = distances <= max(self.limit, self.medians * float(np.median(distances)))
+        keep = distances <= max(self.max_distance, self.max_distance_medians * float(np.median(distances)))
         return Verdict(keep=keep, state="not verifiable", reason="colours limit the matches but do not verify them")
 
 

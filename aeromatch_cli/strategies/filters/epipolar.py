@@ -29,7 +29,7 @@ class Epipolar(TwoViewGated):
     sigmas: float = Field(
         6.0, gt=0.0, description="Half-width of the band in standard deviations of its matches, at most threshold_px."
     )
-    narrowest_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
+    min_band_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""
@@ -49,4 +49,4 @@ class Epipolar(TwoViewGated):
             return self.threshold_px
         sigma = _SIGMA_OF_MEDIAN * float(np.median(errors_px))
         enough = float(np.partition(errors_px, self.min_inliers - 1)[self.min_inliers - 1])
-        return min(max(self.sigmas * sigma, self.narrowest_px, enough), self.threshold_px)
+        return min(max(self.sigmas * sigma, self.min_band_px, enough), self.threshold_px)

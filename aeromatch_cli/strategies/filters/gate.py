@@ -28,7 +28,7 @@ class Gated(Strategy):
     """What filters that verify by one model have in common."""
 
     min_inliers: int = Field(15, ge=8, description="Fewer matches are not verifiable, fewer inliers reject the pair.")
-    false_alarms: float = Field(
+    max_false_alarms: float = Field(
         0.01, gt=0.0, description="The pair is rejected where chance gives more models than this with as many inliers."
     )
 
@@ -57,7 +57,7 @@ class Gated(Strategy):
             log10_false_alarms(points0_px, points1_px, inliers & (errors <= part), wrong, part, sample)
             for part in (threshold_px * share for share in _SHARES)
         )
-        if expected + np.log10(len(_SHARES)) > np.log10(self.false_alarms):
+        if expected + np.log10(len(_SHARES)) > np.log10(self.max_false_alarms):
             return f"{count} inliers of {len(inliers)} matches are no more than chance gives"
         return ""
 

@@ -42,13 +42,13 @@ class Graph(Strategy):
         gt=0.0,
         description="Largest distance of a neighbour to where it would move, undistorted pixels of either image.",
     )
-    least: float = Field(
+    min_support: float = Field(
         0.9,
         ge=0.0,
         description="Neighbours that must move with a match besides the two that define its affinity, weighted by how "
         "well.",
     )
-    share: float = Field(
+    min_support_share: float = Field(
         0.6,
         ge=0.0,
         le=1.0,
@@ -58,10 +58,10 @@ class Graph(Strategy):
 
     @model_validator(mode="after")
     def _can_be_had(self) -> Self:
-        if self.least >= self.neighbours - 2:
+        if self.min_support >= self.neighbours - 2:
             raise ValueError(
-                f"least {self.least:g} is never reached: {self.neighbours} neighbours support by at most "
-                f"{self.neighbours - 2}; lower least"
+                f"min_support {self.min_support:g} is never reached: {self.neighbours} neighbours support by at most "
+                f"{self.neighbours - 2}; lower min_support"
             )
         return self
 
@@ -87,7 +87,7 @@ class Graph(Strategy):
         ways = ((points0, points1), (points1, points0))
         support = np.minimum(*(local_support(*way, around, threshold_px)[0] for way in ways))
         least = np.sort(support[around], axis=1)[:, : around.shape[1] // 2].mean(axis=1)
-        return np.asarray(support >= np.maximum(self.share * least if fine else 0.0, self.least))
+        return np.asarray(support >= np.maximum(self.min_support_share * least if fine else 0.0, self.min_support))
 
 
 def _passed(count: int, reason: str) -> Verdict:

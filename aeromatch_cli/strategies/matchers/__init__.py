@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.matchers.bidirectional import Bidirectional
-from aeromatch_cli.strategies.matchers.lightglue import LightGlue
-from aeromatch_cli.strategies.matchers.nearest import Nearest
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.matchers.polar import Polar
 
 MATCHERS: Mapping[str, type[Strategy]] = {

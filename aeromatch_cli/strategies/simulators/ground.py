@@ -43,4 +43,4 @@ class GroundView(PlaneViews):
         view = self.plane_view(ground, ground.polygon_m, direction_of(0, 0.0), self.name)
         if view is None:
             return (source,)
-        return (source, view) if self.source else (view,)
+        return (source, view) if self.keep_source else (view,)

@@ -29,7 +29,7 @@ _PER_SIDE = 2
 class NeighbourViews(PlaneViews):
     """Parallel views of the ground, each of the part that the neighbours which need it see as well.
 
-    The ground view serves every neighbour. Where an image and a neighbour together resolve the ground min_tilt times
+    The ground view serves every neighbour. Where an image and a neighbour together resolve the ground min_stretch times
     more coarsely along one axis than across (`geometry.views.common_stretch`, at the middle of their overlap), both
     also make the view along the direction that evens this out. Directions are clustered by rounding to a set that is
     fixed to the world, so that two images make the same views without knowing of each other's other neighbours; those
@@ -38,7 +38,7 @@ class NeighbourViews(PlaneViews):
     A budget per image is spent best on the ground view, whatever the tilt: correct matches grow faster than the
     descriptors of a view, so that a view which shares them loses more than it finds (a quarter of the matches at 2048,
     measured up to 70 degrees). By default, therefore, only neighbours that hardly see the ground get one. With a budget
-    per view min_tilt = 1.2 finds 1.5 to 2 times the matches, for 2.5 to 4 times the descriptors.
+    per view min_stretch = 1.2 finds 1.5 to 2 times the matches, for 2.5 to 4 times the descriptors.
 
     Without attitude, ground or common ground sampling distance, or where no ground is seen: the source view alone.
     Tilts are no substitute there: the other images of the block have no such views to compare them with.
@@ -47,7 +47,7 @@ class NeighbourViews(PlaneViews):
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "ground", "neighbours"})
     name: Literal["neighbours"] = "neighbours"
     max_views: int = Field(default=4, ge=1, description="Most views of an image, the ground view included.")
-    min_tilt: float = Field(
+    min_stretch: float = Field(
         default=4.0,
         gt=1.0,
         description="Neighbours get a view of their direction from this stretch of the ground on; less is skipped.",
@@ -90,7 +90,7 @@ class NeighbourViews(PlaneViews):
         made = tuple(view for view in views if view is not None)
         if not made:
             return (source,)
-        return (source, *made) if self.source else made
+        return (source, *made) if self.keep_source else made
 
     def _wanted(self, ground: GroundPlane, own: Neighbour, other: Neighbour, gsd_m: float) -> _Wanted | None:
         """What one neighbour asks for, None where both share no ground."""
@@ -105,7 +105,7 @@ class NeighbourViews(PlaneViews):
             return None
         middle = np.append(polygon_centroid_m(overlap), plane_m)
         stretch, azimuth_rad = common_stretch(middle - own.pose.center_m, middle - other.pose.center_m)
-        sample = nearest_sample(stretch, azimuth_rad) if stretch >= self.min_tilt else (0, 0)
+        sample = nearest_sample(stretch, azimuth_rad) if stretch >= self.min_stretch else (0, 0)
         polygon = intersection(ground.polygon_m, theirs.polygon_m, self.margin * ground.flying_height_m)
         return _Wanted(polygon, polygon_area_m2(overlap), sample)
 

@@ -43,7 +43,7 @@ class PlaneViews(Strategy):
     """Settings of views of the ground plane, and how one is made."""
 
     name: str  # a strategy's own, first in every listing
-    source: bool = Field(default=False, description="Also use the source image, as view 0.")
+    keep_source: bool = Field(default=False, description="Also use the source image, as view 0.")
     max_megapixels: float = Field(
         default=32.0, gt=0.0, description="Largest view; one that would be larger is scaled down to this."
     )

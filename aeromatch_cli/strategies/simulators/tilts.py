@@ -35,7 +35,7 @@ class Tilts(Strategy):
         le=5,
         description="Tilts of 1.41, 2, 2.83 ...: 4, 5, 8 ... views, as many pixels as 2.8, 2.5, 2.8 ... images.",
     )
-    turns: int = Field(
+    rotations: int = Field(
         default=1,
         ge=1,
         le=12,
@@ -55,8 +55,8 @@ class Tilts(Strategy):
         neighbours: Sequence[Neighbour] = (),
     ) -> tuple[View, ...]:
         """Views of one image; see the family's table for the contract."""
-        step_deg = 360.0 / self.turns
-        turned = [self._view(camera, f"turn{turn}", step_deg * turn, 1.0) for turn in range(1, self.turns)]
+        step_deg = 360.0 / self.rotations
+        turned = [self._view(camera, f"turn{turn}", step_deg * turn, 1.0) for turn in range(1, self.rotations)]
         tilted = [
             self._view(camera, f"tilt{level}-{number}", float(np.rad2deg(azimuth_rad)), TILT_STEP**level)
             for level in range(1, self.levels + 1)

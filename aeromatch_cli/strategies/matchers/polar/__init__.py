@@ -2,7 +2,7 @@
 
 For grass, sand and ploughed fields, where few features are found twice: every pixel of the overlap takes part. The
 similarity between both pictures is searched for from coarse to fine, with the poses as a start where they are known
-and without them where they are not; where it is right, the lattice of image 0 is measured in image 1.
+and without them where they are not; where it is right, the grid of image 0 is measured in image 1.
 
 Source: dynamic polar parameterisation of least-squares registration for nadir images, J. Geo-inf. Sci. 2019(10),
 1586-1593.
@@ -43,7 +43,7 @@ class Registered:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Tie points of a pair. indices: (M, 2) int32, the lattice point of one image, -1 for the other. points0_px,
+    """Tie points of a pair. indices: (M, 2) int32, the grid point of one image, -1 for the other. points0_px,
     points1_px: (M, 2) stored pixels. correlations: (M,). sigmas_px: (M,) in the image where it was measured.
     """
 
@@ -62,24 +62,20 @@ class Polar(Strategy):
     reads_pixels: ClassVar[bool] = True
     name: Literal["polar"] = "polar"
     sigmas: float = Field(3.0, gt=0.0, description="Poses may be wrong by so many standard deviations.")
-    smallest_scale: float = Field(
-        SCALES[0], gt=0.0, description="Without poses: scale of image 1 over image 0, at least."
-    )
-    largest_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
-    window: int = Field(
+    min_scale: float = Field(SCALES[0], gt=0.0, description="Without poses: scale of image 1 over image 0, at least.")
+    max_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
+    window_px: int = Field(
         21, ge=7, le=101, description="Side of the windows that tie points are measured with, odd, pixels."
     )
-    least_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
-    largest_sigma_px: float = Field(0.5, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
+    min_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
+    max_sigma_px: float = Field(0.5, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
 
     @model_validator(mode="after")
     def _possible(self) -> Polar:
-        if self.smallest_scale > self.largest_scale:
-            raise ValueError(
-                f"smallest_scale {self.smallest_scale:g} is larger than largest_scale {self.largest_scale:g}"
-            )
-        if self.window % 2 == 0:
-            raise ValueError(f"window {self.window} is even: give {self.window + 1}, which has a middle")
+        if self.min_scale > self.max_scale:
+            raise ValueError(f"min_scale {self.min_scale:g} is larger than max_scale {self.max_scale:g}")
+        if self.window_px % 2 == 0:
+            raise ValueError(f"window_px {self.window_px} is even: give {self.window_px + 1}, which has a middle")
         return self
 
     def __call__(
@@ -120,23 +116,23 @@ class Polar(Strategy):
     def _compared(self, side0: Side, side1: Side, prior: Prior | None) -> Registered:
         longest = max(side0.width_px, side0.height_px, side1.width_px, side1.height_px)
         levels = Pyramid(side0.read, side1.read, longest, min(side0.finest, side1.finest))
-        registration = register(levels, prior, (self.smallest_scale, self.largest_scale))
+        registration = register(levels, prior, (self.min_scale, self.max_scale))
         return Registered(side0, side1, levels, registration)
 
-    def measured(self, found: Registered, lattice0_px: FloatArray, lattice1_px: FloatArray) -> Measured:
+    def measured(self, found: Registered, grid0_px: FloatArray, grid1_px: FloatArray) -> Measured:
         """Points (K, 2) of either image, stored pixels, measured in the other: so that every image's points are seen in
         all that overlap it, whichever comes first. None where the registration is not accepted.
         """
-        ways = [self._one_way(found, lattice0_px), self._one_way(found.turned(), lattice1_px)]
+        ways = [self._one_way(found, grid0_px), self._one_way(found.turned(), grid1_px)]
         columns = []
-        for side, (lattice_px, points) in enumerate(zip((lattice0_px, lattice1_px), ways, strict=True)):
+        for side, (grid_px, points) in enumerate(zip((grid0_px, grid1_px), ways, strict=True)):
             indices = np.full((len(points.rows), 2), -1, np.int32)
             indices[:, side] = points.rows
-            places = [lattice_px[points.rows].astype(np.float64), points.places_px]
+            places = [grid_px[points.rows].astype(np.float64), points.places_px]
             columns.append((indices, places[side], places[1 - side], points.correlations, points.sigmas_px))
         return Measured(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
     def _one_way(self, found: Registered, points_px: FloatArray) -> TiePoints:
         points = points_px.astype(np.float64) if found.registration.accepted else np.zeros((0, 2))
-        limits = Limits(self.window // 2, self.least_correlation, self.largest_sigma_px)
+        limits = Limits(self.window_px // 2, self.min_correlation, self.max_sigma_px)
         return tie_points(found.side0, found.side1, found.levels, found.registration, points, limits)

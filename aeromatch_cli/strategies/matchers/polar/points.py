@@ -1,4 +1,4 @@
-"""Least-squares tie points: every lattice point of image 0 that image 1 shows too, measured there.
+"""Least-squares tie points: every grid point of image 0 that image 1 shows too, measured there.
 
 The registration says about where; windows on reduced pictures are searched for around it, so that relief and what is
 left of tilt are followed; least squares on the way up to stored pixels measure. At every step the neighbours have a
@@ -33,7 +33,7 @@ _STEP_PX = 8.0  # over which shapes are taken from one frame to another
 
 @dataclass(frozen=True, eq=False)
 class TiePoints:
-    """rows: (M,) int32 of the lattice. places_px: (M, 2) stored pixels of image 1. correlations: (M,). sigmas_px:
+    """rows: (M,) int32 of the grid. places_px: (M, 2) stored pixels of image 1. correlations: (M,). sigmas_px:
     (M,) in stored pixels of image 1.
     """
 
@@ -53,10 +53,10 @@ class Limits:
 
 
 def tie_points(
-    side0: Side, side1: Side, levels: Pyramid, registration: Registration, lattice_px: FloatArray, limits: Limits
+    side0: Side, side1: Side, levels: Pyramid, registration: Registration, grid_px: FloatArray, limits: Limits
 ) -> TiePoints:
-    """Of lattice points (K, 2), stored pixels of image 0."""
-    frame0 = side0.frame_from_source(lattice_px)
+    """Of grid points (K, 2), stored pixels of image 0."""
+    frame0 = side0.frame_from_source(grid_px)
     frame1 = apply_homography(registration.warp, frame0)
     rows = np.flatnonzero(_inside(side1.source_from_frame(frame1), side1.raster) & np.isfinite(frame0).all(axis=1))
     if not len(rows):
@@ -64,7 +64,7 @@ def tie_points(
     expected = frame1[rows]
     start = Windows.start(frame0[rows], expected, homography_jacobians(registration.warp, frame0[rows], expected))
     windows = _followed(levels, start)
-    stored = _stored(side0, side1, windows, lattice_px[rows])
+    stored = _stored(side0, side1, windows, grid_px[rows])
     straight = side1.source_from_frame(expected)
     for scale in _scales(levels.scale(FINEST_PX), min(side0.raster.finest, side1.raster.finest)):
         stored = _measured(side0.raster, side1.raster, stored, scale, limits.half)
@@ -102,7 +102,7 @@ def _corrected(windows: Windows, expected_px: FloatArray, good: BoolArray) -> Wi
     return replace(windows, places1_px=places, matched=np.asarray(np.isfinite(places).all(axis=1)))
 
 
-def _stored(side0: Side, side1: Side, windows: Windows, lattice_px: FloatArray) -> Windows:
+def _stored(side0: Side, side1: Side, windows: Windows, grid_px: FloatArray) -> Windows:
     """Windows of frames in stored pixels."""
     places1 = side1.source_from_frame(windows.places1_px)
     columns = []
@@ -111,12 +111,12 @@ def _stored(side0: Side, side1: Side, windows: Windows, lattice_px: FloatArray) 
         step[axis] = _STEP_PX
         ends = []
         for sign in (-1.0, 1.0):
-            arms = side0.frame_from_source(lattice_px + sign * step) - windows.places0_px
+            arms = side0.frame_from_source(grid_px + sign * step) - windows.places0_px
             ends.append(side1.source_from_frame(windows.places1_px + np.einsum("nij,nj->ni", windows.shapes, arms)))
         columns.append((ends[1] - ends[0]) / (2.0 * _STEP_PX))
     shapes = np.stack(columns, axis=2)
     usable = np.isfinite(places1).all(axis=1) & np.isfinite(shapes).all(axis=(1, 2))
-    found = Windows.start(lattice_px.astype(np.float64), places1, shapes)
+    found = Windows.start(grid_px.astype(np.float64), places1, shapes)
     return replace(found, matched=np.asarray(usable))
 
 

@@ -1,0 +1,82 @@
+"""The application: its commands, its top level, and what every command line passes through."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from aeromatch_cli import __version__
+from aeromatch_cli.cli.commands import WEIGHTS, evaluate, synth
+from aeromatch_cli.cli.output import ARGUMENTS
+from aeromatch_cli.cli.stage_commands import STAGES, stage_command
+from aeromatch_cli.errors import ConfigError
+
+
+class _Commands(TyperGroup):
+    """Gives wrong arguments a JSON line too, where --json asks for one: scripts read the last line whatever happens."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        stated = args[0] if args else options.get("args")
+        given = sys.argv[1:] if stated is None else list(stated)
+        try:
+            return super().main(*args, **options)
+        except SystemExit as stop:
+            # Commands leave by typer.Exit and have said it already; what else exits with 2 is the parser.
+            if (
+                stop.code == ConfigError.exit_code
+                and "--json" in given
+                and not isinstance(stop.__context__, typer.Exit)
+            ):
+                facts = {"error": "wrong arguments; stderr says which", "exit_code": stop.code}
+                typer.echo(json.dumps(facts))
+            raise
+
+    def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
+        """Keeps the arguments as they were written, for the log file."""
+        written = list(args)  # parsing uses them up
+        options["obj"] = {ARGUMENTS: written}
+        return super().make_context(info_name, args, *rest, **options)
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Verified, evenly spread tie points for aerial image blocks.",
+    epilog="CONFIG|PRESET is a YAML file or the name of a preset; every command names its options with --help.",
+)
+weights_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="List, verify and add network weights.")
+app.add_typer(weights_app, name="weights")
+
+for _name, _help in STAGES.items():
+    app.command(_name, help=_help)(stage_command(_name))
+app.command()(evaluate)
+app.command()(synth)
+for _name, (_help, _command) in WEIGHTS.items():
+    weights_app.command(_name, help=_help)(_command)
+
+
+@app.callback(invoke_without_command=True)
+def top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+) -> None:
+    """Verified, evenly spread tie points for aerial image blocks."""
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def main() -> None:
+    """Entry point of the `aeromatch` script."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a name that the terminal's encoding lacks is no error
+    app()

@@ -1,0 +1,138 @@
+"""The other commands: judge a workspace, render a block, manage network weights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aeromatch_cli.cli.options import Jobs, Json, LogFile, Quiet
+from aeromatch_cli.cli.output import as_texts, guarded
+from aeromatch_cli.cli.progress import progress_shown
+from aeromatch_cli.errors import ConfigError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.run import Result
+
+# Written out: the modules that know them are too heavy for --help. A test compares.
+_SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"
+_FLIGHTS = "nadir, oblique, sweep, orbit, two-flights, mixed"
+
+
+def evaluate(
+    context: typer.Context,
+    work: Annotated[Path, typer.Argument(metavar="WORK", help="Workspace that `run` wrote.")],
+    truth: Annotated[Path, typer.Option("--truth", metavar="DIR", help="Rendered block, or reference solution.")],
+    mapping: Annotated[bool, typer.Option(help="Also count the images that pycolmap's mapping registers.")] = True,
+    log_file: LogFile = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Judge the matches of a workspace against rendered truth or reference poses."""
+
+    def call() -> Result:
+        from aeromatch_cli.evaluate import evaluate_workspace
+        from aeromatch_cli.evaluate.output import facts, lines, refresh_report, write_evaluation
+        from aeromatch_cli.stages.run import Result
+
+        evaluation = evaluate_workspace(work, truth, mapping=mapping, progress=progress_shown(quiet))
+        written = write_evaluation(evaluation)
+        end = (f"written to {written[0].parent}", refresh_report(work))
+        return Result((*lines(evaluation), *end), facts(evaluation))
+
+    guarded(call, "evaluate", quiet=quiet, as_json=json_, log_file=log_file, context=context)
+
+
+def synth(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the rendered block.")],
+    preset: Annotated[str, typer.Option("--preset", metavar="NAME", help=f"Scene: {_SCENES}.")] = "city",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another scene.")] = 0,
+    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Image size in pixels.")] = "1000x750",
+    images: Annotated[int, typer.Option("--images", min=1, help="Number of images.")] = 12,
+    flight: Annotated[str, typer.Option("--flight", metavar="NAME", help=f"{_FLIGHTS}.")] = "nadir",
+    height: Annotated[
+        float | None, typer.Option("--height", metavar="METRES", help="Flying height; each scene has its own.")
+    ] = None,
+    lens: Annotated[
+        str, typer.Option("--lens", metavar="MODEL", help="Camera model, COLMAP's name: PINHOLE, RADIAL, OPENCV ...")
+    ] = "SIMPLE_RADIAL",
+    sun: Annotated[
+        str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first sortie, degrees.")
+    ] = None,
+    texture: Annotated[
+        Path | None, typer.Option("--texture", metavar="DIR", help="Pictures to lay over the ground.")
+    ] = None,
+    jobs: Jobs = None,
+    log_file: LogFile = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render a block with exact truth."""
+
+    def call() -> Result:
+        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.synthetic import render_block
+
+        width_px, height_px = _parse_size(size)
+        summary = render_block(
+            out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images, flight=flight,
+            lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture, jobs=jobs or 0,
+            progress=progress_shown(quiet),
+        )  # fmt: skip
+        return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), as_texts(asdict(summary)))
+
+    guarded(call, "synth", quiet=quiet, as_json=json_, log_file=log_file, context=context)
+
+
+def _parse_sun(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    azimuth, _, elevation = text.partition(",")
+    try:
+        return float(azimuth), float(elevation)
+    except ValueError:
+        raise ConfigError(f"--sun {text!r}: write AZIMUTH,ELEVATION in degrees, for example 135,45") from None
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT in pixels, for example 1000x750")
+    return int(width), int(height)
+
+
+def _list_weights(json_: Json = False, quiet: Quiet = False) -> None:
+    _manage_weights("list", None, json_, quiet)
+
+
+def _verify_weights(json_: Json = False, quiet: Quiet = False) -> None:
+    _manage_weights("verify", None, json_, quiet)
+
+
+def _add_weights(
+    path: Annotated[str, typer.Argument(metavar="PATH", help="Checkpoint file.")],
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    _manage_weights("add", path, json_, quiet)
+
+
+# `aeromatch weights NAME`: its help and its command.
+WEIGHTS: Mapping[str, tuple[str, Callable[..., None]]] = {
+    "list": ("Weights that strategies find by name.", _list_weights),
+    "verify": ("Compare every file with its recorded SHA-256.", _verify_weights),
+    "add": ("Check a checkpoint strictly and copy it into the weights folder.", _add_weights),
+}
+
+
+def _manage_weights(action: str, argument: str | None, json_: bool, quiet: bool) -> None:
+    def call() -> Result:
+        from aeromatch_cli.stages.weights import manage_weights
+
+        return manage_weights(action, argument)
+
+    guarded(call, f"weights {action}", quiet=quiet, as_json=json_, log_file=None)

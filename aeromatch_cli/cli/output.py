@@ -1,0 +1,113 @@
+"""Results to stdout, messages to stderr, errors to exit codes."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import signal
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from aeromatch_cli import __version__
+from aeromatch_cli.cli.log import logged_to, record
+from aeromatch_cli.errors import AeromatchError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.run import Result
+
+EXIT_SOME_FAILED = 1
+EXIT_INTERRUPTED = 130
+# Where the application keeps the arguments as they were written, in the object of the root context.
+ARGUMENTS = "aeromatch.arguments"
+
+
+def guarded(
+    call: Callable[[], Result],
+    command: str,
+    *,
+    quiet: bool,
+    as_json: bool,
+    log_file: Path | None,
+    context: typer.Context | None = None,
+) -> None:
+    """Run one command; print its result, or its error, and leave with the right exit code."""
+    started = time.monotonic()
+    with ExitStack() as stack:
+
+        def logged() -> Result:
+            stack.enter_context(logged_to(log_file, quiet=quiet))
+            record.info("aeromatch %s: aeromatch %s", __version__, shlex.join(_arguments(context)))
+            with _terminated_like_interrupt():
+                return call()
+
+        facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet)
+        record.info("exit code %d after %.1f s", facts["exit_code"], time.monotonic() - started)
+    if as_json:
+        typer.echo(json.dumps(_finite(facts), allow_nan=False))
+    if facts["exit_code"]:
+        raise typer.Exit(int(facts["exit_code"]))
+
+
+def _arguments(context: typer.Context | None) -> Sequence[str]:
+    return () if context is None else tuple(context.find_root().obj[ARGUMENTS])
+
+
+def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
+    """The facts of one call, with its exit code; its lines, or its error, are printed and recorded."""
+    try:
+        result = call()
+    except AeromatchError as error:
+        typer.echo(f"error: {error}", err=True)
+        record.error("error: %s", error)
+        record.debug("stopped by", exc_info=True)
+        return {"error": str(error), "exit_code": error.exit_code}
+    except KeyboardInterrupt:
+        typer.echo("interrupted; run the same command again to resume", err=True)
+        record.error("interrupted")
+        return {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
+    except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
+        typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
+        record.error("error: %s", text, exc_info=True)
+        return {"error": text, "exit_code": AeromatchError.exit_code}
+    for line in result.lines:
+        record.info("%s", line)
+        if not quiet:
+            typer.echo(line)
+    return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN: it becomes null."""
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@contextmanager
+def _terminated_like_interrupt() -> Iterator[None]:
+    """SIGTERM (a scheduler's time limit) stops as cleanly as Ctrl-C."""
+
+    def interrupt(signum: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def as_texts(values: dict[str, Any]) -> dict[str, Any]:
+    """Given options only, paths as text."""
+    return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if v is not None}

@@ -1,0 +1,92 @@
+"""The commands that take a configuration: `run`, its stages one by one, and `check`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from aeromatch_cli.cli.options import (
+    Cameras,
+    Config,
+    Crs,
+    ExecutorName,
+    Ground,
+    Images,
+    Jobs,
+    Json,
+    KeepImages,
+    LogFile,
+    Masks,
+    MaxSize,
+    Overwrite,
+    Poses,
+    Quiet,
+    Set,
+    ShardText,
+    WorkspaceDir,
+)
+from aeromatch_cli.cli.output import as_texts, guarded
+from aeromatch_cli.cli.progress import progress_shown
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.run import Result
+
+STAGES = {
+    "run": "Everything, over all overlapping pairs: pairs to report.",
+    "pairs": "Read the block and choose the pairs.",
+    "enhance": "Write enhanced pictures; none of images that need none.",
+    "simulate": "Write simulated views.",
+    "extract": "Find features in every image.",
+    "match": "Match every pair; features that are missing are made first.",
+    "filter": "Verify the matches of every pair.",
+    "export": "Write the files of other programs.",
+    "report": "Write the HTML report.",
+    "check": "Dry run: images readable, poses plausible, weights present, pairs, memory, disk, time. Writes nothing.",
+}
+
+
+def stage_command(name: str) -> Callable[..., None]:
+    """The command of one stage, of `run` or of `check`: all take the same options."""
+
+    def command(
+        context: typer.Context,
+        config: Config,
+        images: Images = None,
+        poses: Poses = None,
+        cameras: Cameras = None,
+        crs: Crs = None,
+        ground: Ground = None,
+        masks: Masks = None,
+        workspace: WorkspaceDir = None,
+        set_: Set = None,
+        max_size: MaxSize = None,
+        jobs: Jobs = None,
+        executor: ExecutorName = None,
+        shard: ShardText = None,
+        overwrite: Overwrite = False,
+        keep_images: KeepImages = False,
+        log_file: LogFile = None,
+        json_: Json = False,
+        quiet: Quiet = False,
+    ) -> None:
+        block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
+        block |= {"masks": masks, "max_size_px": max_size}
+        run = {"jobs": jobs, "executor": executor, "keep_images": keep_images or None}
+
+        def call() -> Result:
+            from aeromatch_cli.config import load
+            from aeromatch_cli.stages.run import execute
+
+            settings = load(config, set_ or (), as_texts(block), run=as_texts(run), workspace=_absolute(workspace))
+            return execute(name, settings, shard=shard, overwrite=overwrite, progress=progress_shown(quiet))
+
+        guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)
+
+    return command
+
+
+def _absolute(path: Path | None) -> str | None:
+    return None if path is None else str(path.absolute())

@@ -1,0 +1,16 @@
+"""Settings: the schema, presets and files, `--set` overrides, messages on faults, and the commented default file."""
+
+from aeromatch_cli.config.load import dump, load, parse_method, preset_names, validate
+from aeromatch_cli.config.schema import FAMILIES, BlockSettings, RunSettings, Settings
+
+__all__ = [
+    "FAMILIES",
+    "BlockSettings",
+    "RunSettings",
+    "Settings",
+    "dump",
+    "load",
+    "parse_method",
+    "preset_names",
+    "validate",
+]

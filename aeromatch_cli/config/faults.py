@@ -1,0 +1,149 @@
+"""What is wrong with a configuration, in words: the key's place, the fault, and what would be right."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic_core import ErrorDetails
+
+from aeromatch_cli.config.renamed import STRATEGIES, new_key
+
+Families = Mapping[str, Mapping[str, type[BaseModel]]]
+
+_LONGEST_VALUE = 60
+_LARGEST_WRITTEN = 1e15
+# pydantic's fault types, in the words of someone who writes YAML.
+_PHRASES = {
+    "model_type": "must hold settings (key: value)",
+    "model_attributes_type": "must be a strategy's name, or its settings (key: value)",
+    "tuple_type": "must be a list, or names joined by +",
+    "too_short": "must name at least one strategy",
+    "string_type": "must be text; put it in quotes",
+    "string_too_short": "must not be empty",
+    "invalid_key": "keys must be text",
+    "finite_number": "must be a finite number",
+    "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "float_parsing": "must be a number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+}
+
+
+def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> str:
+    """One line for one pydantic fault. root: the whole tree's class; families: section -> its table of strategies."""
+    location = tuple(fault["loc"])
+    names = [str(part) for part in _visible(location, families)]
+    place = ".".join(names)
+    family = families.get(str(location[0]), {}) if location else {}
+    kind = fault["type"]
+    if kind == "extra_forbidden":
+        siblings = _siblings(location[:-1], root, families)
+        renamed = new_key(str(location[0]), names[-1], frozenset(siblings))
+        if renamed:
+            return f"{place}: this setting is now named {renamed}; write {'.'.join([*names[:-1], renamed])}"
+        owners = [name for name, strategy in family.items() if names[-1] in strategy.model_fields]
+        if owners and len(names) > 1:
+            return f"{place}: unknown key here, it belongs to {' and '.join(owners)}{nearest(names[-1], siblings)}"
+        return f"{place}: unknown key{nearest(names[-1], siblings)}"
+    if kind == "union_tag_invalid" or (kind == "literal_error" and family and location[-1] == "name"):
+        name = str(fault["ctx"]["tag"] if kind == "union_tag_invalid" else fault["input"])
+        renamed = STRATEGIES.get(str(location[0]), {}).get(name)
+        if renamed:
+            return f"{place.removesuffix('.name')}: the strategy {name!r} is now named {renamed!r}"
+        return f"{place.removesuffix('.name')}: no strategy is named {name!r}{nearest(name, list(family))}"
+    if kind == "union_tag_not_found":
+        return f"{place}: name the strategy (name: ...), one of {', '.join(family)} (got {_shown(fault['input'])})"
+    if fault["input"] is None and family and kind.startswith("model_"):
+        return f"{place}: a value is missing; one of {', '.join(family)}"
+    if kind == "value_error":
+        return f"{place or 'top level'}: {fault['msg'].removeprefix('Value error, ')}"
+    phrase = _PHRASES.get(kind) or fault["msg"].replace("Input should", "must")
+    hint = _whole_number(fault["input"]) if kind == "int_parsing" else ""
+    return f"{place or 'top level'}: {phrase} (got {_shown(fault['input'])}){hint}"
+
+
+def root_faults(faults: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+    """Without those that only follow from another: pydantic calls a chain too short when a member is invalid."""
+    places = [tuple(fault["loc"]) for fault in faults]
+    return [
+        fault
+        for fault, place in zip(faults, places, strict=True)
+        if fault["type"] != "too_short" or not any(other[:-1][: len(place)] == place for other in places)
+    ]
+
+
+def accidents(given: Any, validated: Any, place: str = "") -> Iterator[str]:
+    """Faults that the types let through: YAML reads a bare `yes` as true, and true would pass as the number 1."""
+    if isinstance(given, Mapping) and isinstance(validated, Mapping):
+        for key in (k for k in validated if k in given):
+            yield from accidents(given[key], validated[key], f"{place}.{key}" if place else str(key))
+    elif isinstance(given, list) and isinstance(validated, list):
+        for one, other in zip(given, validated, strict=True):
+            yield from accidents(one, other, f"{place}.{other['name']}" if isinstance(other, Mapping) else place)
+    elif isinstance(given, bool) and not isinstance(validated, bool):
+        yield f"{place}: must be a number (got {given!r})"
+    elif isinstance(given, str) and "\0" in given:
+        yield f"{place}: must not hold a null character (got {_shown(given)})"
+
+
+def nearest(word: str, known: Sequence[str], *, otherwise: str | None = None) -> str:
+    """`; did you mean 'x'?`, or the list of valid words (or `otherwise`) where none is close."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    if otherwise is not None:
+        return otherwise
+    return f"; valid here: {', '.join(known)}" if known else ""
+
+
+def _whole_number(value: Any) -> str:
+    """`; write 1000` for 1e3, which YAML reads as text."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return ""
+    return f"; write {number:.0f}" if number.is_integer() and abs(number) < _LARGEST_WRITTEN else ""
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + " ..."
+
+
+def _visible(location: tuple[Any, ...], families: Families) -> Iterator[Any]:
+    """The location as `--set` would write it: without chain positions and the union tags that pydantic puts in."""
+    family = families.get(str(location[0])) if location else None
+    chained = len(location) > 1 and isinstance(location[1], int)
+    for index, part in enumerate(location):
+        if isinstance(part, int):
+            # A chain's member is told by its name, which pydantic leaves out where the family has only one.
+            if family is not None and len(family) == 1 and index == 1 and len(location) > 2:
+                yield next(iter(family))
+            continue
+        is_tag = family is not None and len(family) > 1 and not chained and index == 1 and part in family
+        if not is_tag:
+            yield part
+
+
+def _siblings(location: tuple[Any, ...], root: type[BaseModel], families: Families) -> list[str]:
+    """The keys that are valid at a place."""
+    model: Any = root
+    for part in location:
+        if isinstance(part, int):
+            continue
+        if isinstance(model, type) and issubclass(model, BaseModel) and part in model.model_fields:
+            model = model.model_fields[part].annotation
+        else:
+            model = families.get(str(location[0]), {}).get(str(part), model)
+    if len(location) > 1 and isinstance(location[1], int) and len(families[str(location[0])]) == 1:
+        model = next(iter(families[str(location[0])].values()))
+    for candidate in (model, *get_args(model)):
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return list(candidate.model_fields)
+    return []

@@ -1,0 +1,106 @@
+"""Settings from a preset or file, `--set` overrides and options; validated once; dumped whole.
+
+A tree is built from the defaults, a preset or file holding differences, and overrides, in this order.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from aeromatch_cli.config.faults import accidents, describe, nearest, root_faults
+from aeromatch_cli.config.merge import apply_override, merge
+from aeromatch_cli.config.paths import absolute_paths
+from aeromatch_cli.config.reading import UniqueKeyLoader, read_text
+from aeromatch_cli.config.schema import FAMILIES, Settings
+from aeromatch_cli.errors import ConfigError
+
+
+def preset_names() -> list[str]:
+    """Presets that ship with the package."""
+    return sorted(path.stem for path in _preset_folder().glob("*.yaml"))
+
+
+def _preset_folder() -> Path:
+    """Inside the package when installed from a wheel, beside it in a checkout."""
+    package = Path(__file__).parent.parent
+    inside = package / "configs"
+    return inside if inside.is_dir() else package.parent / "configs"
+
+
+def load(source: str, overrides: Sequence[str] = (), block: Mapping[str, Any] | None = None, **top: Any) -> Settings:
+    """Settings of a preset name or YAML file, with `--set` overrides and command-line block options on top.
+
+    overrides: "key.sub=value" texts. block, top: values from the command line; None means not given. Paths in a file
+    are relative to that file, all others to the current folder.
+    Raises ConfigError naming the key's place and the nearest valid one.
+    """
+    tree, origin = _read_tree(source)
+    for text in overrides:
+        apply_override(tree, text)
+    given = {key: value for key, value in top.items() if value is not None}
+    block_given = {key: value for key, value in (block or {}).items() if value is not None}
+    if block_given:
+        given["block"] = block_given
+    if overrides and given:
+        validate(tree, f"{origin} with --set")  # a mistake is one even where an option hides it
+    merge(tree, absolute_paths(given, tree, Path.cwd()))
+    return validate(tree, f"{origin} with the options given" if overrides or given else origin)
+
+
+def validate(tree: Mapping[str, Any], origin: str = "configuration") -> Settings:
+    """Settings of a plain tree. Raises ConfigError listing every fault."""
+    try:
+        settings = Settings.model_validate(tree)
+        faults = list(accidents(tree, settings.model_dump(mode="json")))
+    except ValidationError as error:
+        faults = [describe(fault, Settings, FAMILIES) for fault in root_faults(error.errors())]
+    if faults:
+        raise ConfigError(f"{origin} is not valid:\n" + "\n".join(f"  {fault}" for fault in faults))
+    return settings
+
+
+def dump(settings: Settings) -> str:
+    """The complete tree as YAML, every default present, for the workspace itself.
+
+    Its `workspace` is therefore `.`: the file runs again where it lies, even after the folder was moved.
+    """
+    tree = settings.model_dump(mode="json") | {"workspace": "."}
+    return yaml.safe_dump(tree, sort_keys=False, width=100, allow_unicode=True)
+
+
+def parse_method(text: str) -> tuple[str, list[str]]:
+    """`fusion[enhance=none,match.ratio=0.7]` to ("fusion", ["enhance=none", "match.ratio=0.7"])."""
+    match = re.fullmatch(r"([^\[\]]+)(?:\[(.*)\])?", text.strip())
+    if not match:
+        raise ConfigError(f"{text!r} is not a method; write PRESET or PRESET[key=value,key=value]")
+    return match[1], [part for part in (match[2] or "").split(",") if part]
+
+
+def _read_tree(source: str) -> tuple[dict[str, Any], str]:
+    """Defaults with the differences of a preset or file merged in, and the source in words."""
+    tree: dict[str, Any] = Settings().model_dump(mode="json")
+    path = Path(source)
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    if not is_yaml and source in preset_names():
+        text, origin, folder = read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
+    elif is_yaml or path.is_file():
+        text, origin, folder = read_text(path), str(path), path.absolute().parent
+    else:
+        hint = nearest(source, preset_names(), otherwise="")
+        raise ConfigError(
+            f"{source!r} is neither a YAML file nor a preset; presets are {', '.join(preset_names())}{hint}"
+        )
+    try:
+        differences = yaml.load(text, UniqueKeyLoader) or {}
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{origin} is not YAML: {error}") from None
+    if not isinstance(differences, dict):
+        raise ConfigError(f"{origin} must hold keys and values at the top, not a {type(differences).__name__}")
+    merge(tree, absolute_paths(differences, tree, folder) if folder else differences)
+    return tree, origin

@@ -1,0 +1,69 @@
+"""Paths in a tree of settings: relative to the file that names them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.config.schema import FAMILIES
+from aeromatch_cli.strategies import Strategy
+
+PATH_KEYS = ("images", "poses", "cameras", "ground", "masks")
+
+_WORDS = {"poses": ("exif", "none"), "cameras": ("exif", "folder"), "ground": ("auto",)}
+
+
+def absolute_paths(differences: Mapping[str, Any], tree: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """`differences` with every path below `folder` unless it is absolute. tree: names the strategies they refer to."""
+    result = dict(differences)
+    if isinstance(result.get("workspace"), str) and result["workspace"]:
+        result["workspace"] = _below(folder, result["workspace"])
+    block = result.get("block")
+    if isinstance(block, Mapping):
+        result["block"] = {key: _absolute_block_path(key, value, folder) for key, value in block.items()}
+    for key, table in FAMILIES.items():
+        current, value = tree.get(key), result.get(key)
+        default = current.get("name") if isinstance(current, Mapping) else None
+        if isinstance(value, Mapping):
+            result[key] = absolute_strategy_paths(value, table.get(str(value.get("name", default))), folder)
+        elif isinstance(value, list):
+            result[key] = [
+                absolute_strategy_paths(item, table.get(str(item.get("name"))), folder)
+                if isinstance(item, Mapping)
+                else item
+                for item in value
+            ]
+    return result
+
+
+def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
+    if key not in PATH_KEYS or not isinstance(value, str) or not value or value in _WORDS.get(key, ()):
+        return value
+    return value if key == "ground" and _is_number(value) else _below(folder, value)
+
+
+def absolute_strategy_paths(values: Mapping[str, Any], strategy: type[Strategy] | None, folder: Path) -> dict[str, Any]:
+    """A field marked `path` holds a path; one marked "path or name" does where it is written as one or exists."""
+    result = dict(values)
+    for key, field in strategy.model_fields.items() if strategy else ():
+        extra, value = field.json_schema_extra, result.get(key)
+        kind = extra.get("path") if isinstance(extra, dict) else None
+        if not kind or not isinstance(value, str) or not value:
+            continue
+        if kind is True or os.sep in value or Path(_below(folder, value)).is_file():
+            result[key] = _below(folder, value)
+    return result
+
+
+def _below(folder: Path, path: str) -> str:
+    return os.path.normpath(folder / os.path.expanduser(path))  # noqa: PTH111 - Path's raises on an unknown user
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

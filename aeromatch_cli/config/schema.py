@@ -1,0 +1,164 @@
+"""The settings: one model for the whole tree; each strategy class brings its own keys and defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.enhancers import ENHANCERS
+from aeromatch_cli.strategies.exporters import EXPORTERS
+from aeromatch_cli.strategies.extractors import EXTRACTORS
+from aeromatch_cli.strategies.filters import FILTERS
+from aeromatch_cli.strategies.matchers import MATCHERS
+from aeromatch_cli.strategies.pairings import PAIRINGS
+from aeromatch_cli.strategies.simulators import SIMULATORS
+
+
+def named(value: Any) -> Any:
+    """A bare name stands for the strategy with its defaults."""
+    return {"name": value} if isinstance(value, str) else value
+
+
+def chain(value: Any) -> Any:
+    """`a+b` and a single mapping are chains too; null and `none` are the empty one."""
+    if value is None or value == "none":
+        return []
+    if isinstance(value, str):
+        value = [name.strip() for name in value.split("+")]
+    elif isinstance(value, Mapping):
+        value = [value]
+    return [named(item) for item in value] if isinstance(value, Sequence) else value
+
+
+def _choice(table: Mapping[str, type[Strategy]]) -> Any:
+    """Type of "one of this family", chosen by `name`."""
+    classes = tuple(table.values())
+    if len(classes) == 1:
+        return Annotated[classes[0], BeforeValidator(named)]
+    return Annotated[Union[classes], Field(discriminator="name"), BeforeValidator(named)]  # noqa: UP007
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class BlockSettings(_Section):
+    """What was flown: images, poses, cameras, ground."""
+
+    images: str = Field("", description="Folder of images, searched recursively.")
+    poses: str = Field("exif", description="Pose list (CSV/TXT), `exif` for GPS and XMP angles, or `none`.")
+    cameras: str = Field("exif", description="COLMAP cameras.txt, YAML, JSON, `exif` or `folder` (one per folder).")
+    crs: str = Field("auto", description="Code of the world frame (EPSG:32633), `local`, or `auto` (UTM zone).")
+    ground: str = Field("auto", description="Height in metres, a DEM file, or `auto` (triangulated).")
+    masks: str = Field("", description="Folder of masks (a/1.jpg.png masks a/1.jpg; 0 = ignore) or one mask for all.")
+    angles: Literal["auto", "gimbal", "nadir"] = Field(
+        "auto", description="Zero of yaw/pitch/roll: camera forward (gimbal, DJI) or down (nadir, Parrot)."
+    )
+    sigma_position_m: float = Field(5.0, gt=0, description="Standard deviation of each coordinate, metres.")
+    sigma_angle_deg: float = Field(3.0, gt=0, description="Standard deviation of each angle, degrees.")
+    max_size_px: int = Field(0, ge=0, description="Larger images are reduced to this longer side; 0 = never.")
+
+    @field_validator("crs", "ground", mode="before")
+    @classmethod
+    def _number_as_text(cls, value: Any) -> Any:
+        return str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+class RunSettings(_Section):
+    """How it is run; nothing here changes a result."""
+
+    executor: Literal["serial", "processes", "dask"] = Field(
+        "processes", description="Where tasks run; `dask` needs the extra [cluster]."
+    )
+    jobs: int = Field(0, ge=0, description="Worker processes; 0 = one per core.")
+    keep_images: bool = Field(False, description="`run` keeps enhanced and simulated pictures too.")
+
+
+class Settings(_Section):
+    """The whole tree."""
+
+    workspace: str = Field("aeromatch-work", min_length=1, description="Folder for every result; made if missing.")
+    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    block: BlockSettings = Field(BlockSettings(), description="What was flown.")
+    run: RunSettings = Field(RunSettings(), description="How it is run; nothing here changes a result.")
+    pairs: _choice(PAIRINGS) = Field(  # type: ignore[valid-type]
+        PAIRINGS["overlap"](), description="Which images are compared."
+    )
+    enhance: _choice(ENHANCERS) = Field(  # type: ignore[valid-type]
+        ENHANCERS["none"](), description="What is done to a picture before anything else."
+    )
+    simulate: _choice(SIMULATORS) = Field(  # type: ignore[valid-type]
+        SIMULATORS["ground"](), description="From where a picture is looked at: virtual views."
+    )
+    extract: _choice(EXTRACTORS) = Field(  # type: ignore[valid-type]
+        EXTRACTORS["sift"](), description="Features of each image, over all its views."
+    )
+    match: _choice(MATCHERS) = Field(  # type: ignore[valid-type]
+        MATCHERS["nearest"](), description="Which features of two images belong together."
+    )
+    filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+        (FILTERS["poselib"](),),
+        min_length=1,  # without a filter no pair is ever verified
+        description="Which matches are kept: a chain, each sees what those before it left.",
+    )
+    export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+        (EXPORTERS["colmap"](),), description="For which programs the result is written: a list."
+    )
+
+    @field_validator("filter")
+    @classmethod
+    def _one_that_verifies(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
+        if not any(one.verifies for one in value):
+            names = "+".join(getattr(one, "name", "") for one in value)
+            evidence = next(name for name, strategy in FILTERS.items() if strategy.verifies)
+            colours = " with extract.colours=true" if any("colour" in one.needs for one in value) else ""
+            raise ValueError(f"{names} verifies nothing by itself; use {names}+{evidence}{colours}")
+        return value
+
+    @model_validator(mode="after")
+    def _descriptors_for_matchers(self) -> Settings:
+        made, wanted = self.extract.descriptors, self.match.reads_descriptors
+        if not self.match.reads_pixels and (not made or wanted not in ("", made)):
+            # What has no descriptors only pixels can compare; what has them need not be measured anew.
+            readers = [
+                name
+                for name, one in MATCHERS.items()
+                if one.reads_pixels != bool(made) and one.reads_descriptors in ("", made)
+            ]
+            makers = [name for name, one in EXTRACTORS.items() if one.descriptors and wanted in ("", one.descriptors)]
+            raise ValueError(
+                f"match {self.match.name} compares {wanted or 'any'} descriptors, extract {self.extract.name} makes "
+                f"{made or 'none'}; use match {' or '.join(readers)}, or extract {' or '.join(makers)}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _colours_for_filters(self) -> Settings:
+        readers = [getattr(one, "name", "") for one in self.filter if "colour" in one.needs]
+        if readers and not self.extract.colours:
+            raise ValueError(
+                f"filter {'+'.join(readers)} compares colours that are not kept; add --set extract.colours=true"
+            )
+        return self
+
+    @field_validator("export")
+    @classmethod
+    def _one_folder_each(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
+        names = [getattr(exporter, "name", "") for exporter in value]
+        if len(set(names)) < len(names):
+            raise ValueError(f"each exporter at most once, its folder has its name: {', '.join(names)}")
+        return value
+
+
+FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
+    "pairs": PAIRINGS,
+    "enhance": ENHANCERS,
+    "simulate": SIMULATORS,
+    "extract": EXTRACTORS,
+    "match": MATCHERS,
+    "filter": FILTERS,
+    "export": EXPORTERS,
+}

@@ -1,0 +1,122 @@
+"""Rasters from files and back: the stored frame whatever the EXIF Orientation, RGB order, 8 and 16 bit.
+
+The only file that knows OpenCV's BGR.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.images import tiff
+from aeromatch_cli.images.depth import in_16_bits, to_gray8
+
+# A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
+# announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
+_JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
+
+_JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
+
+_END_OF_IMAGE = 0xD9
+
+
+def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
+    """The stored raster: (H, W) uint8 gray, or with `colour` uint8 or uint16 and (H, W, 3) RGB where it has colour.
+
+    Other depths come as `in_16_bits` makes them. Raises ItemError when the file cannot be decoded.
+    """
+    return read_raster(path, colour=colour)[0]
+
+
+def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
+    """The same, and where it is valid (H, W) by what the file says (None = everywhere); what is not is 0.
+
+    Invalid are transparent pixels, those of the nodata value in all bands, and NaN. A file that calls every pixel
+    invalid is not believed: some writers leave alpha empty.
+    """
+    import cv2
+
+    valid = None
+    if path.suffix.lower() in tiff.SUFFIXES:
+        pixels, valid = tiff.read_tiff(path)
+    else:
+        # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
+        straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
+        flag = cv2.IMREAD_GRAYSCALE if straight else cv2.IMREAD_UNCHANGED
+        pixels = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pixels.ndim == 3 and pixels.shape[2] == 4:
+            valid = pixels[..., 3] > 0
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
+        elif pixels.ndim == 3:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+    if valid is not None and bool(valid.all()) == bool(valid.any()):
+        valid = None
+    pixels = in_16_bits(pixels, valid)
+    if valid is not None:
+        pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
+    return pixels if colour else to_gray8(pixels), valid
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
+    import cv2
+
+    try:
+        data = path.read_bytes()
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except (OSError, cv2.error) as error:
+        raise ItemError(f"cannot read image {path}: {error}") from None
+    if pixels is None:
+        raise ItemError(f"cannot decode image {path}: the file is corrupt or no picture; replace or remove it")
+    if fault := _jpeg_fault(data):
+        raise ItemError(f"image {path} is {fault}")
+    return np.asarray(pixels)
+
+
+def _jpeg_fault(data: bytes) -> str:
+    """What is wrong with a JPEG's structure, "" for nothing; other formats pass.
+
+    The decoder makes a picture of a cut or overwritten file without an error: gray, or noise, from there on. So the
+    segments are walked here. The end marker must come, though not as the file's last bytes (some cameras append data),
+    and compressed data must hold no marker but restarts. Markers inside segments (a thumbnail) do not count.
+    """
+    if data[:2] != b"\xff\xd8":
+        return ""
+    place = 2
+    while found := _JPEG_MARKER.search(data, place):
+        marker, place = found[1][0], found.end()
+        if marker == _END_OF_IMAGE:
+            return ""
+        if marker not in _JPEG_SEGMENTS:
+            return "corrupt: its compressed data is damaged; copy it again or remove it"
+        # A segment's length counts its own two bytes.
+        place += int.from_bytes(data[place : place + 2], "big")
+    return "cut off: its JPEG data ends early; copy it again or remove it"
+
+
+def write_png(stream: Any, pixels: NDArray[Any]) -> None:
+    """PNG of (H, W) or (H, W, 3) RGB, uint8 or uint16, into a binary stream. Raises ValueError for other types."""
+    import cv2
+
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"a PNG holds uint8 or uint16, not {pixels.dtype}")  # OpenCV would cast without a word
+    ordered = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    ok, data = cv2.imencode(".png", ordered)
+    if not ok:
+        raise ValueError(f"cannot encode a picture of shape {pixels.shape}")
+    stream.write(data.tobytes())
+
+
+def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
+    """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError."""
+    import cv2
+
+    mask = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask.shape != (height_px, width_px):
+        mask = cv2.resize(mask, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(mask) > 0

@@ -1,0 +1,65 @@
+"""Where a picture shows ground: mask files by name, the horizon, frames of black."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
+from aeromatch_cli.geometry.cameras import world_rays
+from aeromatch_cli.geometry.footprints import sees_horizon
+
+
+def mask_path(masks: str, name: str) -> Path | None:
+    """Mask of an image: COLMAP's naming (a/1.jpg.png), the bare stem (a/1.png), or the one file for all."""
+    if not masks:
+        return None
+    root = Path(masks)
+    if root.is_file():
+        return root
+    for candidate in (root / f"{name}.png", (root / name).with_suffix(".png")):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def sees_sky(camera: Camera, pose: Pose | None) -> bool:
+    """Whether some part of the image's border looks level or above the horizon."""
+    return pose is not None and pose.world_rotation is not None and sees_horizon(camera, pose.world_rotation)
+
+
+def below_horizon(camera: Camera, world_rotation: FloatArray) -> BoolArray:
+    """(H, W) bool, False where the image looks above the horizon (sky)."""
+    width, height = camera.width_px, camera.height_px
+    xs, ys = np.arange(0.0, width + 15, 16), np.arange(0.0, height + 15, 16)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    up = np.nan_to_num(world_rays(camera, world_rotation, grid)[:, 2], nan=1.0).reshape(len(ys), len(xs))
+    return _interpolate(up, xs, ys, width, height) < 0.0
+
+
+def _interpolate(values: FloatArray, xs: FloatArray, ys: FloatArray, width: int, height: int) -> FloatArray:
+    rows = np.array([np.interp(np.arange(width), xs, row) for row in values])
+    t = np.interp(np.arange(height), ys, np.arange(len(ys), dtype=float))
+    lower = np.minimum(t.astype(int), len(ys) - 2)
+    weight = (t - lower)[:, None]
+    return rows[lower] * (1 - weight) + rows[lower + 1] * weight
+
+
+def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
+    """False in frames of exact zeros that touch the border, as orthorectified or rotated pictures have them.
+
+    Black objects inside the picture stay valid; None when less than half of any border line is zero.
+    """
+    import cv2
+
+    flat = pixels if pixels.ndim == 2 else pixels.max(axis=2)
+    borders = (flat[0], flat[-1], flat[:, 0], flat[:, -1])
+    if all(np.count_nonzero(line == 0) < 0.5 * line.size for line in borders):
+        return None
+    zero = (flat == 0).astype(np.uint8)
+    _, labels = cv2.connectedComponents(zero, connectivity=4)
+    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    return ~np.isin(labels, edge[edge > 0])

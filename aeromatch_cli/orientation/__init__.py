@@ -1,0 +1,1 @@
+"""Terrain and attitudes from matches: arrays in, arrays out."""

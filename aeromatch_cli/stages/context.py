@@ -1,0 +1,161 @@
+"""What every stage knows: settings, workspace, block, pairs, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.config import Settings
+from aeromatch_cli.data import Block, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.workspace import Workspace, fingerprint
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`."""
+
+    settings: Settings
+    workspace: Workspace
+    executor: Executor
+    block: Block
+    pairs: tuple[Pair, ...]
+    image_fingerprints: Mapping[str, str]
+    given_poses: Mapping[str, Pose]
+    guessed_cameras: frozenset[str] = frozenset()
+    # Images that no match ties to their surroundings although their poses say so (`stages.attitudes`).
+    suspects: frozenset[str] = frozenset()
+    shard: Shard | None = None
+    overwrite: bool = False
+    # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
+    known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
+    known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def owns(self, item_id: str) -> bool:
+        return self.shard is None or self.shard.owns(item_id)
+
+    def images(self) -> list[Image]:
+        """The images of this shard."""
+        return [image for image in self.block.images if self.owns(image.image_id)]
+
+    def rows(self) -> dict[str, list[Pair]]:
+        """Pairs of this shard by image_id0, in order."""
+        rows: dict[str, list[Pair]] = {}
+        for pair in self.pairs:
+            if self.owns(pair.image_id0):
+                rows.setdefault(pair.image_id0, []).append(pair)
+        return rows
+
+    def image_path(self, image: Image) -> Path:
+        return Path(self.settings.block.images) / image.name
+
+    def pose(self, image_id: str) -> Pose | None:
+        return self.block.poses.get(image_id)
+
+    def ground_z_m(self, image_id: str) -> float | None:
+        """Ground height where an image looks (below it, without attitude), None without ground or position."""
+        return _ground_heights(self.block).get(image_id)
+
+    @property
+    def image_by_id(self) -> Mapping[str, Image]:
+        return _image_index(self.block)
+
+    def geometry(self, pair: Pair) -> PairGeometry:
+        images = self.image_by_id
+        heights = [h for h in (self.ground_z_m(pair.image_id0), self.ground_z_m(pair.image_id1)) if h is not None]
+        return PairGeometry(
+            pair=pair,
+            camera0=self.block.camera(images[pair.image_id0]),
+            camera1=self.block.camera(images[pair.image_id1]),
+            pose0=self._believed(pair.image_id0),
+            pose1=self._believed(pair.image_id1),
+            ground_z_m=sum(heights) / len(heights) if heights else None,
+        )
+
+    def _believed(self, image_id: str) -> Pose | None:
+        """The pose by which matches are searched and limited: of a suspect only where it was."""
+        pose = self.pose(image_id)
+        return replace(pose, world_rotation=None) if pose is not None and image_id in self.suspects else pose
+
+    def lacks_north(self, image_id: str) -> bool:
+        """Whether an image, or one that it is paired with, has no attitude to be trusted: what turns its north up
+        cannot be compared with it, the picture as it was taken can."""
+        ids = (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))
+        poses = [self._believed(i) for i in ids]
+        return any(pose is None or pose.world_rotation is None for pose in poses)
+
+    def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
+        """Where else the ground of an image is looked at from: the images it is paired with that have an attitude."""
+        found = []
+        for other_id, overlap in _paired(self.pairs).get(image_id, ()):
+            pose = self.pose(other_id)
+            if pose is not None and pose.world_rotation is not None:
+                camera = self.block.camera(self.image_by_id[other_id])
+                found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
+        return tuple(found)
+
+    def under_one_sun(self, image_id: str, minutes: float) -> bool:
+        """Whether an image and all that it is paired with are known to be taken within so many minutes."""
+        images = self.image_by_id
+        times = [images[i].time for i in (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))]
+        if minutes <= 0.0 or not all(times):
+            return False
+        taken, *others = (datetime.fromisoformat(time) for time in times)
+        return all(abs((other - taken).total_seconds()) <= 60.0 * minutes for other in others)
+
+    def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
+        """What strategies with these `needs` read of one image's geometry."""
+        key = image_id, needs
+        if key not in self.known_fingerprints:
+            self.known_fingerprints[key] = self._geometry_fingerprint(image_id, needs)
+        return self.known_fingerprints[key]
+
+    def _geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
+        pose = self.pose(image_id)
+        parts: dict[str, Any] = {}
+        if "camera" in needs:
+            parts["camera"] = self.block.camera(self.image_by_id[image_id])
+        if "pose" in needs:
+            parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
+        if "pose" in needs and image_id in self.suspects:
+            parts["suspect"] = True
+        if "sigma" in needs:
+            parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
+        if "ground" in needs:
+            parts["ground"] = (self.ground_z_m(image_id), self.block.gsd_m)
+        if "neighbours" in needs:
+            parts["neighbours"] = [
+                (n.camera, n.pose.center_m, n.pose.world_rotation, n.overlap, n.ground_z_m)
+                for n in self.neighbours(image_id)
+            ]
+        return fingerprint(parts)
+
+
+@lru_cache(maxsize=4)
+def _paired(pairs: tuple[Pair, ...]) -> Mapping[str, Sequence[tuple[str, float]]]:
+    """image_id -> the other image and the overlap of each of its pairs, in the order of the ids."""
+    found: dict[str, list[tuple[str, float]]] = {}
+    for pair in pairs:
+        found.setdefault(pair.image_id0, []).append((pair.image_id1, pair.overlap))
+        found.setdefault(pair.image_id1, []).append((pair.image_id0, pair.overlap))
+    return {image_id: sorted(others) for image_id, others in found.items()}
+
+
+@lru_cache(maxsize=4)
+def _ground_heights(block: Block) -> Mapping[str, float]:
+    """World height of the ground by image_id: over relief an oblique image looks at other heights than it stands on."""
+    if block.ground is None:
+        return {}
+    below = {i: float(block.ground.height_m(pose.center_m[None, :2])[0]) for i, pose in block.poses.items()}
+    return below | {i: footprint.ground_z_m for i, footprint in block_footprints(block).items()}
+
+
+@lru_cache(maxsize=4)
+def _image_index(block: Block) -> Mapping[str, Image]:
+    return {image.image_id: image for image in block.images}

@@ -1,0 +1,31 @@
+"""Part i of n of a stage's items."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.workspace import stable_hash
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part i of n of the items, chosen by a stable hash of their id: 1/2 and 2/2 are disjoint and complete."""
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """From "i/n", 1 <= i <= n. Raises ConfigError."""
+        first, _, second = text.partition("/")
+        if not (first.isdigit() and second.isdigit() and 1 <= int(first) <= int(second)):
+            raise ConfigError(f"--shard {text!r}: write i/n with 1 <= i <= n, for example 1/4")
+        return cls(int(first), int(second))
+
+    def owns(self, item_id: str) -> bool:
+        return stable_hash(item_id) % self.count == self.index - 1
+
+    @property
+    def label(self) -> str:
+        return f"{self.index}-of-{self.count}"

@@ -1,0 +1,163 @@
+"""What a stage leaves behind: its report, the list of all failures, and how its tasks are run."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from aeromatch_cli.data import Pair
+from aeromatch_cli.executor import Outcome
+from aeromatch_cli.formats import csv_text
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.workspace import Workspace, read_json, write_json, write_text
+
+T = TypeVar("T")
+
+R = TypeVar("R")
+
+log = logging.getLogger("aeromatch")
+
+# Stages whose items are images or pairs; the others name files or exporters.
+ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
+
+
+@dataclass
+class StageReport:
+    """What one stage did; becomes reports/<stage>.json.
+
+    items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters.
+    """
+
+    stage: str
+    seconds: float = 0.0
+    items: int = 0
+    done: int = 0
+    skipped: int = 0
+    fingerprint: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    failures: list[tuple[str, str]] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+
+    def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
+        """Close the clock, write the report and gather failures.csv from all stages.
+
+        A stage that found everything up to date leaves the report of the run that made it, with its timing.
+        """
+        self.seconds = round(time.perf_counter() - self.started, 3)
+        value = {
+            "stage": self.stage,
+            "seconds": self.seconds,
+            "items": self.items,
+            "done": self.done,
+            "skipped": self.skipped,
+            "failed": len(self.failures),
+            "fingerprint": self.fingerprint,
+            "facts": self.facts,
+            "failures": [list(failure) for failure in self.failures],
+        }
+        path = context_workspace.stage_report(self.stage, shard.label if shard else "")
+        if not self._says_nothing_new(path):
+            write_json(path, value)
+        gather_failures(context_workspace)
+        for item, reason in self.failures:
+            log.warning("%s: %s: %s", self.stage, item, reason)
+        return self
+
+    def absorb(self, earlier: StageReport, workspace: Workspace) -> StageReport:
+        """Count what an earlier pass of the same command did as done by this one, and write the sum."""
+        self.done = min(self.items - len(self.failures), self.done + earlier.done)
+        self.skipped = self.items - len(self.failures) - self.done
+        self.started -= earlier.seconds
+        return self.write(workspace)
+
+    def _says_nothing_new(self, path: Path) -> bool:
+        if self.done or self.failures or not path.is_file():
+            return False
+        old = read_json(path)
+        # Without facts of its own the stage only counts what it makes: those on file still hold.
+        self.facts = self.facts or old.get("facts", {})
+        return not old.get("failures") and (old.get("fingerprint"), old.get("facts")) == (self.fingerprint, self.facts)
+
+
+def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
+    """failures.csv anew from the reports of all stages; returns its rows (stage, item, reason).
+
+    What a later report of the same stage covers (the whole block, or a shard that owns the item) supersedes what an
+    earlier one says of that item.
+    """
+    by_stage: dict[str, list[Path]] = {}
+    for path in workspace.reports.glob("*.json"):
+        by_stage.setdefault(path.stem.partition(".")[0], []).append(path)
+    rows: set[tuple[str, str, str]] = set()
+    for stage, paths in by_stage.items():
+        later: list[Shard | None] = []
+        for path in sorted(paths, key=lambda path: (-path.stat().st_mtime_ns, path.name)):
+            for item, reason in read_json(path).get("failures", []):
+                if not any(shard is None or shard.owns(owner(item)) for shard in later):
+                    rows.add((stage, item, reason))
+            label = path.stem.partition(".")[2]
+            later.append(Shard.parse(label.replace("-of-", "/")) if label else None)
+    ordered = sorted(rows)
+    write_text(workspace.failures, csv_text(("stage", "item", "reason"), ordered))
+    return ordered
+
+
+def owner(item: str) -> str:
+    """The image by which a failed item is sharded: itself, or the first of a pair "id0 id1"."""
+    return item.partition(" ")[0]
+
+
+def forget_absent(context: Context) -> None:
+    """Drop failures of images and pairs that are no longer part of the block from earlier reports."""
+    images = {image.image_id for image in context.block.images}
+    pairs = {f"{pair.image_id0} {pair.image_id1}" for pair in context.pairs}
+    for path in sorted(context.workspace.reports.glob("*.json")):
+        report = read_json(path)
+        if report.get("stage") not in ITEM_STAGES:
+            continue
+        kept = [row for row in report["failures"] if row[0] in images or row[0] in pairs]
+        if len(kept) < len(report["failures"]):
+            stamp = path.stat().st_mtime_ns
+            write_json(path, {**report, "failed": len(kept), "failures": kept})
+            os.utime(path, ns=(stamp, stamp))
+
+
+def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[tuple[str, str]]:
+    """Failures (image_id0, reason), one per row, for pairs that lack what `command` makes.
+
+    Pairs that have failed there or before, themselves or by one of their images, are explained already.
+    """
+    before = ITEM_STAGES[: ITEM_STAGES.index(command) + 1]
+    failed = {item for stage, item, _ in gather_failures(context.workspace) if stage in before}
+    rows: dict[str, int] = {}
+    for pair in pairs:
+        if failed.isdisjoint((pair.image_id0, pair.image_id1, f"{pair.image_id0} {pair.image_id1}")):
+            rows[pair.image_id0] = rows.get(pair.image_id0, 0) + 1
+    remedy = "run `aeromatch run`, or the single stages match and filter in this order"
+    text = f"missing, or made with other settings, attitudes or inputs: {remedy}"
+    return [(image_id, f"results of {command} for {count} pair(s): {text}") for image_id, count in rows.items()]
+
+
+def run_stage(
+    context: Context,
+    report: StageReport,
+    function: Callable[[T], R],
+    tasks: Sequence[T],
+    names: Sequence[str],
+) -> list[R]:
+    """Run tasks, put failures into the report under their names, return the values of the rest."""
+    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, report.stage) if tasks else []
+    values = []
+    for name, outcome in zip(names, outcomes, strict=True):
+        if outcome.value is None:
+            report.failures.append((name, outcome.error))
+        else:
+            values.append(outcome.value)
+    report.done += len(values)
+    return values

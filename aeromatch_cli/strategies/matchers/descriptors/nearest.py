@@ -1,0 +1,24 @@
+"""Mutual nearest neighbours with the ratio test over views of like direction: the classical matcher."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from aeromatch_cli.strategies.matchers.descriptors.comparison import RATIO, Comparison, Found, ratio_test
+from aeromatch_cli.strategies.matchers.descriptors.search import Search
+
+
+class Nearest(Search):
+    """Mutual nearest neighbours between views of like direction. Scores are 1 - d1/d2."""
+
+    version: ClassVar[int] = 2
+    name: Literal["nearest"] = "nearest"
+    ratio: float = Field(
+        RATIO, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
+    )
+
+    def scan(self, asked: Comparison) -> Found:
+        """Matches of all view pairs that are alike, costs d1/d2."""
+        return ratio_test(asked, self.ratio)
