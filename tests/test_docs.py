@@ -10,7 +10,7 @@ import pytest
 from benchmarks import pages, stamps
 
 from aeromatch_cli.config import load
-from aeromatch_cli.nets.weights import SHIPPED_FOLDER, shipped_weights
+from aeromatch_cli.nets.files import SHIPPED_FOLDER, shipped_weights
 
 PRESENT = stamps.present_versions()
 RESULTS = sorted(pages.FOLDER.glob("*.md"))

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import FAMILIES, Settings
+from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
-from aeromatch_cli.nets.weights import SHIPPED_FOLDER, sha256_of_file
-from aeromatch_cli.stages.common import PIPELINE_VERSION
+from aeromatch_cli.stages.versions import PIPELINE_VERSION
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 
