@@ -219,13 +219,13 @@ class Executor:
     def _run_processes(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
         outcomes: dict[int, Outcome[R]] = {}
         waiting = list(range(len(tasks)))
-        suspects: list[int] = []
+        in_flight: list[int] = []
         while waiting:
-            suspects = self._drain(function, tasks, waiting, outcomes)
-            waiting = [index for index in waiting if index not in outcomes and index not in suspects]
+            in_flight = self._drain(function, tasks, waiting, outcomes)
+            waiting = [index for index in waiting if index not in outcomes and index not in in_flight]
             # A dead worker (killed for memory, a crash in a native library) takes the pool with it and does not say
             # which task it had: each task that was in flight is tried again alone, and blamed only if it dies alone.
-            for index in suspects:
+            for index in in_flight:
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
                     outcomes[index] = Outcome(None, "its worker process died (out of memory, or a crash in a library)")

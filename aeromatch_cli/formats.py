@@ -17,8 +17,8 @@ failures.csv    stage, item, reason
 ignored_attitudes.json
                 images whose attitude contradicts the pictures: fingerprint (of all that the judgement rests on),
                 settings (fingerprint of the strategies), images: image_id -> angle_deg, facts (fingerprint of the
-                image and its pose); suspects: image_id -> facts, of images that no verified pair ties to those that
-                they overlap with: they and their neighbours are also matched as they were taken
+                image and its pose); isolated: image_id -> facts, of images without verified pairs although poses
+                predict overlap: they and the images they are paired with are also matched as source images
 
 enhanced/<id>.png|tif        the enhanced picture; <id>.mask.png 255 = treated; <id>.json: fingerprint, picture
                              (whether the picture is kept), and the facts that the strategy states. None of images

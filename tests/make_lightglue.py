@@ -78,4 +78,6 @@ class Answers:
 
 def stand_in(monkeypatch: pytest.MonkeyPatch, network: Answers) -> None:
     """The matcher asks this instead of its weights."""
-    monkeypatch.setattr(lightglue, "ready", lambda _: inference.Asked(network, Calibration(), "cpu", {}))
+    monkeypatch.setattr(
+        lightglue, "loaded_network", lambda _: inference.LoadedNetwork(network, Calibration(), "cpu", {})
+    )

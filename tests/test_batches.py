@@ -21,7 +21,7 @@ from aeromatch_cli.formats import read_match_row, write_features
 from aeromatch_cli.nets import lightglue_batch
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
-from aeromatch_cli.stages.batches import asked_together
+from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.lightglue import inference
@@ -35,7 +35,7 @@ class Together(LightGlue):
     """As where there is a GPU."""
 
     @property
-    def asks_together(self) -> bool:
+    def batches_pairs(self) -> bool:
         return True
 
 
@@ -65,7 +65,7 @@ def matcher(tmp_path_factory: pytest.TempPathFactory) -> Together:
 def test_together_they_find_what_each_finds_alone(
     matcher: Together, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    monkeypatch.setattr(batches, "_TOGETHER", most)
+    monkeypatch.setattr(batches, "_BATCH_PAIRS", most)
     asked: list[int] = []
     plain = LightGlue.answers
 
@@ -73,8 +73,8 @@ def test_together_they_find_what_each_finds_alone(
         asked.append(len(questions))
         return plain(self, questions)
 
-    monkeypatch.setattr(Together, "answers", spy)
-    found = asked_together(matcher, PAIRS, sides)
+    monkeypatch.setattr(Together, "run_network", spy)
+    found = matched_in_batches(matcher, PAIRS, sides)
     assert asked == {1: [1, 1, 1], 3: [2, 1], 32: [3]}[most]
     assert found.keys() == {pair.image_id1 for pair in PAIRS}
     for pair in PAIRS:
@@ -85,9 +85,9 @@ def test_together_they_find_what_each_finds_alone(
 
 
 def test_one_by_one_where_nothing_is_gained(matcher: Together) -> None:
-    assert asked_together(matcher, PAIRS[:1], sides) == {}
-    assert asked_together(LightGlue(weights=matcher.weights), PAIRS, sides) == {}
-    assert asked_together(Nearest(), PAIRS, sides) == {}
+    assert matched_in_batches(matcher, PAIRS[:1], sides) == {}
+    assert matched_in_batches(LightGlue(weights=matcher.weights), PAIRS, sides) == {}
+    assert matched_in_batches(Nearest(), PAIRS, sides) == {}
 
 
 def test_a_pair_that_fails_is_left_for_its_own_turn(matcher: Together) -> None:
@@ -96,7 +96,7 @@ def test_a_pair_that_fails_is_left_for_its_own_turn(matcher: Together) -> None:
             raise ConfigError("no features")
         return sides(pair)
 
-    assert asked_together(matcher, PAIRS, broken).keys() == {"same", "many", "few"}
+    assert matched_in_batches(matcher, PAIRS, broken).keys() == {"same", "many", "few"}
 
 
 def test_where_the_network_fails_only_settled_pairs_are_there(
@@ -105,9 +105,9 @@ def test_where_the_network_fails_only_settled_pairs_are_there(
     def full(*_: object) -> None:
         raise RuntimeError("CUDA out of memory")
 
-    monkeypatch.setattr(Together, "answers", full)
+    monkeypatch.setattr(Together, "run_network", full)
     with caplog.at_level(logging.WARNING):
-        assert asked_together(matcher, PAIRS, sides).keys() == {"many"}
+        assert matched_in_batches(matcher, PAIRS, sides).keys() == {"many"}
     assert "pair by pair" in caplog.text
     assert "CUDA out of memory" in caplog.text
 
@@ -118,9 +118,9 @@ def test_batches_on_a_gpu_answer_in_the_order_of_the_questions(
     monkeypatch.setattr(inference, "_BATCH_KEYPOINTS", 400)
     given = [features(count, seed) for seed, count in enumerate((40, 120, 0, 80, 119))]
     kept = np.ones(200, bool)
-    shown = [inference.shown_of(one, 0, kept[: len(one.keypoints_px)], 2048) for one in given]
+    shown = [inference.network_input(one, 0, kept[: len(one.keypoints_px)], 2048) for one in given]
     (path,) = matcher.fingerprint_files()
-    here = inference.ready(inference.Wanted(path, "float32", "cpu", 0.0, 0.95, 0.99))
+    here = inference.loaded_network(inference.NetworkOptions(path, "float32", "cpu", 0.0, 0.95, 0.99))
     calls: list[int] = []
     plain = lightglue_batch.match_batch
 
@@ -129,13 +129,13 @@ def test_batches_on_a_gpu_answer_in_the_order_of_the_questions(
         return plain(network, sides0, sides1, **options)
 
     monkeypatch.setattr(lightglue_batch, "match_batch", spy)
-    alone = here.answers([(one, one) for one in shown])
+    alone = here.run_network([(one, one) for one in shown])
     assert calls == []
     # As on a GPU, but for where the tensors lie.
     there = dataclasses.replace(here, device="cuda")
     tensors = here._tensors
-    monkeypatch.setattr(inference.Asked, "_tensors", lambda _, one: tensors(one))
-    together = there.answers([(one, one) for one in shown])
+    monkeypatch.setattr(inference.LoadedNetwork, "_tensors", lambda _, one: tensors(one))
+    together = there.run_network([(one, one) for one in shown])
     assert calls == [1, 1, 2, 1]
     for (pairs, scores), (own_pairs, own_scores) in zip(together, alone, strict=True):
         assert pairs.tolist() == own_pairs.tolist()
@@ -182,7 +182,7 @@ def test_the_device_is_no_part_of_the_recipe() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_finds_what_the_cpu_finds(matcher: Together) -> None:
     there = LightGlue(weights=matcher.weights, precision="float32", threshold=0.0, device="cuda")
-    together = asked_together(there, PAIRS, sides)
+    together = matched_in_batches(there, PAIRS, sides)
     for pair in PAIRS:
         alone, own = matcher(*sides(pair), pair.geometry), together[pair.image_id1]
         here = dict(zip(map(tuple, alone.indices.tolist()), alone.scores, strict=True))

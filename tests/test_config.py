@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 import yaml
 
 from aeromatch_cli.config import FAMILIES, Settings, dump, load, parse_method, preset_names, validate
+from aeromatch_cli.config.page import page
 from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.workspace import fingerprint
@@ -33,6 +35,19 @@ def fault(source: str, *overrides: str) -> str:
 def test_default_yaml_is_up_to_date() -> None:
     stored = (CONFIGS / "default.yaml").read_text(encoding="utf-8")
     assert stored == default_yaml(), "run: python -m aeromatch_cli.config.text > configs/default.yaml"
+
+
+def test_the_configuration_page_is_up_to_date() -> None:
+    stored = (CONFIGS.parent / "docs" / "configuration.md").read_text(encoding="utf-8")
+    assert stored == page(), "run: python -m aeromatch_cli.config.page > docs/configuration.md"
+
+
+@pytest.mark.parametrize("name", [name for name in preset_names() if name != "default"])
+def test_the_page_says_what_a_preset_sets(name: str) -> None:
+    """What stands there as --set options makes the preset of the defaults."""
+    comment = next(line for line in page().splitlines() if line.startswith(f"- `{name}`:"))
+    written = page().splitlines()[page().splitlines().index(comment) + 1]
+    assert load("baseline", re.findall(r"`([^`]+)`", written)) == load(name)
 
 
 def test_default_and_baseline_are_the_defaults() -> None:

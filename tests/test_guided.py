@@ -279,12 +279,12 @@ def test_of_two_sets_of_matches_the_one_with_more_evidence_counts(more_right, mo
     columns = np.arange(400)
     columns[100:] = rng.permutation(columns[100:])
     columns[100 : 100 + more_right] = np.arange(100, 100 + more_right)
-    asked = Comparison(*(described(s, np.zeros((400, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
+    comparison = Comparison(*(described(s, np.zeros((400, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
                        np.ones((1, 1), bool))  # fmt: skip
     few = Found(np.arange(70, 140), np.concatenate([np.arange(70, 100), rng.integers(200, 400, 40)]), np.full(70, 0.5))
     rows = np.arange(70, 100 + more_right + more_wrong)
     many = Found(rows, columns[rows], np.full(len(rows), 0.5))
-    best = most_evident(asked, [many, few])
+    best = most_evident(comparison, [many, few])
     assert len(best.rows) > 70 if taken else set(best.rows) <= set(few.rows)
     assert len(np.unique(best.columns)) == len(best.columns)
 
@@ -292,7 +292,7 @@ def test_of_two_sets_of_matches_the_one_with_more_evidence_counts(more_right, mo
 def test_without_any_evidence_the_first_set_stays():
     rng = np.random.default_rng(5)
     seen = [rng.uniform(0, [1000, 750], (100, 2)) for _ in "01"]
-    asked = Comparison(*(described(s, np.zeros((100, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
+    comparison = Comparison(*(described(s, np.zeros((100, 128), np.uint8)) for s in seen), pair_of(POSE0, POSE1),
                        np.ones((1, 1), bool))  # fmt: skip
     first, second = (Found(np.arange(n), np.arange(n), np.full(n, 0.5)) for n in (100, 50))
-    assert np.array_equal(most_evident(asked, [first, second]).rows, first.rows)
+    assert np.array_equal(most_evident(comparison, [first, second]).rows, first.rows)

@@ -54,14 +54,14 @@ def test_images_of_one_sun_are_left_as_they_are(site: Site) -> None:
         assert np.array_equal(skipped.descriptors, plain.descriptors)
 
 
-def test_without_beside_the_time_has_no_effect(site: Site) -> None:
+def test_without_keep_source_the_time_has_no_effect(site: Site) -> None:
     take_at(site, lambda _: "12:00:00")
     clahe = ("--set", "enhance=clahe", "--set", "enhance.same_illumination_minutes=20")
     outcome = site("enhance", *clahe)
     assert outcome.counts("enhance") == (5, 0, 0)
     assert "same illumination" not in outcome.stdout
     described = " ".join(default_yaml().replace("#", "").split())
-    assert "Without beside it has no effect: every image is enhanced." in described
+    assert "With keep_source: an image is not enhanced if all images" in described
 
 
 def test_only_images_with_a_partner_of_another_time_are_enhanced(site: Site) -> None:

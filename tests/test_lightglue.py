@@ -264,12 +264,12 @@ def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize(("count", "asked"), [(400, False), (200, True)])
 def test_the_network_is_asked_where_the_ratio_test_leaves_few(
-    weights: str, monkeypatch: pytest.MonkeyPatch, count: int, asked: bool
+    weights: str, monkeypatch: pytest.MonkeyPatch, count: int, comparison: bool
 ) -> None:
     recorder = Answers()
     stand_in(monkeypatch, recorder)
     matches = LightGlue(weights=weights)(features(count), noisy(features(count), 2.0), GEOMETRY)
-    assert bool(recorder.given) == asked
+    assert bool(recorder.given) == comparison
     # The ratio test's stay where the network finds nothing.
     assert len(matches.indices) == pytest.approx(count, rel=0.05)
 

@@ -36,32 +36,32 @@ def found_before(*costs: float) -> Found:
 
 
 def test_what_is_left_of_a_view_gets_a_frame_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    network, asked = Answers((0.9, 0.8)), asked_of()
+    network, comparison = Answers((0.9, 0.8)), asked_of()
     stand_in(monkeypatch, network)
-    shown = asked.features0.keypoints_px[:, 0] > 400, np.ones(40, bool)
-    found = finished(LightGlue().by_network(asked, shown), LightGlue().answers)
+    shown = comparison.features0.keypoints_px[:, 0] > 400, np.ones(40, bool)
+    found = finished(LightGlue().by_network(comparison, shown), LightGlue().answers)
     side0, side1, _ = network.given[0]
     rows = np.flatnonzero(shown[0])
     assert 5 < len(rows) < 35
     assert found.rows.tolist() == rows[:2].tolist()  # of the image's descriptors, not of those that went in
     # By hand: 4 px around the outermost of those shown; the middle is 0, half the longer side 1.
-    points = asked.features0.view_keypoints_px[rows] + 0.5
+    points = comparison.features0.view_keypoints_px[rows] + 0.5
     low, high = points.min(axis=0) - FRAME_PX, points.max(axis=0) + FRAME_PX
     expected = (points - (low + high) / 2) / ((high - low).max() / 2)
     np.testing.assert_allclose(side0.places[0, :, :2].numpy(), expected, atol=1e-5)
     # Nothing is culled there: the frame stays that of the view.
-    whole = (asked.features1.view_keypoints_px + 0.5 - (320, 240)) / 320
+    whole = (comparison.features1.view_keypoints_px + 0.5 - (320, 240)) / 320
     np.testing.assert_allclose(side1.places[0, :, :2].numpy(), whole, atol=1e-5)
 
 
 @pytest.mark.parametrize("overlap", [True, False])
 def test_only_the_overlap_goes_in_where_asked(monkeypatch: pytest.MonkeyPatch, overlap: bool) -> None:
-    network, asked = Answers(), asked_of()
+    network, comparison = Answers(), asked_of()
     stand_in(monkeypatch, network)
     half = np.arange(40) < 20
     monkeypatch.setattr(lightglue, "in_overlap", lambda *_: (half, half))
-    matcher = LightGlue(overlap=overlap)
-    finished(matcher.look_closer(asked, joined([]), None), matcher.answers)
+    matcher = LightGlue(only_overlap=overlap)
+    finished(matcher.refined(comparison, joined([]), None), matcher.run_network)
     side0, side1, _ = network.given[0]
     assert side0.places.shape[1] == side1.places.shape[1] == (20 if overlap else 40)
 
@@ -82,9 +82,9 @@ def test_sets_of_surer_matches_compete_and_the_winner_leads_the_search(monkeypat
         return found.take(np.arange(1))
 
     monkeypatch.setattr(lightglue, "most_evident", most_evident)
-    matcher = LightGlue(threshold=0.1, overlap=False)
+    matcher = LightGlue(threshold=0.1, only_overlap=False)
     second: Any = again
-    found = finished(matcher.look_closer(asked_of(), before, second), matcher.answers)
+    found = finished(matcher.refined(asked_of(), before, second), matcher.run_network)
     # At 0.1, 0.3, 0.5 and 0.8, each with the two from before, whose cost says that the network did not find them.
     probabilities = [1.0 - part.costs for part in competing[0]]
     doubtful = [0.3, 0.1]
@@ -95,7 +95,7 @@ def test_sets_of_surer_matches_compete_and_the_winner_leads_the_search(monkeypat
     np.testing.assert_array_equal(calls[0][0].costs, competing[0][2].costs)
     assert len(found.rows) == 1
     # Without a second search the winner is the answer.
-    plain = finished(matcher.look_closer(asked_of(), before, None), matcher.answers)
+    plain = finished(matcher.refined(asked_of(), before, None), matcher.run_network)
     np.testing.assert_array_equal(plain.costs, competing[1][2].costs)
 
 
@@ -111,7 +111,7 @@ def test_the_settings_reach_the_network(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(Network, "match", spy)
     settings = {"threshold": 0.25, "depth_confidence": 0.7, "width_confidence": 0.6}
     matcher = LightGlue(weights=str(path), **settings)
-    finished(matcher.by_network(asked_of()), matcher.answers)
+    finished(matcher.by_network(asked_of()), matcher.run_network)
     assert options == [settings]
 
 

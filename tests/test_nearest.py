@@ -14,7 +14,7 @@ from aeromatch_cli.strategies.matchers.descriptors import scan
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.descriptors.scan import Limits, mutual_nearest
-from aeromatch_cli.strategies.matchers.descriptors.views import like_views
+from aeromatch_cli.strategies.matchers.descriptors.views import comparable_views
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 100, 80, (90.0, 50.0, 40.0))
 GEOMETRY = PairGeometry(Pair("a", "b", 0.5, 0.0, "overlap"), CAMERA, CAMERA, None, None, None)
@@ -216,10 +216,10 @@ def test_views_of_like_direction_are_compared():
     first = seen([tilted, down, tilted], [nan, 0.1, 0.1], [0.0, 34.0, 0.0])
     second = seen([down, down], [nan, 0.2], [0.0, 0.0])
     # Source with source whatever their directions, the ground view with the ground view, the tilted one with none.
-    assert like_views(first, second, 5.0).tolist() == [[True, False], [False, True], [False, False]]
-    assert like_views(first, second, 40.0).tolist() == [[True, False], [False, True], [False, True]]
+    assert comparable_views(first, second, 5.0).tolist() == [[True, False], [False, True], [False, False]]
+    assert comparable_views(first, second, 40.0).tolist() == [[True, False], [False, True], [False, True]]
     unknown = seen([[nan] * 3], [nan], [0.0])
-    assert like_views(first, unknown, 5.0).all()
+    assert comparable_views(first, unknown, 5.0).all()
 
 
 def test_view_pairs_say_which_views_found_a_match():

@@ -40,9 +40,9 @@ def found(rng: np.random.Generator, right: int, wrong: int) -> Found:
 @pytest.mark.parametrize("seed", range(3))
 def test_matches_tell_what_the_higher_image_shows_of_the_lower(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    asked = compared(rng)
-    shown0, shown1 = in_overlap(asked, found(rng, 60, 40), Nearest().windows)
-    points1 = asked.features1.keypoints_px
+    comparison = compared(rng)
+    shown0, shown1 = in_overlap(comparison, found(rng, 60, 40), Nearest().windows)
+    points1 = comparison.features1.keypoints_px
     beyond = np.maximum(FIRST_PX - points1, points1 - LAST_PX).max(axis=1)
     assert shown0.mean() > 0.99
     assert shown1[beyond < 0.0].all()
@@ -55,9 +55,9 @@ def test_few_matches_leave_it_to_the_poses_and_no_poses_to_everything() -> None:
     for shown in in_overlap(compared(rng), few, Nearest().windows):
         assert shown.all()
     # From 100 m a picture shows 111 m of ground along x; these share a half.
-    asked = compared(rng, nadir(0.0, 100.0), nadir(55.0, 100.0))
-    shown0, shown1 = in_overlap(asked, few, Nearest().windows)
-    x0, x1 = asked.features0.keypoints_px[:, 0], asked.features1.keypoints_px[:, 0]
+    comparison = compared(rng, nadir(0.0, 100.0), nadir(55.0, 100.0))
+    shown0, shown1 = in_overlap(comparison, few, Nearest().windows)
+    x0, x1 = comparison.features0.keypoints_px[:, 0], comparison.features1.keypoints_px[:, 0]
     assert shown0[x0 > 510].all()
     assert not shown0[x0 < 250].any()
     assert shown1[x1 < 490].all()
@@ -74,6 +74,6 @@ def test_images_without_keypoints_show_nothing() -> None:
     rng = np.random.default_rng(3)
     whole = compared(rng, nadir(0.0, 100.0), nadir(55.0, 100.0))
     empty = described(np.zeros((0, 2)), LOOKS[:0])
-    asked = Comparison(empty, whole.features1, whole.geometry, whole.alike)
-    shown0, shown1 = in_overlap(asked, found(rng, 0, 0), Nearest().windows)
+    comparison = Comparison(empty, whole.features1, whole.geometry, whole.comparable)
+    shown0, shown1 = in_overlap(comparison, found(rng, 0, 0), Nearest().windows)
     assert (len(shown0), shown1.any()) == (0, False)

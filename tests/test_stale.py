@@ -67,7 +67,7 @@ def test_an_attitude_that_filter_rejects_is_a_failure_with_a_way_out(site: Site)
     site.rewrite_poses(turn_one)
     image_id = site.names()[2].replace(".", "_")
     # Turned by its attitude it matches nothing; compared as it was taken it contradicts its attitude; then it is right.
-    for reason in ("nothing matches by its attitude", "matches contradict its attitude"):
+    for reason in ("no verified pair with its attitude", "matches contradict its attitude"):
         assert site("match").code == 0
         judged = site("filter")
         assert judged.code == 1

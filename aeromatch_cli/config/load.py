@@ -26,6 +26,13 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in _preset_folder().glob("*.yaml"))
 
 
+def differences_of_preset(name: str) -> tuple[str, dict[str, Any]]:
+    """What a preset is for, in the comment at its top, and what it sets besides the defaults."""
+    text = read_text(_preset_folder() / f"{name}.yaml")
+    comment = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+    return comment, yaml.safe_load(text) or {}
+
+
 def _preset_folder() -> Path:
     """Inside the package when installed from a wheel, beside it in a checkout."""
     package = Path(__file__).parent.parent

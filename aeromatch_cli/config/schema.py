@@ -49,17 +49,49 @@ class BlockSettings(_Section):
     """What was flown: images, poses, cameras, ground."""
 
     images: str = Field("", description="Folder of images, searched recursively.")
-    poses: str = Field("exif", description="Pose list (CSV/TXT), `exif` for GPS and XMP angles, or `none`.")
-    cameras: str = Field("exif", description="COLMAP cameras.txt, YAML, JSON, `exif` or `folder` (one per folder).")
-    crs: str = Field("auto", description="Code of the world frame (EPSG:32633), `local`, or `auto` (UTM zone).")
-    ground: str = Field("auto", description="Height in metres, a DEM file, or `auto` (triangulated).")
-    masks: str = Field("", description="Folder of masks (a/1.jpg.png masks a/1.jpg; 0 = ignore) or one mask for all.")
-    angles: Literal["auto", "gimbal", "nadir"] = Field(
-        "auto", description="Zero of yaw/pitch/roll: camera forward (gimbal, DJI) or down (nadir, Parrot)."
+    poses: str = Field("exif", description="Pose list (CSV or TXT), `exif` for GPS and XMP angles, or `none`.")
+    cameras: str = Field(
+        "exif",
+        description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, focal length and size); or "
+        "`folder` (one camera per folder).",
     )
-    sigma_position_m: float = Field(5.0, gt=0, description="Standard deviation of each coordinate, metres.")
-    sigma_angle_deg: float = Field(3.0, gt=0, description="Standard deviation of each angle, degrees.")
-    max_size_px: int = Field(0, ge=0, description="Larger images are reduced to this longer side; 0 = never.")
+    crs: str = Field(
+        "auto",
+        description="World frame: a code such as EPSG:32633, `local`, or `auto` (the UTM zone of the median position).",
+    )
+    ground: str = Field(
+        "auto",
+        description="Ground height in metres, a DEM file, or `auto` (triangulated from adjacent images, else from "
+        "relative altitudes).",
+    )
+    masks: str = Field(
+        "",
+        description="Folder of masks in COLMAP's naming (a/1.jpg.png masks a/1.jpg; 0 = ignore), or one mask for all "
+        "images.",
+    )
+    angles: Literal["auto", "gimbal", "nadir"] = Field(
+        "auto",
+        description="Convention of yaw, pitch, roll: at zero the camera looks forward (gimbal, DJI) or down (nadir, "
+        "Parrot, Metashape, Pix4D); auto: by the tags' origin in EXIF, gimbal in a pose list.",
+    )
+    sigma_position_m: float = Field(
+        5.0,
+        gt=0,
+        description="Standard deviation of each coordinate of a position that states none, metres. Larger: wider "
+        "search windows, looser pose priors.",
+    )
+    sigma_angle_deg: float = Field(
+        3.0,
+        gt=0,
+        description="Standard deviation of each angle of an attitude that states none, degrees. Larger: wider search "
+        "windows.",
+    )
+    max_size_px: int = Field(
+        0,
+        ge=0,
+        description="Longer side to which larger images are reduced, pixels; 0 = never. Smaller: less time and "
+        "memory, fewer details.",
+    )
 
     @field_validator("crs", "ground", mode="before")
     @classmethod
@@ -71,10 +103,11 @@ class RunSettings(_Section):
     """How it is run; nothing here changes a result."""
 
     executor: Literal["serial", "processes", "dask"] = Field(
-        "processes", description="Where tasks run; `dask` needs the extra [cluster]."
+        "processes",
+        description="Where tasks run: in this process, in worker processes, or on a dask cluster (extra `cluster`).",
     )
-    jobs: int = Field(0, ge=0, description="Worker processes; 0 = one per core.")
-    keep_images: bool = Field(False, description="`run` keeps enhanced and simulated pictures too.")
+    jobs: int = Field(0, ge=0, description="Number of worker processes; 0 = one per core. Larger: faster, more memory.")
+    keep_images: bool = Field(False, description="Also keep enhanced and simulated pictures in the workspace.")
 
 
 class Settings(_Section):
@@ -82,30 +115,30 @@ class Settings(_Section):
 
     workspace: str = Field("aeromatch-work", min_length=1, description="Folder for every result; made if missing.")
     seed: int = Field(0, ge=0, description="Seed of everything random.")
-    block: BlockSettings = Field(BlockSettings(), description="What was flown.")
-    run: RunSettings = Field(RunSettings(), description="How it is run; nothing here changes a result.")
+    block: BlockSettings = Field(BlockSettings(), description="What was flown: images, poses, cameras, ground.")
+    run: RunSettings = Field(RunSettings(), description="How it is run. Nothing here changes a result.")
     pairs: _choice(PAIRINGS) = Field(  # type: ignore[valid-type]
         PAIRINGS["overlap"](), description="Which images are compared."
     )
     enhance: _choice(ENHANCERS) = Field(  # type: ignore[valid-type]
-        ENHANCERS["none"](), description="What is done to a picture before anything else."
+        ENHANCERS["none"](), description="What is done to an image before anything else."
     )
     simulate: _choice(SIMULATORS) = Field(  # type: ignore[valid-type]
-        SIMULATORS["ground"](), description="From where a picture is looked at: virtual views."
+        SIMULATORS["ground"](), description="From which virtual views an image is described."
     )
     extract: _choice(EXTRACTORS) = Field(  # type: ignore[valid-type]
         EXTRACTORS["sift"](), description="Features of each image, over all its views."
     )
     match: _choice(MATCHERS) = Field(  # type: ignore[valid-type]
-        MATCHERS["nearest"](), description="Which features of two images belong together."
+        MATCHERS["nearest"](), description="Which features of two images correspond."
     )
     filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
         (FILTERS["poselib"](),),
         min_length=1,  # without a filter no pair is ever verified
-        description="Which matches are kept: a chain, each sees what those before it left.",
+        description="Which matches are kept: a chain of filters; each gets what the previous one kept.",
     )
     export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
-        (EXPORTERS["colmap"](),), description="For which programs the result is written: a list."
+        (EXPORTERS["colmap"](),), description="Programs for which the result is written: a list."
     )
 
     @field_validator("filter")

@@ -39,7 +39,7 @@ def default_yaml() -> str:
         elif isinstance(value, BaseModel):
             lines += [f"{key}:", *_indented(_settings_lines(value)), ""]
         else:
-            lines += [f"{key}: {_scalar(value)}", ""]
+            lines += [f"{key}: {scalar(value)}", ""]
     return "\n".join(lines[:-1]) + "\n"
 
 
@@ -62,7 +62,7 @@ def _strategy_lines(strategy: Strategy, *, chained: bool) -> list[str]:
     lines = list(_settings_lines(strategy))
     if chained:
         lines = [f"- {lines[0]}", *_indented(lines[1:])]
-    return [*_comment(inspect.getdoc(type(strategy)), first_sentence=True), *lines]
+    return [*_comment(first_sentence(type(strategy))), *lines]
 
 
 def _settings_lines(settings: BaseModel) -> Iterator[str]:
@@ -71,22 +71,26 @@ def _settings_lines(settings: BaseModel) -> Iterator[str]:
         yield from _comment(field.description)
         if get_origin(field.annotation) is Literal and key != "name":
             yield f"# One of: {', '.join(map(str, get_args(field.annotation)))}"
-        yield f"{key}: {_scalar(getattr(settings, key))}"
+        yield f"{key}: {scalar(getattr(settings, key))}"
 
 
-def _comment(text: str | None, *, first_sentence: bool = False) -> list[str]:
+def first_sentence(strategy: type[Strategy]) -> str:
+    """What a strategy is, in the first sentence of its docstring."""
+    words = " ".join((inspect.getdoc(strategy) or "").split())
+    return words.split(". ")[0].rstrip(".") + "."
+
+
+def _comment(text: str | None) -> list[str]:
     """Comment lines; none without text."""
-    words = " ".join((text or "").split())
-    if first_sentence:
-        words = words.split(". ")[0].rstrip(".") + "."
-    return [f"# {line}" for line in textwrap.wrap(words, _WIDTH)] if text else []
+    return [f"# {line}" for line in textwrap.wrap(" ".join(text.split()), _WIDTH)] if text else []
 
 
 def _indented(lines: Any) -> list[str]:
     return [f"  {line}" for line in lines]
 
 
-def _scalar(value: Any) -> str:
+def scalar(value: Any) -> str:
+    """A setting's value as YAML on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     return yaml.safe_dump(plain, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
 

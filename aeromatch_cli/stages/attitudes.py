@@ -1,12 +1,12 @@
-"""Which images' attitudes are not used because their pictures contradict them: judged by filter, kept between runs.
+"""Which images' attitudes are ignored because their matches contradict them: judged by filter, kept between runs.
 
-A picture that an attitude turns the wrong way matches nothing, so that nothing contradicts the attitude. Images that no
-verified pair ties to the rest although poses promise overlap are therefore suspects: they and those paired with them
-are also compared as they were taken, wherever the poses say, and judged by what that finds. Matches speak of attitudes
-where the filter that verified them gives a relative rotation: with a fundamental matrix or a homography none is judged.
+An image with a wrong attitude has no matches with north-up views of its neighbours, so that no match contradicts the
+attitude. Images without verified pairs although poses predict overlap are therefore *isolated*: they and the images
+that they are paired with are also matched as source images, and judged by those matches. Only a filter that gives a
+relative rotation allows a judgement; a fundamental matrix or a homography does not.
 
-A judgement on an image holds as long as nothing changes that can be laid at its door: the image, its given pose and
-the settings. Images that come later do not revoke it by themselves; matches that vindicate the image do.
+A judgement holds as long as the image, its given pose and the settings stay the same. Images that are added later do
+not revoke it by themselves; matches that agree with the attitude do.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from aeromatch_cli.orientation.attitudes import contradicting_images
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import fingerprint, read_json, write_json
 
-# Images that share this much of their ground and are not tied make one of them a suspect.
-_SUSPICIOUS_OVERLAP = 0.3
+# With this overlap (share of the smaller footprint) and no verified pair, one of two images is isolated.
+_ISOLATED_OVERLAP = 0.3
 Rotations = Sequence[tuple[str, str, FloatArray, int]]
 
 
 def without_ignored_attitudes(context: Context) -> Context:
-    """The context with its suspects, in which images whose attitude pictures contradict keep only their position."""
+    """The context with its isolated images, in which images whose attitude is ignored keep only their position."""
     record = _on_file(context)
-    wrong = _standing(context, record)
-    context = replace(context, suspects=_standing_suspects(context, record))
+    wrong = _still_ignored(context, record)
+    context = replace(context, isolated=_still_isolated(context, record))
     poses: dict[str, Pose] = {
         i: replace(pose, world_rotation=None) if i in wrong else pose for i, pose in context.given_poses.items()
     }
@@ -49,25 +49,25 @@ def judge(context: Context, rotations: Rotations, root: Mapping[str, str] | None
     evidence = fingerprint(_settings(context), [(i, _facts(context, i)) for i in sorted(context.given_poses)])
     seen = {image_id for id0, id1, _, _ in rotations for image_id in (id0, id1)}
     unchanged = before.get("fingerprint") == evidence
-    kept = {i: a for i, a in _standing(context, before).items() if unchanged or i not in seen}
+    kept = {i: a for i, a in _still_ignored(context, before).items() if unchanged or i not in seen}
     angles = dict(sorted({**found, **kept}.items()))
     images = {i: {"angle_deg": angle, "facts": _facts(context, i)} for i, angle in angles.items()}
-    suspects = _standing_suspects(context, before) | (_untied(context, root) - angles.keys())
-    facts = {i: _facts(context, i) for i in sorted(suspects)}
-    record = {"fingerprint": evidence, "settings": _settings(context), "images": images, "suspects": facts}
+    isolated = _still_isolated(context, before) | (_isolated(context, root) - angles.keys())
+    facts = {i: _facts(context, i) for i in sorted(isolated)}
+    record = {"fingerprint": evidence, "settings": _settings(context), "images": images, "isolated": facts}
     write_json(context.workspace.ignored_attitudes, record)
     return angles
 
 
-def _untied(context: Context, root: Mapping[str, str] | None) -> set[str]:
+def _isolated(context: Context, root: Mapping[str, str] | None) -> set[str]:
     """Images with attitude that overlap with a larger component of verified pairs but belong to none, or a smaller."""
-    if root is None or not context.settings.extract.follows_north:
+    if root is None or not context.settings.extract.north_up_only:
         return set()
     sizes = Counter(root.values())
     found = set()
     for pair in context.pairs:
         ids = pair.image_id0, pair.image_id1
-        if root[ids[0]] == root[ids[1]] or not pair.overlap >= _SUSPICIOUS_OVERLAP:
+        if root[ids[0]] == root[ids[1]] or not pair.overlap >= _ISOLATED_OVERLAP:
             continue
         small, large = sorted(ids, key=lambda i: (sizes[root[i]], root[i]))
         pose = context.pose(small)
@@ -76,10 +76,10 @@ def _untied(context: Context, root: Mapping[str, str] | None) -> set[str]:
     return found
 
 
-def _standing_suspects(context: Context, record: dict[str, Any]) -> frozenset[str]:
+def _still_isolated(context: Context, record: dict[str, Any]) -> frozenset[str]:
     if not record or record.get("settings") != _settings(context):
         return frozenset()
-    known = {i: facts for i, facts in record.get("suspects", {}).items() if i in context.given_poses}
+    known = {i: facts for i, facts in record.get("isolated", {}).items() if i in context.given_poses}
     return frozenset(i for i, facts in known.items() if facts == _facts(context, i))
 
 
@@ -88,7 +88,7 @@ def _on_file(context: Context) -> dict[str, Any]:
     return read_json(path) if path.is_file() and not context.overwrite else {}
 
 
-def _standing(context: Context, record: dict[str, Any]) -> dict[str, float]:
+def _still_ignored(context: Context, record: dict[str, Any]) -> dict[str, float]:
     """image_id -> degrees of the judgements that still hold."""
     if not record or record.get("settings") != _settings(context):
         return {}

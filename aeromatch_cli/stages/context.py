@@ -29,8 +29,8 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given_poses: Mapping[str, Pose]
     guessed_cameras: frozenset[str] = frozenset()
-    # Images that no match ties to their surroundings although their poses say so (`stages.attitudes`).
-    suspects: frozenset[str] = frozenset()
+    # Images without verified pairs although poses predict overlap (`stages.attitudes`).
+    isolated: frozenset[str] = frozenset()
     shard: Shard | None = None
     overwrite: bool = False
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
@@ -73,21 +73,21 @@ class Context:
             pair=pair,
             camera0=self.block.camera(images[pair.image_id0]),
             camera1=self.block.camera(images[pair.image_id1]),
-            pose0=self._believed(pair.image_id0),
-            pose1=self._believed(pair.image_id1),
+            pose0=self._usable_pose(pair.image_id0),
+            pose1=self._usable_pose(pair.image_id1),
             ground_z_m=sum(heights) / len(heights) if heights else None,
         )
 
-    def _believed(self, image_id: str) -> Pose | None:
-        """The pose by which matches are searched and limited: of a suspect only where it was."""
+    def _usable_pose(self, image_id: str) -> Pose | None:
+        """The pose by which matches are searched and limited; of an isolated image its position alone."""
         pose = self.pose(image_id)
-        return replace(pose, world_rotation=None) if pose is not None and image_id in self.suspects else pose
+        return replace(pose, world_rotation=None) if pose is not None and image_id in self.isolated else pose
 
-    def lacks_north(self, image_id: str) -> bool:
-        """Whether an image, or one that it is paired with, has no attitude to be trusted: what turns its north up
-        cannot be compared with it, the picture as it was taken can."""
+    def lacks_attitude(self, image_id: str) -> bool:
+        """Whether an image, or one that it is paired with, has no usable attitude: north-up views of both cannot be
+        compared then, the source images can."""
         ids = (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))
-        poses = [self._believed(i) for i in ids]
+        poses = [self._usable_pose(i) for i in ids]
         return any(pose is None or pose.world_rotation is None for pose in poses)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
@@ -100,7 +100,7 @@ class Context:
                 found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
         return tuple(found)
 
-    def under_one_sun(self, image_id: str, minutes: float) -> bool:
+    def same_illumination(self, image_id: str, minutes: float) -> bool:
         """Whether an image and all that it is paired with are known to be taken within so many minutes."""
         images = self.image_by_id
         times = [images[i].time for i in (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))]
@@ -123,8 +123,8 @@ class Context:
             parts["camera"] = self.block.camera(self.image_by_id[image_id])
         if "pose" in needs:
             parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
-        if "pose" in needs and image_id in self.suspects:
-            parts["suspect"] = True
+        if "pose" in needs and image_id in self.isolated:
+            parts["isolated"] = True
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:

@@ -90,7 +90,7 @@ def source_of(context: Context, image: Image) -> Source:
 
 def _is_skipped(context: Context, image: Image) -> bool:
     enhancer = context.settings.enhance
-    return enhancer.keep_source and context.under_one_sun(image.image_id, enhancer.same_illumination_minutes)
+    return enhancer.keep_source and context.same_illumination(image.image_id, enhancer.same_illumination_minutes)
 
 
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:

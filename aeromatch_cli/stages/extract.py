@@ -59,7 +59,9 @@ def run_task(task: ExtractTask) -> Extracted:
     pictures, enhancement = simulate.render(task.views)
     source = task.views.enhance.source
     further = simulate.further_views(pictures)
-    features = (task.extractor.with_room_for(further) if further else task.extractor)(source.working_camera, pictures)
+    features = (task.extractor.with_extra_views(further) if further else task.extractor)(
+        source.working_camera, pictures
+    )
     if task.extractor.colours:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)

@@ -12,7 +12,7 @@ from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import extract, rows
-from aeromatch_cli.stages.batches import asked_together
+from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
@@ -79,7 +79,7 @@ def run_task(task: MatchTask) -> RowResult:
     path = task.workspace.matches(task.image_id0)
     old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
-    ahead = asked_together(task.matcher, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
+    ahead = matched_in_batches(task.matcher, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
     row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)

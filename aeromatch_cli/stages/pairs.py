@@ -122,7 +122,7 @@ def _remarks(settings: Settings, oriented: int) -> list[str]:
     found = [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
     # The last model wins (filters.chain); every chain has one (config).
     *_, last = (one for one in settings.filter if one.verifies)
-    if oriented and not last.tells_rotation():
+    if oriented and not last.gives_rotation():
         chain = "+".join(one.name for one in settings.filter)
         found.append(
             f"attitudes        not judged: filter={chain} gives no rotation (poselib and epipolar do, with "

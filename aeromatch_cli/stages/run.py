@@ -69,7 +69,7 @@ def execute(
 
 
 def _repairing(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
-    """Attempts until no damaged file is met; each one is deleted, so that the next attempt makes it again."""
+    """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
     while True:
         try:
@@ -97,7 +97,7 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
     elif command != "pairs":
         reports.append(STAGES[command](context))
     if command == "filter" and context.shard is None:
-        _report_turned(context, reports[-1])
+        _report_ignored(context, reports[-1])
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
@@ -106,11 +106,11 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
     return _result(command, context, reports)
 
 
-def _report_turned(context: Context, judged: StageReport) -> None:
-    """Images that lost their attitude in this very stage: their views, pairs and verdicts are out of date now."""
+def _report_ignored(context: Context, judged: StageReport) -> None:
+    """Adds a failure for each image whose attitude this stage found wrong: its views and pairs are out of date now."""
     trusted = without_ignored_attitudes(replace(context, overwrite=False))
     remedy = "run `aeromatch run`, or match and filter again, to go on without it"
-    doubted = dict.fromkeys(trusted.suspects - context.suspects, f"nothing matches by its attitude: {remedy}")
+    doubted = dict.fromkeys(trusted.isolated - context.isolated, f"no verified pair with its attitude: {remedy}")
     turned = dict.fromkeys(_attitudes(context) - _attitudes(trusted), f"matches contradict its attitude: {remedy}")
     if doubted or turned:
         judged.failures += sorted({**doubted, **turned}.items())
@@ -128,10 +128,12 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
             else again
         )
         trusted = without_ignored_attitudes(replace(context, overwrite=False))
-        unchanged = _attitudes(trusted) == _attitudes(context) and trusted.suspects == context.suspects
+        unchanged = _attitudes(trusted) == _attitudes(context) and trusted.isolated == context.isolated
         if context.shard is not None or unchanged:
             break
-        log.info("attitudes of some images contradict the pictures, or match nothing: these are done again without")
+        log.info(
+            "attitudes of some images contradict the matches, or give none: these images are matched again without them"
+        )
         context, first = pairs.prepare(context.settings, context.executor, shard=context.shard)
     reports = [first, *reports]
     if context.shard is None:
@@ -139,11 +141,11 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
             reports.append(report.run(context))
             raise InputError(f"no pair could be verified; {context.workspace.report} and failures.csv say why")
         reports.append(export.run(context))
-        reports.append(_page_on_file(context) or report.run(context))
+        reports.append(_current_page(context) or report.run(context))
     return reports, context
 
 
-def _page_on_file(context: Context) -> StageReport | None:
+def _current_page(context: Context) -> StageReport | None:
     """The page's report, where the page is younger than everything that it tells of."""
     workspace = context.workspace
     own = workspace.stage_report("report")
@@ -171,7 +173,7 @@ def _attitudes(context: Context) -> set[str]:
 
 
 def _result(command: str, context: Context, reports: list[StageReport]) -> Result:
-    failures = _standing_failures(command, context, reports)
+    failures = _all_failures(command, context, reports)
     lines = list(reports[0].facts["summary"])
     for stage in reports:
         lines.append(
@@ -204,7 +206,7 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
     return Result(tuple(lines), facts, failures)
 
 
-def _standing_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
+def _all_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
     """What failed now, and what failed in the stages before this command and still stands."""
     failures = {(r.stage, item, reason) for r in reports for item, reason in r.failures}
     before = _CHAIN if command == "run" else _CHAIN[: _CHAIN.index(command)] if command in _CHAIN else ()
@@ -215,7 +217,7 @@ def _standing_failures(command: str, context: Context, reports: list[StageReport
 
 
 def _picture_lines(stage: StageReport) -> list[str]:
-    """What the pictures of a stage cost, and which are not made."""
+    """Number and size of the views, and images that are not enhanced."""
     facts, words = stage.facts, []
     if "views_per_image" in facts:
         views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
@@ -241,7 +243,7 @@ def _filter_lines(stage: StageReport) -> list[str]:
         names = facts["weakly_tied"]
         lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
     for image_id, angle in facts.get("rotation_contradicts_pose", {}).items():
-        lines.append(f"          {image_id}: matches say its attitude is wrong by {angle:.0f} degrees; not used")
+        lines.append(f"          {image_id}: ignored attitude, wrong by {angle:.0f} degrees by its matches")
     return lines
 
 

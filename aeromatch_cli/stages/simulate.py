@@ -45,7 +45,7 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     simulator = context.settings.simulate
     ground_z_m = context.ground_z_m(image.image_id)
     geometry = context.geometry_fingerprint(image.image_id, simulator.needs)
-    as_taken = context.settings.extract.follows_north and context.lacks_north(image.image_id)
+    as_taken = context.settings.extract.north_up_only and context.lacks_attitude(image.image_id)
     own = fingerprint(enhancing.fingerprint, enhancing.skipped, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)

@@ -60,10 +60,10 @@ class Strategy(BaseModel):
         self.fingerprint_files()
 
     def own_weights(self) -> tuple[str, ...]:
-        """Files of the user's own that stand in for networks that ship, once `check_files` has passed."""
+        """The user's own weights files, used instead of the package's. To be called after `check_files`."""
         return ()
 
-    def tells_rotation(self) -> bool:
+    def gives_rotation(self) -> bool:
         """Whether a filter's verdict holds the relative rotation, by which attitudes are judged."""
         return False
 
@@ -90,7 +90,7 @@ class Enhancer(Protocol):
     """needs_colour: False where the strategy takes gray pixels, which decode faster.
     changes: False where pictures always pass as they are, so that none of them is worth a file.
     keep_source: whether the picture as it was taken has views too, so that every pair can use what suits it.
-    same_illumination_minutes: with beside, images whose partners were all taken within this time are left as they are.
+    same_illumination_minutes: with keep_source, images whose partners were all taken within this time are not enhanced.
     """
 
     needs_colour: ClassVar[bool]
@@ -119,8 +119,8 @@ class Simulator(Protocol):
 class Extractor(Protocol):
     """descriptor_length: of every descriptor. descriptors: what they are called, "" where there are none.
     colours: whether the stage adds the colour around every keypoint to the features.
-    follows_north: whether what it makes of a view that has north up is only comparable with such views.
-    with_room_for: the same for images that get further views only because other images have no attitude.
+    north_up_only: whether descriptors of a north-up view are comparable with those of north-up views only.
+    with_extra_views: the same extractor for images with additional views, needed where other images have no attitude.
     """
 
     descriptor_length: ClassVar[int]
@@ -130,9 +130,9 @@ class Extractor(Protocol):
     def colours(self) -> bool: ...
 
     @property
-    def follows_north(self) -> bool: ...
+    def north_up_only(self) -> bool: ...
 
-    def with_room_for(self, views: int) -> Extractor: ...
+    def with_extra_views(self, views: int) -> Extractor: ...
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features: ...
 
@@ -148,17 +148,17 @@ class Matcher(Protocol):
 
 
 @runtime_checkable
-class Asking(Protocol):
-    """A matcher that may ask a network, of many pairs together where `asks_together` says that this is faster.
+class BatchedMatcher(Protocol):
+    """A matcher with a network, which takes many pairs at once where `batches_pairs` says that this is faster.
 
-    steps: the call, stopping at its questions; it is sent as many answers, and ends with the matches.
+    steps: the call as a generator: it yields inputs for the network, is sent as many outputs, and returns the matches.
     """
 
     @property
-    def asks_together(self) -> bool: ...
+    def batches_pairs(self) -> bool: ...
 
     def steps(
         self, features0: Features, features1: Features, geometry: PairGeometry
     ) -> Generator[Sequence[Any], Sequence[Any], Matches]: ...
 
-    def answers(self, questions: Sequence[Any]) -> Sequence[Any]: ...
+    def run_network(self, inputs: Sequence[Any]) -> Sequence[Any]: ...

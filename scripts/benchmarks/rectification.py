@@ -34,7 +34,7 @@ from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
-from aeromatch_cli.strategies.matchers.descriptors.views import alike
+from aeromatch_cli.strategies.matchers.descriptors.views import comparable
 from aeromatch_cli.synthetic import Truth, load_truth
 from aeromatch_cli.workspace import stable_hash
 from benchmarks import stamps
@@ -101,7 +101,7 @@ def like(views0: Sequence[View], views1: Sequence[View]) -> BoolArray:
         for views in (views0, views1)
     )
     source0, source1 = (np.array([view.is_source for view in views]) for views in (views0, views1))
-    return alike(directions0, directions1, source0, source1, Search.model_fields["max_direction_deg"].default)
+    return comparable(directions0, directions1, source0, source1, Search.model_fields["max_direction_deg"].default)
 
 
 def measured(truth: Truth, sides0: Sequence[ImageView], sides1: Sequence[ImageView]) -> tuple[float, float, float, int]:

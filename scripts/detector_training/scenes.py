@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import calibration_matrix
 from aeromatch_cli.geometry.warps import source_from_view
-from aeromatch_cli.images.scaling import shrink_camera
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.synthetic.truth import _camera, _read_poses
 from aeromatch_cli.synthetic.write import depth_path, read_raster
@@ -108,7 +107,7 @@ def sights(folder: Path) -> list[Sight]:
             view, pose = picture.view, poses[image.name]
             if view.is_source or view.gsd_m is None:
                 continue
-            camera = shrink_camera(task.source.camera, task.source.scale)
+            camera = task.enhance.source.working_camera
             rotation = np.asarray(pose.world_rotation)
             world_from_view = rotation.T @ np.linalg.inv(calibration_matrix(cameras[image.name]))
             nearness = _nearness(camera, view.undistorted_from_view, picture.gray.shape, folder, image.name)

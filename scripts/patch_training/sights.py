@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.warps import source_from_view, view_from_source
-from aeromatch_cli.images.scaling import shrink_camera
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies import ViewPixels
@@ -96,7 +95,7 @@ def sights_of(
     for image in context.block.images:
         task = simulate.make_task(context, image)
         pose = context.block.poses[image.image_id] if poses is None else poses[image.name]
-        own = shrink_camera(task.source.camera, task.source.scale) if cameras is None else cameras[image.name]
+        own = task.enhance.source.working_camera if cameras is None else cameras[image.name]
         pictures: list[Any] = simulate.render(task)[0]
         found += [Sight(picture, own, suns.get(image.name, 0), image.name, pose) for picture in pictures]
     return found

@@ -15,12 +15,19 @@ from aeromatch_cli.strategies.enhancers.kept_source import KeepsSource
 
 
 class ClaheEnhancement(KeepsSource):
-    """Local contrast everywhere, shadow or not; hue stays, except where a band reaches white."""
+    """Contrast-limited adaptive histogram equalisation of the brightness."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["clahe"] = "clahe"
-    clip_limit: float = Field(2.0, gt=0.0, le=100.0, description="Bound on a tile's slope of mapping, OpenCV's unit.")
-    tiles: int = Field(8, ge=1, le=256, description="Tiles across and down the picture.")
+    clip_limit: float = Field(
+        2.0,
+        gt=0.0,
+        le=100.0,
+        description="Contrast limit of a tile's histogram, in OpenCV's unit. Larger: more contrast and more noise.",
+    )
+    tiles: int = Field(
+        8, ge=1, le=256, description="Number of tiles along each side of the image. Larger: more local contrast."
+    )
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
         """pixels (H, W) or (H, W, C) uint8 or uint16; no mask. What is not valid counts like the rest."""

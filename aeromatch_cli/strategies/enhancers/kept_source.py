@@ -15,12 +15,13 @@ class KeepsSource(Strategy):
     changes: ClassVar[bool] = True
     keep_source: bool = Field(
         False,
-        description="Find features in the picture as it was taken too, as many again; a pair uses what suits it.",
+        description="Also find features in the source image, with the same budget again; each pair uses the pictures "
+        "that give more matches.",
     )
     same_illumination_minutes: float = Field(
         20.0,
         ge=0.0,
-        description="With beside: an image whose partners were all taken within so many minutes of it is left as it "
-        "is (the sun moves by 5 degrees in 20 minutes, so their shadows are alike); 0, or an unknown time: never. "
-        "Without beside it has no effect: every image is enhanced.",
+        description="With keep_source: an image is not enhanced if all images that it is paired with were taken "
+        "within this many minutes (their shadows are alike: the sun moves by 5 degrees in 20 minutes). "
+        "Larger: fewer images are enhanced; 0, or an unknown capture time: every image is.",
     )

@@ -11,7 +11,7 @@ from aeromatch_cli.strategies import Enhanced, Strategy
 
 
 class NoEnhancement(Strategy):
-    """The picture as it was taken."""
+    """The source image, unchanged."""
 
     needs_colour: ClassVar[bool] = False
     changes: ClassVar[bool] = False

@@ -22,33 +22,52 @@ from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regi
 
 
 class ShadowEnhancement(KeepsSource):
-    """Shadows lifted to the light around them; a picture without shadow passes unchanged."""
+    """Cast shadow brightened region by region to the light around it; an image without shadow stays unchanged."""
 
     version: ClassVar[int] = 2
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
     keep_source: bool = Field(True, description=KeepsSource.model_fields["keep_source"].description)
-    detection_px: int = Field(768, ge=64, le=4096, description="Longer side at which shadow is looked for.")
+    detection_px: int = Field(
+        768,
+        ge=64,
+        le=4096,
+        description="Longer side of the reduced picture in which shadow is detected, pixels. Larger: smaller shadows "
+        "are found, more time.",
+    )
     max_gain: float = Field(
-        6.0, ge=1.0, le=64.0, description="Most light given to a region, as a factor; a clear sky lacks this much sun."
+        6.0,
+        ge=1.0,
+        le=64.0,
+        description="Largest factor by which a shadow region is brightened. Larger: darker shadows become readable, "
+        "with more noise.",
     )
     region_exponent: float = Field(
         0.25,
         ge=0.0,
         le=1.0,
-        description="How far a region's darkness against the other shadows changes its gain: 0 not, 1 to their mean.",
+        description="Weight (0-1) of a region's own darkness in its gain: 0 = one gain for all regions, 1 = each "
+        "region is brought to the mean of all shadows.",
     )
     min_share: float = Field(
         0.02,
         ge=0.0,
         le=1.0,
-        description="Share of the picture from which shadow counts; below, nothing is changed: it could add no more.",
+        description="Smallest share (0-1) of shadow in the image; with less, nothing is changed. Larger: fewer images "
+        "are enhanced.",
     )
     min_ratio: float = Field(
-        1.3, ge=1.0, description="Lit over shadowed light from which shadow counts; below, nothing is changed."
+        1.3,
+        ge=1.0,
+        description="Smallest ratio of lit to shadowed light; below it, nothing is changed. Larger: only deep shadow "
+        "is enhanced.",
     )
     min_region_share: float = Field(
-        3e-5, ge=0.0, le=1.0, description="Regions smaller than this share of the picture are left alone."
+        3e-5,
+        ge=0.0,
+        le=1.0,
+        description="Smallest region that is enhanced, as a share (0-1) of the image. Larger: small shadows stay as "
+        "they are.",
     )
 
     def fingerprint_files(self) -> tuple[str, ...]:

@@ -21,19 +21,32 @@ _STRIP_ROWS = 256
 
 
 class WallisEnhancement(KeepsSource):
-    """Local mean and contrast made alike everywhere, shadow or not; hue stays, except where a band reaches white."""
+    """Wallis filter: local mean and contrast are brought to targets; hue is kept, except where a band saturates."""
 
     needs_colour: ClassVar[bool] = False
     name: Literal["wallis"] = "wallis"
     window_share: float = Field(
-        0.04, gt=0.0, le=1.0, description="Side of the neighbourhood as a share of the picture's longer side."
+        0.04,
+        gt=0.0,
+        le=1.0,
+        description="Side of the window as a share (0-1) of the longer image side. Larger: less local.",
     )
-    mean: float = Field(0.5, ge=0.0, le=1.0, description="Mean that brightness is brought to, as a share of white.")
+    mean: float = Field(0.5, ge=0.0, le=1.0, description="Target mean of the brightness, as a share (0-1) of white.")
     standard_deviation: float = Field(
-        0.2, gt=0.0, le=0.5, description="Standard deviation that it is brought to, likewise."
+        0.2,
+        gt=0.0,
+        le=0.5,
+        description="Target standard deviation of the brightness, as a share (0-1) of white. Larger: more contrast.",
     )
-    contrast: float = Field(0.8, ge=0.0, le=1.0, description="How far the spread is changed: 0 not, 1 wholly.")
-    brightness: float = Field(0.9, ge=0.0, le=1.0, description="How far the mean is changed: 0 not, 1 wholly.")
+    contrast: float = Field(
+        0.8,
+        ge=0.0,
+        le=1.0,
+        description="Weight (0-1) of the target standard deviation: 0 = unchanged, 1 = reached everywhere.",
+    )
+    brightness: float = Field(
+        0.9, ge=0.0, le=1.0, description="Weight (0-1) of the target mean: 0 = unchanged, 1 = reached everywhere."
+    )
 
     def __call__(self, pixels: NDArray[Any], valid: BoolArray | None) -> Enhanced:
         """pixels (H, W) or (H, W, C) uint8 or uint16; no mask. What is not valid counts in no neighbourhood."""

@@ -42,8 +42,12 @@ class Colmap(Strategy):
     """
 
     name: Literal["colmap"] = "colmap"
-    raw_matches: bool = Field(True, description="Also the matches before filtering, for COLMAP to verify itself.")
-    pose_priors: bool = Field(True, description="The given positions with covariance, for its pose_prior_mapper.")
+    raw_matches: bool = Field(
+        True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
+    )
+    pose_priors: bool = Field(
+        True, description="Write the given positions with their covariance, for COLMAP's pose_prior_mapper."
+    )
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ValueError on a match without keypoint."""

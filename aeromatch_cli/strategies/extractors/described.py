@@ -32,15 +32,20 @@ class Described(Strategy):
     keypoints: int = Field(
         4000,
         ge=1,
-        description="Descriptors per image over all its views: exactly so many, fewer only where fewer exist. "
-        "As in OpenCV and COLMAP, a point with two orientations counts twice. Where an enhancement "
-        "works beside the source, so many in each.",
+        description="Number of descriptors per image over all its views; fewer only where the image has fewer. A "
+        "keypoint with two orientations counts twice, as in OpenCV and COLMAP. With enhance.keep_source "
+        "the source image and the enhanced one have this number each. Larger: more matches, more time.",
     )
     budget: Literal["image", "view"] = Field(
-        "image", description="What `keypoints` is for: the whole image over all its views, or each view by itself."
+        "image", description="Whether keypoints is the number per image, over all its views, or per view."
     )
-    per_cell: int = Field(200, ge=1, description="Keypoints per cell of the even spread; larger is less even.")
-    colours: bool = Field(False, description="Keep the colour around every keypoint; the filter `colour` reads it.")
+    per_cell: int = Field(
+        200,
+        ge=1,
+        description="Number of keypoints per cell of the grid by which they are spread. Larger: fewer cells, less "
+        "even.",
+    )
+    colours: bool = Field(False, description="Keep the colour around every keypoint; filter=colour needs it.")
 
     @abstractmethod
     def detected(self, view: ViewPixels, view_idx: int) -> Raw:
@@ -61,10 +66,10 @@ class Described(Strategy):
 
     @property
     @abstractmethod
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Whether descriptors of views with north up match no others."""
 
-    def with_room_for(self, views: int) -> Described:
+    def with_extra_views(self, views: int) -> Described:
         """With as many descriptors more for further views of an image."""
         return self.model_copy(update={"keypoints": self.keypoints * (1 + views)}) if self.budget == "image" else self
 

@@ -32,16 +32,21 @@ _LEAST_CELL_PX = 3
 
 
 class Grid(Strategy):
-    """Points to measure, one per cell of an even grid, where the cell has texture."""
+    """Points on an even grid, one per cell where the image has texture; no descriptors."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 0
-    follows_north: ClassVar[bool] = False
+    north_up_only: ClassVar[bool] = False
     colours: ClassVar[bool] = False
     name: Literal["grid"] = "grid"
-    points: int = Field(1200, ge=1, description="Cells over the image, about, and so points at most.")
+    points: int = Field(
+        1200,
+        ge=1,
+        description="Approximate number of grid cells, and so the largest number of points. Larger: denser tie "
+        "points, more time.",
+    )
 
-    def with_room_for(self, views: int) -> Grid:
+    def with_extra_views(self, views: int) -> Grid:
         """The same: a grid is of the source alone."""
         del views
         return self

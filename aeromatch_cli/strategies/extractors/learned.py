@@ -34,35 +34,39 @@ _CHOICE = 8
 
 
 class Learned(Described):
-    """Keypoints, orientations and descriptors by networks, trained on aerial images (nets/trained)."""
+    """Keypoints, orientations and descriptors by networks that are trained on aerial images."""
 
     version: ClassVar[int] = 5
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(
-        "network", description="Maxima of heat maps over place and scale, or SIFT's keypoints."
+        "network",
+        description="Keypoints from the maxima of the detector network's heat maps over place and scale, or from SIFT.",
     )
     orientation: Literal["auto", "network", "upright"] = Field(
         "auto",
-        description="Turn patches as the orientation network says, or never (upright); auto is upright in views whose "
-        "axes follow the world's.",
+        description="Rotate patches by the orientation network (network), or not at all (upright). auto: upright in "
+        "views that have north up.",
     )
-    context: bool = Field(False, description="Descriptors know what is around them: picture and other keypoints.")
+    context: bool = Field(
+        False,
+        description="Correct descriptors by their surroundings (image context and neighbouring keypoints); more time.",
+    )
     weights: str | None = Field(
         None,
-        description="Folder with files of your own, `detector.safetensors`, `orientation.safetensors`, "
-        "`geodesc.safetensors` or `context.safetensors`, as the scripts train_* write them; those that it lacks ship.",
+        description="Folder with your own detector, orientation, geodesc or context .safetensors files, as "
+        "scripts/train writes them; files that it lacks are taken from the package.",
         json_schema_extra={"path": True},
     )
     precision: Precision = Field(
         "auto",
-        description="Of the networks' layers; auto is bfloat16 where the processor has it. Features depend on it: name "
-        "one for shards on different processors.",
+        description="Number type of the networks' layers; auto is bfloat16 where the processor has it. Features "
+        "depend on it: set it explicitly for shards on different processors.",
     )
     device: Device = DEVICE
 
     @property
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Upright descriptors of views with north up match no others."""
         return self.orientation == "auto"
 

@@ -34,25 +34,36 @@ class Sift(Described):
     name: Literal["sift"] = "sift"
     orientation: Literal["auto", "gradient", "upright"] = Field(
         "auto",
-        description="Turn descriptors to their gradients, or never (upright: one descriptor per point, orientation 0); "
-        "auto is upright in views whose axes follow the world's.",
+        description="Rotate descriptors to the dominant gradient (gradient), or not at all (upright: one descriptor "
+        "per keypoint, orientation 0). auto: upright in views that have north up.",
     )
     contrast_threshold: float = Field(
         SIFT.contrast_threshold,
         gt=0.0,
-        description="Smallest contrast, divided by octave_layers inside; so low that dull ground fills its budget too.",
+        description="Smallest contrast of a keypoint, as in OpenCV (divided by octave_layers). Larger: fewer "
+        "keypoints on dull ground.",
     )
-    edge_threshold: float = Field(SIFT.edge_threshold, gt=1.0, description="Largest ratio of the two curvatures.")
-    octave_layers: int = Field(SIFT.octave_layers, ge=1, description="Scales per octave.")
-    sigma: float = Field(SIFT.sigma, gt=0.5, description="Blur of the first scale, pixels of the doubled image.")
+    edge_threshold: float = Field(
+        SIFT.edge_threshold,
+        gt=1.0,
+        description="Largest ratio of the principal curvatures. Larger: more keypoints along edges.",
+    )
+    octave_layers: int = Field(
+        SIFT.octave_layers, ge=1, description="Number of scales per octave. Larger: more keypoints, more time."
+    )
+    sigma: float = Field(
+        SIFT.sigma,
+        gt=0.5,
+        description="Blur of the first scale, pixels of the doubled image. Larger: fewer small keypoints.",
+    )
     selection: Literal["balanced", "scale", "response"] = Field(
         "balanced",
-        description="What a cell gives first: the largest, the most contrasted, or response x size^2, sizes up to 6 "
-        "view pixels (balanced).",
+        description="Which keypoints of a cell are kept first: the largest (scale), those of most contrast "
+        "(response), or response x size^2 with sizes up to 6 view pixels (balanced).",
     )
 
     @property
-    def follows_north(self) -> bool:
+    def north_up_only(self) -> bool:
         """Upright descriptors of views with north up match no others."""
         return self.orientation == "auto"
 

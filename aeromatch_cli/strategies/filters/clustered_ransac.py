@@ -24,7 +24,8 @@ _LEVELS_PER_CELL, _DOMINANT_SHARE = 64, 1 / 32
 
 
 class ClusteredRansac(Strategy):
-    """Keeps a match if a plane of its own or a nearby cluster explains it, or if its neighbours move as it does.
+    """K-means clusters of matches, each explained by planes of its own; matches on no plane need neighbours that move
+    with them.
 
     The number of clusters follows the colour content: dominant colours of the matched places in image 0 (see
     `dominant_colours`), or one per 64 matches where the extractor keeps no colours; never so many that they
@@ -37,18 +38,36 @@ class ClusteredRansac(Strategy):
     version: ClassVar[int] = 3
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["clustered-ransac"] = "clustered-ransac"
-    clusters: int = Field(0, ge=0, description="Clusters at most; 0 = as many as dominant colours.")
-    planes: int = Field(3, ge=1, description="Planes of one cluster at most, found one after the other.")
+    clusters: int = Field(
+        0,
+        ge=0,
+        description="Largest number of clusters; 0 = the number of dominant colours. Larger: smaller planes are "
+        "found, more time.",
+    )
+    planes: int = Field(
+        3,
+        ge=1,
+        description="Largest number of planes per cluster, found one after the other. Larger: more matches are kept, "
+        "more time.",
+    )
     threshold_px: float = Field(
-        3.0, gt=0.0, description="Largest distance to a plane, larger of both directions, undistorted pixels."
+        3.0,
+        gt=0.0,
+        description="Largest distance from a plane (larger of both directions), undistorted pixels. Larger: more "
+        "matches, less accurate ones.",
     )
     min_support: float = Field(
         3.0,
         gt=0.0,
-        description="Neighbours that must move with a match on no plane, weighted by how well (0-6); fewer where this "
-        "and the planes explain more than half of the matches.",
+        description="Smallest weighted number of neighbours (0-6) that must move with a match on no plane; fewer in "
+        "pairs where more than half of the matches are explained. Larger: more matches are dropped.",
     )
-    min_inliers: int = Field(15, ge=8, description="Fewer matches, or fewer explained ones, are not verifiable.")
+    min_inliers: int = Field(
+        15,
+        ge=8,
+        description="Smallest number of matches, and of explained matches, of a verified pair. Larger: fewer pairs, "
+        "fewer of them wrong.",
+    )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has the homography of the plane with most matches, and distances to each match's own plane."""

@@ -19,7 +19,7 @@ _FEWEST = 8  # matches that tell the gain between two images
 
 
 class Colour(Strategy):
-    """Drops matches whose chromaticity clearly disagrees.
+    """Drops matches whose chromaticity clearly differs.
 
     Colours are those of the enhanced images around both keypoints. One gain per channel, the median ratio over the
     pair, takes exposure and white balance away; taking the mean of the log channels away leaves chromaticity. Sunlight
@@ -33,10 +33,16 @@ class Colour(Strategy):
     verifies: ClassVar[bool] = False
     name: Literal["colour"] = "colour"
     max_distance: float = Field(
-        0.15, gt=0.0, description="Largest distance in log chromaticity: 0.15 is green stronger by a fifth."
+        0.15,
+        gt=0.0,
+        description="Largest distance in log chromaticity; 0.15 is green stronger by a fifth. Larger: fewer matches "
+        "are dropped.",
     )
     max_distance_medians: float = Field(
-        4.0, ge=0.0, description="The limit is no less than this many times the pair's median distance: noisy colours."
+        4.0,
+        ge=0.0,
+        description="The limit is at least this many times the pair's median distance, for noisy colours. Larger: "
+        "fewer matches are dropped.",
     )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:

@@ -18,7 +18,7 @@ _SIGMA_OF_MEDIAN = 1.4826
 
 
 class Epipolar(TwoViewGated):
-    """Keeps the matches within a band whose width follows from the data.
+    """One two-view geometry with a band that follows the accuracy of the matches.
 
     The geometry is found with `threshold_px`. The standard deviation of its inliers is estimated robustly, and the band
     narrowed to `sigmas` of it: what is locally consistent but globally impossible goes, and so do near misses.
@@ -27,9 +27,14 @@ class Epipolar(TwoViewGated):
     version: ClassVar[int] = 2
     name: Literal["epipolar"] = "epipolar"
     sigmas: float = Field(
-        6.0, gt=0.0, description="Half-width of the band in standard deviations of its matches, at most threshold_px."
+        6.0,
+        gt=0.0,
+        description="Half-width of the band around the epipolar line in standard deviations of the inliers, at most "
+        "threshold_px. Larger: more matches are kept.",
     )
-    min_band_px: float = Field(1.5, gt=0.0, description="The band is no narrower than this on either side.")
+    min_band_px: float = Field(
+        1.5, gt=0.0, description="Smallest half-width of the band, undistorted pixels. Larger: more matches are kept."
+    )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""

@@ -27,9 +27,17 @@ def shortage(inliers: int, matches: int, needed: int) -> str:
 class Gated(Strategy):
     """What filters that verify by one model have in common."""
 
-    min_inliers: int = Field(15, ge=8, description="Fewer matches are not verifiable, fewer inliers reject the pair.")
+    min_inliers: int = Field(
+        15,
+        ge=8,
+        description="Smallest number of inliers of a verified pair; a pair with fewer matches is not verifiable. "
+        "Larger: fewer pairs, fewer of them wrong.",
+    )
     max_false_alarms: float = Field(
-        0.01, gt=0.0, description="The pair is rejected where chance gives more models than this with as many inliers."
+        0.01,
+        gt=0.0,
+        description="Largest expected number of models with as many inliers among random matches (a contrario test). "
+        "Smaller: fewer pairs, fewer of them wrong.",
     )
 
     def too_few(self, usable: BoolArray) -> Verdict | None:
@@ -103,10 +111,14 @@ class TwoViewGated(Gated):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     model: Literal["relative_pose", "fundamental"] = Field(
-        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without."
+        "relative_pose", description="Relative pose with the known cameras, or fundamental matrix without them."
     )
-    threshold_px: float = Field(4.0, gt=0.0, description="Largest Sampson error, undistorted pixels.")
+    threshold_px: float = Field(
+        4.0,
+        gt=0.0,
+        description="Largest Sampson error of an inlier, undistorted pixels. Larger: more matches, less accurate ones.",
+    )
 
-    def tells_rotation(self) -> bool:
+    def gives_rotation(self) -> bool:
         """Known cameras have one; a fundamental matrix holds none."""
         return self.model == "relative_pose"

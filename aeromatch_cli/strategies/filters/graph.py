@@ -18,7 +18,7 @@ _COARSE = 5 / 3
 
 
 class Graph(Strategy):
-    """Keeps the matches that enough of their neighbours move with.
+    """Neighbourhood consistency: keeps the matches whose neighbours in both images move with them.
 
     Matches are the nodes of a graph, joined with those nearest by where they lie in both images. A match is supported
     by the neighbours that one affinity through it explains, from either image alike: some of them, for at a depth step
@@ -36,25 +36,32 @@ class Graph(Strategy):
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     verifies: ClassVar[bool] = False
     name: Literal["graph"] = "graph"
-    neighbours: int = Field(12, ge=4, le=32, description="Matches that each is joined with; time grows with its cube.")
+    neighbours: int = Field(
+        12,
+        ge=4,
+        le=32,
+        description="Number of nearest matches that each match is compared with; time grows with its cube.",
+    )
     threshold_px: float = Field(
         3.0,
         gt=0.0,
-        description="Largest distance of a neighbour to where it would move, undistorted pixels of either image.",
+        description="Largest distance of a neighbour from the place predicted by a local affinity, undistorted pixels "
+        "of either image. Larger: fewer matches are dropped.",
     )
     min_support: float = Field(
         0.9,
         ge=0.0,
-        description="Neighbours that must move with a match besides the two that define its affinity, weighted by how "
-        "well.",
+        description="Smallest weighted number of neighbours that must move with a match, besides the two that define "
+        "its affinity. Larger: more matches are dropped.",
     )
     min_support_share: float = Field(
         0.6,
         ge=0.0,
         le=1.0,
-        description="Support that a match needs, of the mean support of those half of its neighbours with least.",
+        description="Smallest support of a match, as a share (0-1) of the mean support of the less supported half of "
+        "its neighbours. Larger: more matches are dropped.",
     )
-    min_matches: int = Field(20, ge=8, description="With fewer matches, or where fewer would be left, all pass.")
+    min_matches: int = Field(20, ge=8, description="With fewer matches, before or after, the filter keeps all of them.")
 
     @model_validator(mode="after")
     def _can_be_had(self) -> Self:

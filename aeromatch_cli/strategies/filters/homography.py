@@ -15,7 +15,7 @@ from aeromatch_cli.strategies.filters.gate import Gated
 
 
 class Homography(Gated):
-    """Keeps the matches that one plane explains, estimated by PoseLib's LO-RANSAC.
+    """One plane for all matches, estimated by PoseLib's LO-RANSAC.
 
     The plane's relative rotation is ambiguous and not given: behind this filter no attitude is judged by its matches.
     """
@@ -24,7 +24,10 @@ class Homography(Gated):
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["homography"] = "homography"
     threshold_px: float = Field(
-        3.0, gt=0.0, description="Largest distance to the plane, larger of both directions, undistorted pixels."
+        3.0,
+        gt=0.0,
+        description="Largest distance from the plane (larger of both directions), undistorted pixels. Larger: more "
+        "matches, less accurate ones.",
     )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:

@@ -16,7 +16,7 @@ from aeromatch_cli.strategies.filters.gate import Gated
 
 
 class Magsac(Gated):
-    """Keeps the inliers of a fundamental matrix that weighs matches over all noise levels up to the threshold.
+    """Fundamental matrix by MAGSAC++ (OpenCV).
 
     A fundamental matrix holds no relative rotation: behind this filter no attitude is judged by its matches.
     """
@@ -24,9 +24,21 @@ class Magsac(Gated):
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     name: Literal["magsac"] = "magsac"
-    threshold_px: float = Field(3.0, gt=0.0, description="Largest error, undistorted pixels.")
-    confidence: float = Field(0.9999, gt=0.0, lt=1.0, description="Sampling stops at this chance of a clean sample.")
-    max_iterations: int = Field(10000, ge=1, description="Samples drawn at most.")
+    threshold_px: float = Field(
+        3.0,
+        gt=0.0,
+        description="Largest error of an inlier, undistorted pixels. Larger: more matches, less accurate ones.",
+    )
+    confidence: float = Field(
+        0.9999,
+        gt=0.0,
+        lt=1.0,
+        description="Sampling stops when the chance of having drawn an uncontaminated sample reaches this (0-1). "
+        "Larger: more time.",
+    )
+    max_iterations: int = Field(
+        10000, ge=1, description="Largest number of random samples. Larger: more time on pairs with few inliers."
+    )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has F on undistorted pixels and Sampson errors; OpenCV takes no seed and needs none."""

@@ -16,7 +16,7 @@ _SMALLEST_BASELINE_M = 1e-6
 
 
 class PoseBand(Strategy):
-    """Keeps the matches whose epipolar error the errors of the poses can explain.
+    """Keeps the matches whose epipolar error the standard deviations of the poses can explain.
 
     The band is a limit, not evidence: it verifies nothing by itself, so its verdict is "not verifiable" with the
     surviving matches kept. Without both attitudes everything passes.
@@ -26,8 +26,13 @@ class PoseBand(Strategy):
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma"})
     verifies: ClassVar[bool] = False
     name: Literal["pose"] = "pose"
-    sigmas: float = Field(3.0, gt=0.0, description="Half-width of the band in predicted standard deviations.")
-    sigma_px: float = Field(1.5, gt=0.0, description="Standard deviation of a keypoint, pixels.")
+    sigmas: float = Field(
+        3.0,
+        gt=0.0,
+        description="Half-width of the band around the epipolar line in predicted standard deviations. Larger: more "
+        "matches are kept.",
+    )
+    sigma_px: float = Field(1.5, gt=0.0, description="Standard deviation of a keypoint, pixels. Larger: a wider band.")
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """errors_px are Sampson distances to the poses' own epipolar geometry."""

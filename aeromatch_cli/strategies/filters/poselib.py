@@ -12,16 +12,24 @@ from aeromatch_cli.strategies.filters.gate import TwoViewGated
 
 
 class Poselib(TwoViewGated):
-    """Keeps the matches that one two-view geometry explains.
+    """One two-view geometry by PoseLib's LO-RANSAC.
 
     The gates on the number of inliers come after the estimator, which calls 7 of 7 random matches inliers.
     """
 
     version: ClassVar[int] = 2
     name: Literal["poselib"] = "poselib"
-    confidence: float = Field(0.999, gt=0.0, lt=1.0, description="Sampling stops at this chance of a clean sample.")
-    min_iterations: int = Field(50, ge=1, description="Samples drawn at least.")
-    max_iterations: int = Field(3000, ge=1, description="Samples drawn at most.")
+    confidence: float = Field(
+        0.999,
+        gt=0.0,
+        lt=1.0,
+        description="Sampling stops when the chance of having drawn an uncontaminated sample reaches this (0-1). "
+        "Larger: more samples, more time.",
+    )
+    min_iterations: int = Field(50, ge=1, description="Smallest number of random samples.")
+    max_iterations: int = Field(
+        3000, ge=1, description="Largest number of random samples. Larger: more time on pairs with few inliers."
+    )
 
     def __call__(self, candidates: Candidates, geometry: PairGeometry, seed: int) -> Verdict:
         """The Verdict has E (or F), Sampson errors and cam1_from_cam0's rotation."""

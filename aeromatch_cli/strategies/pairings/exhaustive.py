@@ -12,7 +12,7 @@ from aeromatch_cli.strategies.pairings.measure import measured_pairs
 
 
 class Exhaustive(Strategy):
-    """All N (N - 1) / 2 pairs: for small blocks and for poses that are not to be trusted."""
+    """All N (N - 1) / 2 pairs: for small blocks, and for unreliable poses."""
 
     name: Literal["exhaustive"] = "exhaustive"
 

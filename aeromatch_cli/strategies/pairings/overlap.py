@@ -19,7 +19,7 @@ _CANDIDATES_PER_NEIGHBOUR = 3
 
 
 class Overlap(Strategy):
-    """Pairs whose ground footprints overlap enough, seen from directions that are not too different.
+    """Pairs of images whose footprints on the ground overlap.
 
     Of the pairs that pass both limits, each image keeps its `max_neighbours` largest overlaps (equal overlaps: the
     smaller view angle); a pair stays if either image keeps it. The pairs of a maximum spanning forest stay whatever
@@ -28,16 +28,35 @@ class Overlap(Strategy):
     """
 
     name: Literal["overlap"] = "overlap"
-    min_overlap: float = Field(default=0.1, ge=0.0, le=1.0, description="Least common share of the smaller footprint.")
-    max_view_angle_deg: float = Field(
-        default=60.0, gt=0.0, le=180.0, description="Largest angle between both viewing directions."
+    min_overlap: float = Field(
+        default=0.1,
+        ge=0.0,
+        le=1.0,
+        description="Smallest overlap of two footprints, as a share (0-1) of the smaller one. Larger: fewer pairs.",
     )
-    max_neighbours: int = Field(default=30, ge=1, description="Pairs kept per image, largest overlap first.")
+    max_view_angle_deg: float = Field(
+        default=60.0,
+        gt=0.0,
+        le=180.0,
+        description="Largest angle between both viewing directions, degrees. Larger: more pairs, harder to match.",
+    )
+    max_neighbours: int = Field(
+        default=30,
+        ge=1,
+        description="Largest number of pairs per image; those with most overlap are kept. Larger: more pairs, more "
+        "time.",
+    )
     max_distance_factor: float = Field(
-        default=MAX_DISTANCE_FACTOR, gt=0.0, description="Ground farther away than this many flying heights is ignored."
+        default=MAX_DISTANCE_FACTOR,
+        gt=0.0,
+        description="Ground farther away than this many flying heights is ignored. Larger: oblique images get larger "
+        "footprints.",
     )
     fallback_neighbours: int = Field(
-        default=20, ge=1, description="Neighbours of an image without usable pose, by position, time or name."
+        default=20,
+        ge=1,
+        description="Number of neighbours of an image without usable pose, chosen by position, capture time or name. "
+        "Larger: more pairs.",
     )
 
     def __call__(self, block: Block) -> list[Pair]:

@@ -20,8 +20,14 @@ class Sequential(Strategy):
     """
 
     name: Literal["sequential"] = "sequential"
-    window: int = Field(default=10, ge=1, description="Pair each image with this many images before and after it.")
-    order: Literal["name", "time"] = Field(default="name", description="Order of the images: name or time.")
+    window: int = Field(
+        default=10,
+        ge=1,
+        description="Number of images before and after each image that it is paired with. Larger: more pairs.",
+    )
+    order: Literal["name", "time"] = Field(
+        default="name", description="Order of the images: by name or by capture time."
+    )
 
     def __call__(self, block: Block) -> list[Pair]:
         """Pairs of a block; see the family's table for the contract."""

@@ -12,7 +12,7 @@ from aeromatch_cli.strategies.simulators.plane import PlaneViews
 
 
 class GroundView(PlaneViews):
-    """A north-up nadir view of the ground plane by plane-induced homography (H&Z section 13.1).
+    """A north-up nadir view of the ground plane by plane-induced homography (Hartley and Zisserman, section 13.1).
 
     Rotation, scale and perspective between overlapping images vanish for flat ground. View pixel (0, 0) is the centre
     of the top-left pixel, x runs east and y south along the grid. The view's box encloses the footprint cut at

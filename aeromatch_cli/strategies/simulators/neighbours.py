@@ -27,7 +27,8 @@ _PER_SIDE = 2
 
 
 class NeighbourViews(PlaneViews):
-    """Parallel views of the ground, each of the part that the neighbours which need it see as well.
+    """The north-up ground view of what neighbours see too, and views along common directions where the ground is
+    stretched.
 
     The ground view serves every neighbour. Where an image and a neighbour together resolve the ground min_stretch times
     more coarsely along one axis than across (`geometry.views.common_stretch`, at the middle of their overlap), both
@@ -46,16 +47,23 @@ class NeighbourViews(PlaneViews):
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "ground", "neighbours"})
     name: Literal["neighbours"] = "neighbours"
-    max_views: int = Field(default=4, ge=1, description="Most views of an image, the ground view included.")
+    max_views: int = Field(
+        default=4,
+        ge=1,
+        description="Largest number of views per image, the ground view included. Larger: the budget is shared by "
+        "more views.",
+    )
     min_stretch: float = Field(
         default=4.0,
         gt=1.0,
-        description="Neighbours get a view of their direction from this stretch of the ground on; less is skipped.",
+        description="Smallest stretch of the ground between an image and a neighbour for which a view along their "
+        "common direction is added. Larger: fewer added views.",
     )
     margin: float = Field(
         default=0.1,
         ge=0.0,
-        description="How far views reach beyond the overlap with neighbours, in flying heights: poses are inexact.",
+        description="Margin of a view around the overlap with neighbours, in flying heights. Larger: allows for less "
+        "accurate poses, more pixels.",
     )
 
     def __call__(

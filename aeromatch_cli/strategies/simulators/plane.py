@@ -45,21 +45,28 @@ class PlaneViews(Strategy):
     name: str  # a strategy's own, first in every listing
     keep_source: bool = Field(default=False, description="Also use the source image, as view 0.")
     max_megapixels: float = Field(
-        default=32.0, gt=0.0, description="Largest view; one that would be larger is scaled down to this."
+        default=32.0,
+        gt=0.0,
+        description="Largest view, megapixels; a larger one is scaled down. Larger: more detail, more time and memory.",
     )
     max_distance_factor: float = Field(
         default=MAX_DISTANCE_FACTOR,
         gt=0.0,
-        description="Ground farther away than this many flying heights is left out.",
+        description="Ground farther away than this many flying heights is left out of the view. Larger: more distant "
+        "ground.",
     )
     max_magnification: float = Field(
         default=1.0,
         gt=0.0,
         le=2.0,
-        description="The view is never finer than the middle of the image by more than this.",
+        description="Largest magnification of a view against the middle of the source image. Larger: finer views than "
+        "the image itself, more time.",
     )
     max_stretch: float = Field(
-        default=3.0, gt=1.0, description="Far ground that the view would enlarge more than this is left out."
+        default=3.0,
+        gt=1.0,
+        description="Largest magnification of distant ground; ground that would be stretched more is left out. "
+        "Larger: more distant, more blurred ground.",
     )
 
     def ground_plane(

@@ -20,7 +20,8 @@ _BORDER_POINTS_PER_SIDE = 8
 
 
 class Tilts(Strategy):
-    """Affine views of the whole image: in-plane turns, and tilts by sqrt(2)^k with azimuths every 72 degrees / tilt.
+    """Affine views of the whole image as in ASIFT: in-plane rotations, and tilts by sqrt(2)^k with azimuths every 72
+    degrees / tilt.
 
     A tilt shrinks the picture by its factor along one axis, so that its view has that much fewer pixels. Neither pose
     nor ground is used. Meant for `extract.budget: view`: views that share an image's budget find fewer matches than the
@@ -33,17 +34,20 @@ class Tilts(Strategy):
         default=1,
         ge=0,
         le=5,
-        description="Tilts of 1.41, 2, 2.83 ...: 4, 5, 8 ... views, as many pixels as 2.8, 2.5, 2.8 ... images.",
+        description="Number of simulated tilts (1.41, 2, 2.83 ...), with 4, 5, 8 ... views of 2.8, 2.5, 2.8 ... image "
+        "sizes. Larger: more views, more time.",
     )
     rotations: int = Field(
         default=1,
         ge=1,
         le=12,
-        description="In-plane turns of the image, evenly spaced, the source being the first; SIFT needs one, networks "
-        "that know little of rotation 4 or more.",
+        description="Number of in-plane rotations, evenly spaced, the source image being the first. SIFT needs 1, "
+        "networks that are not invariant to rotation 4 or more.",
     )
     max_megapixels: float = Field(
-        default=32.0, gt=0.0, description="Largest view besides the source; a larger one is scaled down to this."
+        default=32.0,
+        gt=0.0,
+        description="Largest simulated view, megapixels; a larger one is scaled down. Larger: more detail, more time.",
     )
 
     def __call__(

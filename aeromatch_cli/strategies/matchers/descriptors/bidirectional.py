@@ -13,7 +13,7 @@ from aeromatch_cli.strategies.matchers.descriptors.search import Search
 
 
 class Bidirectional(Search):
-    """Mutual nearest neighbours whose ratio holds from either image. Scores are 1 - the larger of both ratios.
+    """Mutual nearest neighbours with the ratio test in both directions. Scores are 1 - the larger of both ratios.
 
     Guided, a second search around the places that the verified ones predict follows, as in every `Search`: by place and
     likeness, without ratio.
@@ -27,13 +27,14 @@ class Bidirectional(Search):
         0.85,
         gt=0.0,
         le=1.0,
-        description="Largest distance to the nearest over that to the next other keypoint, seen from either image.",
+        description="Largest ratio of the distances to the nearest and the second nearest descriptor, in both "
+        "directions. Larger: more matches, more of them wrong.",
     )
 
-    def scan(self, asked: Comparison) -> Found:
-        """Matches of all view pairs that are alike, costs the larger d1/d2."""
+    def scan(self, comparison: Comparison) -> Found:
+        """Matches of all view pairs that are comparable, costs the larger d1/d2."""
         parts = []
-        for views in asked.view_pairs():
+        for views in comparison.view_pairs():
             rows, columns, ratios = mutual_nearest(
                 views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=self.ratio, limits=views.limits
             )

@@ -1,4 +1,4 @@
-"""What a matcher of described keypoints is asked, and what it finds."""
+"""Two images to be compared by their descriptors, and the matches that are found."""
 
 from __future__ import annotations
 
@@ -68,20 +68,20 @@ class ViewPair:
 class Comparison:
     """Two images, and which of their views are compared.
 
-    alike: (V0, V1) of the views. where: where matches may lie, None for everywhere.
+    comparable: (V0, V1) bool. where: search windows, None for everywhere.
     """
 
     features0: Features
     features1: Features
     geometry: PairGeometry
-    alike: BoolArray
+    comparable: BoolArray
     where: Where | None = None
 
     def view_pairs(self) -> Iterator[ViewPair]:
-        """Those that are alike, in the order of their numbers."""
+        """The comparable view pairs, in the order of their indices."""
         features0, features1 = self.features0, self.features1
         limits = None if self.where is None else Limits(self.where.windows.forms(), self.where.places_px)
-        for view0, view1 in np.argwhere(self.alike):
+        for view0, view1 in np.argwhere(self.comparable):
             of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
             keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
             yield ViewPair(
@@ -100,17 +100,17 @@ class Comparison:
         return self.features0.descriptor_keypoint_idx[rows], self.features1.descriptor_keypoint_idx[columns]
 
     def within(self, found: Found) -> Found:
-        """Those of the matches that lie where they may."""
+        """The matches within the search windows."""
         if self.where is None:
             return found
         idx0, idx1 = self.keypoints(found)
         return found.take(self.where.windows.take(idx0).contain(self.where.places_px[idx1]))
 
 
-def ratio_test(asked: Comparison, ratio: float = RATIO) -> Found:
-    """Mutual nearest neighbours of all view pairs that are alike and hold the ratio, costs d1/d2."""
+def ratio_test(comparison: Comparison, ratio: float = RATIO) -> Found:
+    """Mutual nearest neighbours of all view pairs that are comparable and hold the ratio, costs d1/d2."""
     parts = []
-    for views in asked.view_pairs():
+    for views in comparison.view_pairs():
         rows, columns, ratios = mutual_nearest(
             views.descriptors0, views.descriptors1, views.keypoint_idx1, ratio=ratio, limits=views.limits
         )

@@ -1,4 +1,4 @@
-"""How far beyond chance matches support one relative pose, and which of several sets of them does most."""
+"""How significantly matches support one relative pose (a contrario), and which of several sets supports it most."""
 
 from __future__ import annotations
 
@@ -33,25 +33,27 @@ class Evidence:
         return self.log10_false_alarms <= LOG10_FALSE_ALARMS
 
 
-def evidence_of(asked: Comparison, found: Found, places0_px: FloatArray, places1_px: FloatArray) -> Evidence | None:
+def evidence_of(
+    comparison: Comparison, found: Found, places0_px: FloatArray, places1_px: FloatArray
+) -> Evidence | None:
     """Of matches in which no keypoint occurs twice; None where too few agree. places: (K0, 2), (K1, 2) undistorted."""
-    idx0, idx1 = asked.keypoints(found)
+    idx0, idx1 = comparison.keypoints(found)
     usable: BoolArray = np.asarray(np.isfinite(places0_px[idx0] + places1_px[idx1]).all(axis=1))
     if usable.sum() < MIN_INLIERS:
         return None
     points0, points1 = places0_px[idx0[usable]], places1_px[idx1[usable]]
-    model = estimate(points0, points1, asked.geometry, "relative_pose", Sampling(_MODEL_PX), 0)
+    model = estimate(points0, points1, comparison.geometry, "relative_pose", Sampling(_MODEL_PX), 0)
     if model.inliers.sum() < MIN_INLIERS:
         return None
 
     def distance(a: FloatArray, b: FloatArray) -> FloatArray:
         return sampson_distance_px(model.pixel_model, a, b)
 
-    if asked.where is None:
+    if comparison.where is None:
         errors = chance_errors_px(distance, points0, points1)
     else:
         # A wrong match lies anywhere in its window.
-        windows = asked.where.windows.take(idx0)
+        windows = comparison.where.windows.take(idx0)
         wrong0, wrong1 = np.tile(places0_px[idx0], (_TRIALS, 1)), windows.sample(_TRIALS, np.random.default_rng(0))
         seen = np.isfinite(wrong0 + wrong1).all(axis=1)
         errors = distance(wrong0[seen], wrong1[seen])
@@ -61,15 +63,15 @@ def evidence_of(asked: Comparison, found: Found, places0_px: FloatArray, places1
     return Evidence(replace(model, inliers=inliers), odds)
 
 
-def most_evident(asked: Comparison, sets: Sequence[Found]) -> Found:
+def most_evident(comparison: Comparison, sets: Sequence[Found]) -> Found:
     """The set whose matches, each keypoint once, support a model farthest beyond chance; the first where none does."""
-    geometry = asked.geometry
-    places0 = undistort(geometry.camera0, asked.features0.keypoints_px)
-    places1 = undistort(geometry.camera1, asked.features1.keypoints_px)
-    singles = [found.take(one_to_one(*asked.keypoints(found), found.costs)) for found in sets]
+    geometry = comparison.geometry
+    places0 = undistort(geometry.camera0, comparison.features0.keypoints_px)
+    places1 = undistort(geometry.camera1, comparison.features1.keypoints_px)
+    singles = [found.take(one_to_one(*comparison.keypoints(found), found.costs)) for found in sets]
     best, most = singles[0], 0.0
     for single in singles:
-        evidence = evidence_of(asked, single, places0, places1)
+        evidence = evidence_of(comparison, single, places0, places1)
         if evidence is not None and evidence.log10_false_alarms < most:
             best, most = single, evidence.log10_false_alarms
     return best

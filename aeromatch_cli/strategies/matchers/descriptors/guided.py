@@ -1,4 +1,4 @@
-"""A second search around the places that verified matches predict: a point instead of a line."""
+"""Guided search around the places that verified matches predict: a point instead of an epipolar line."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ _ROUNDS = 2
 # that found the keypoint (a reduced view tells places no better than its own pixels); octaves between both sizes beyond
 # those of the matches around; distance of descriptors over the one that wrong pairs have.
 _LINE_PX, _PLACE_PX, _SIZE_OCTAVES, _LOOK = 0.7, 1.0, 0.2, 0.4
-# Share of the model's matches that the search around the places which they predict must find again to be believed.
+# Smallest share of the model's matches that the search around their predicted places must find again.
 _LEAST_KEPT = 0.5
 # Sum of the four squares that 95 % of the true matches stay below (chi-square).
 _LARGEST_COST = 9.49
-# So many times as far from place and line, none may look more alike: repeated things lie side by side.
+# Within this many times the distance from place and line, no other keypoint may have a more similar descriptor:
+# repeated structures lie side by side.
 _RIVALS = 2.0
 # Matches that another matcher found may lie so many times as far from predicted place and size, and the squares less
 # the log odds sum up to so much: of what it adds to 14 pairs of each of 7 rendered scenes, nine tenths are right.
@@ -40,7 +41,7 @@ _CHUNK = 4096
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One image as the search sees it. places_px: (K, 2) undistorted. first, count: (K,) run of its descriptors.
+    """One image in the search. places_px: (K, 2) undistorted. first, count: (K,) run of its descriptors.
 
     units_px: (K,) stored pixels per pixel of the view that found each keypoint, 1 at least.
     """
@@ -68,26 +69,26 @@ class Prediction:
 class SecondSearch:
     """Matches around the places that a verified model and the heights of its matches predict.
 
-    A match needs that its epipolar line, a place predicted by other matches, its size and its looks agree together.
+    A match must agree with its epipolar line, a place and a size predicted by other matches, and its descriptor.
     """
 
-    def __init__(self, asked: Comparison) -> None:
-        self.asked = asked
-        geometry = asked.geometry
+    def __init__(self, comparison: Comparison) -> None:
+        self.comparison = comparison
+        geometry = comparison.geometry
         self._side0, self._side1 = (
-            side_of(asked.features0, geometry.camera0),
-            side_of(asked.features1, geometry.camera1),
+            side_of(comparison.features0, geometry.camera0),
+            side_of(comparison.features1, geometry.camera1),
         )
-        self._wrong = distance_of_wrong_pairs(self._side0, self._side1, asked.alike)
+        self._wrong = distance_of_wrong_pairs(self._side0, self._side1, comparison.comparable)
 
     def __call__(self, found: Found, *, keep: bool = False) -> Found:
-        """The new matches instead of those found, which stay where they support no model beyond chance.
+        """The new matches. Those given are returned unchanged where they support no significant model.
 
-        keep: costs of `found` are 1 - probability of a matcher that sees more than looks; what line, place, size and it
-        agree on stays, too, where the search found nothing for either keypoint.
+        keep: the costs of `found` are 1 - probability of a network. Its matches that agree with line, place and size
+        are added where the search found no match for either keypoint.
         """
-        # One that occurred twice would confirm itself.
-        first = found = found.take(one_to_one(*self.asked.keypoints(found), found.costs))
+        # A keypoint that occurred twice would confirm itself.
+        first = found = found.take(one_to_one(*self.comparison.keypoints(found), found.costs))
         if self._wrong == 0.0:
             return found
         last: Prediction | None = None
@@ -95,28 +96,28 @@ class SecondSearch:
             prediction = self._predicted(found)
             if prediction is None:
                 break
-            again = around(self._side0, self._side1, prediction, self.asked.alike, self._wrong)
+            again = around(self._side0, self._side1, prediction, self.comparison.comparable, self._wrong)
             if len(again.rows) < _LEAST_KEPT * prediction.model.inliers.sum():
-                break  # heights around a match say nothing here: what was known is better
+                break  # the heights of neighbours predict badly here: the earlier matches are better
             found, last = again, prediction
         if not keep or last is None:
             return found
-        return self._added(found, first.take(believed(first, self._side0, self._side1, last)))
+        return self._added(found, first.take(plausible(first, self._side0, self._side1, last)))
 
     def _predicted(self, found: Found) -> Prediction | None:
-        evidence = evidence_of(self.asked, found, self._side0.places_px, self._side1.places_px)
+        evidence = evidence_of(self.comparison, found, self._side0.places_px, self._side1.places_px)
         if evidence is None or not evidence.beyond_chance:
             return None
-        idx0, idx1 = self.asked.keypoints(found.take(evidence.model.inliers))
-        return predicted(self._side0, self._side1, idx0, idx1, evidence.model, self.asked.geometry)
+        idx0, idx1 = self.comparison.keypoints(found.take(evidence.model.inliers))
+        return predicted(self._side0, self._side1, idx0, idx1, evidence.model, self.comparison.geometry)
 
     def _added(self, first: Found, second: Found) -> Found:
         """All of the first, and of the second what shares no keypoint with it."""
-        (used0, used1), (idx0, idx1) = self.asked.keypoints(first), self.asked.keypoints(second)
+        (used0, used1), (idx0, idx1) = self.comparison.keypoints(first), self.comparison.keypoints(second)
         return joined([first, second.take(~np.isin(idx0, used0) & ~np.isin(idx1, used1))])
 
 
-def believed(found: Found, side0: Side, side1: Side, prediction: Prediction) -> BoolArray:
+def plausible(found: Found, side0: Side, side1: Side, prediction: Prediction) -> BoolArray:
     """Whether each match (N,) of costs 1 - probability agrees enough with its line, the places and the size predicted.
 
     The odds stand where `around` has the looks.
@@ -180,7 +181,7 @@ def _octaves(side0: Side, side1: Side, idx0: IntArray, idx1: IntArray) -> FloatA
     return np.asarray(np.log2(side1.features.sizes_px[idx1].astype(np.float64) / side0.features.sizes_px[idx0]))
 
 
-def around(side0: Side, side1: Side, prediction: Prediction, alike: BoolArray, wrong: float) -> Found:
+def around(side0: Side, side1: Side, prediction: Prediction, comparable: BoolArray, wrong: float) -> Found:
     """Mutually best matches near the predicted places and sizes, by the sum of what disagrees.
 
     Both keypoints must be each other's nearest in looks, too, among all that lie about there.
@@ -190,7 +191,7 @@ def around(side0: Side, side1: Side, prediction: Prediction, alike: BoolArray, w
     line, place, size = disagreements(side0, side1, idx0, idx1, prediction)
     about = line <= _RIVALS * np.sqrt(_LARGEST_COST)
     idx0, idx1, costs = idx0[about], idx1[about], (line**2 + place**2 + size**2)[about]
-    distances, rows, columns = closest(side0, side1, idx0, idx1, alike)
+    distances, rows, columns = closest(side0, side1, idx0, idx1, comparable)
     costs = costs + (distances / (_LOOK * wrong)) ** 2
     best = (costs <= _LARGEST_COST) & is_cheapest(idx0, costs) & is_cheapest(idx1, costs)
     best &= is_cheapest(idx0, distances) & is_cheapest(idx1, distances)
@@ -222,18 +223,18 @@ def nearby(places_px: FloatArray, points1_px: FloatArray, radius_px: float) -> t
         first = np.searchsorted(codes, np.maximum(low[:, 0], 0) + lines * shape[0], side="left")
         last = np.searchsorted(codes, np.minimum(high[:, 0], shape[0] - 1) + lines * shape[0], side="right")
         lengths = np.maximum(last - first, 0)
-        asked = np.repeat(np.arange(len(row)), lengths)
-        at = np.arange(len(asked)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + first[asked]
-        near = ((places[asked] - points1_px[usable[at]]) ** 2).sum(axis=1) <= radius_px**2
-        found.append(row[asked[near]] * len(points1_px) + usable[at[near]])
+        queries = np.repeat(np.arange(len(row)), lengths)
+        at = np.arange(len(queries)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + first[queries]
+        near = ((places[queries] - points1_px[usable[at]]) ** 2).sum(axis=1) <= radius_px**2
+        found.append(row[queries[near]] * len(points1_px) + usable[at[near]])
     code = np.unique(np.concatenate(found))
     return code // len(points1_px), code % len(points1_px)
 
 
 def closest(
-    side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, alike: BoolArray
+    side0: Side, side1: Side, idx0: IntArray, idx1: IntArray, comparable: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Smallest descriptor distance (N,) of keypoint pairs (N,) over views that are alike (infinite without any) and
+    """Smallest descriptor distance (N,) of keypoint pairs over comparable views (infinite without any) and
     the descriptors (N,), (N,) of it."""
     distance, row, column = np.full(len(idx0), np.inf), np.zeros(len(idx0), np.int64), np.zeros(len(idx0), np.int64)
     widest = int((side0.count[idx0] * side1.count[idx1]).max(initial=0))
@@ -242,7 +243,7 @@ def closest(
         at = np.flatnonzero(side0.count[idx0] * side1.count[idx1] > k)
         d0 = side0.first[idx0[at]] + k // side1.count[idx1[at]]
         d1 = side1.first[idx1[at]] + k % side1.count[idx1[at]]
-        allowed = alike[side0.features.view_idx[d0], side1.features.view_idx[d1]]
+        allowed = comparable[side0.features.view_idx[d0], side1.features.view_idx[d1]]
         at, d0, d1 = at[allowed], d0[allowed], d1[allowed]
         measured = descriptor_distances(side0.features, side1.features, d0, d1)
         nearer = measured < distance[at]
@@ -262,14 +263,14 @@ def descriptor_distances(features0: Features, features1: Features, rows: IntArra
     return np.sqrt(squared)
 
 
-def distance_of_wrong_pairs(side0: Side, side1: Side, alike: BoolArray) -> float:
-    """Distance that one in fifty random keypoint pairs stays below: how much alike things of this place look anyway."""
+def distance_of_wrong_pairs(side0: Side, side1: Side, comparable: BoolArray) -> float:
+    """Descriptor distance below which one in fifty random keypoint pairs lies: similarity by chance in this pair."""
     count0, count1 = len(side0.count), len(side1.count)
     if not min(count0, count1):
         return 0.0
     rng = np.random.default_rng(0)
     draws = [rng.integers(0, count, _DRAWS) for count in (count0, count1)]
-    distances, _, _ = closest(side0, side1, draws[0], draws[1], alike)
+    distances, _, _ = closest(side0, side1, draws[0], draws[1], comparable)
     known = distances[np.isfinite(distances)]
     return float(np.quantile(known, _CHANCE)) if len(known) else 0.0
 

@@ -11,14 +11,18 @@ from aeromatch_cli.strategies.matchers.descriptors.search import Search
 
 
 class Nearest(Search):
-    """Mutual nearest neighbours between views of like direction. Scores are 1 - d1/d2."""
+    """Mutual nearest neighbours with Lowe's ratio test, between views of similar direction. Scores are 1 - d1/d2."""
 
     version: ClassVar[int] = 2
     name: Literal["nearest"] = "nearest"
     ratio: float = Field(
-        RATIO, gt=0.0, le=1.0, description="Largest distance to the nearest over that to the next other keypoint."
+        RATIO,
+        gt=0.0,
+        le=1.0,
+        description="Largest ratio of the distances to the nearest and the second nearest descriptor. Larger: more "
+        "matches, more of them wrong.",
     )
 
-    def scan(self, asked: Comparison) -> Found:
-        """Matches of all view pairs that are alike, costs d1/d2."""
-        return ratio_test(asked, self.ratio)
+    def scan(self, comparison: Comparison) -> Found:
+        """Matches of all view pairs that are comparable, costs d1/d2."""
+        return ratio_test(comparison, self.ratio)

@@ -1,4 +1,4 @@
-"""What matchers of described keypoints share: views to compare, where matches may lie, and the second search."""
+"""What matchers of descriptors share: comparable views, search windows, and the second, guided search."""
 
 from __future__ import annotations
 
@@ -17,54 +17,71 @@ from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, Where
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
-from aeromatch_cli.strategies.matchers.descriptors.views import appearances, like_views
+from aeromatch_cli.strategies.matchers.descriptors.views import appearances, comparable_views
 
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
 
 T = TypeVar("T")
-# A search that puts questions to a network, is sent as many answers and ends with a result. Whoever runs it decides
-# when the network is asked, and for how many pairs at once.
+# A search that yields inputs for a network, is sent as many outputs, and returns a result. The caller decides when the
+# network runs, and for how many pairs at once.
 Steps = Generator[Sequence[Any], Sequence[Any], T]
 
 
-def finished(steps: Steps[T], answers: Callable[[Sequence[Any]], Sequence[Any]]) -> T:
-    """The result of steps whose questions are answered as they come."""
+def finished(steps: Steps[T], run_network: Callable[[Sequence[Any]], Sequence[Any]]) -> T:
+    """The result of steps, with the network run for each of their inputs as they come."""
     try:
-        questions = next(steps)
+        inputs = next(steps)
         while True:
-            questions = steps.send(answers(questions))
+            inputs = steps.send(run_network(inputs))
     except StopIteration as end:
         result: T = end.value
         return result
 
 
 class Search(Strategy):
-    """A matcher that compares the views of like direction of two images, at most one match per keypoint.
+    """A matcher that compares the views of similar direction of two images, with at most one match per keypoint.
 
-    Most pairs of an ordinary block are settled by the pictures as they were taken (`ample`); the others are searched
-    harder. guided: where both attitudes and the ground are known, a keypoint of image 0 is only compared with those of
-    image 1 that lie where the poses and their sigma put it; then, whatever is known, around the places that the
-    verified matches predict (`matchers.guided`).
+    Source images are matched first. Pairs with fewer than guide_below_matches are matched again, with enhanced pictures
+    and, if guided, in two searches. Where both attitudes and the ground are known, a keypoint of image 0 is compared
+    with those of image 1 within the window that the poses and their sigma predict. Then, with or without poses, around
+    the places that verified matches predict (`descriptors.guided`).
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
     max_direction_deg: float = Field(
-        5.0, ge=0.0, le=180.0, description="Simulated views whose directions are farther apart are not compared."
+        5.0,
+        ge=0.0,
+        le=180.0,
+        description="Largest angle between the directions of two simulated views that are compared, degrees. Larger: "
+        "more view pairs, more time.",
     )
     guided: bool = Field(
-        False, description="Search where the poses say, then once more around what verified matches predict."
+        False,
+        description="Guided search: match again within the windows predicted by the poses, then around the places "
+        "predicted by verified matches.",
     )
     guide_below_matches: int = Field(
         500,
         ge=1,
-        description="Where so many matches are found at once, enhanced pictures and guided search are left out: they "
-        "cost more than they add.",
+        description="Guided search and enhanced pictures are used only for pairs with fewer matches than this. "
+        "Larger: more pairs are searched again, more time.",
     )
-    sigmas: float = Field(3.0, gt=0.0, description="Guided: half-width of the window in predicted standard deviations.")
-    sigma_px: float = Field(1.5, gt=0.0, description="Guided: standard deviation of a keypoint, pixels.")
+    sigmas: float = Field(
+        3.0,
+        gt=0.0,
+        description="Guided search: half-width of the window in predicted standard deviations. Larger: allows for "
+        "less accurate poses, more ambiguous matches.",
+    )
+    sigma_px: float = Field(
+        1.5, gt=0.0, description="Guided search: standard deviation of a keypoint, pixels. Larger: wider windows."
+    )
     relief: float = Field(
-        0.3, gt=0.0, lt=1.0, description="Guided: how far things rise over or fall below the ground, in flying heights."
+        0.3,
+        gt=0.0,
+        lt=1.0,
+        description="Guided search: largest height above or below the ground, in flying heights. Larger: longer "
+        "windows.",
     )
 
     def reads(self) -> frozenset[str]:
@@ -76,60 +93,60 @@ class Search(Strategy):
 
         Scores are the matcher's own, or 1 - cost where a model guided the search.
         """
-        return finished(self.steps(features0, features1, geometry), self.answers)
+        return finished(self.steps(features0, features1, geometry), self.run_network)
 
     @property
-    def asks_together(self) -> bool:
-        """Whether it is faster to put the questions of many pairs to the network together."""
+    def batches_pairs(self) -> bool:
+        """Whether the network is faster for many pairs at once."""
         return False
 
-    def answers(self, questions: Sequence[Any]) -> Sequence[Any]:
-        """Of a network, one for each question of `steps`. Raises TypeError where a matcher that asks none is asked."""
-        raise TypeError(f"{type(self).__name__} asks no network")
+    def run_network(self, inputs: Sequence[Any]) -> Sequence[Any]:
+        """One output for each input that `steps` yields. Raises TypeError in a matcher without a network."""
+        raise TypeError(f"{type(self).__name__} has no network")
 
     def steps(self, features0: Features, features1: Features, geometry: PairGeometry) -> Steps[Matches]:
-        """The call, which stops where a network is asked."""
-        alike = like_views(features0, features1, self.max_direction_deg)
-        taken, *enhanced = (alike & which for which in appearances(features0, features1))
+        """The call as a generator: it yields inputs for the network."""
+        comparable = comparable_views(features0, features1, self.max_direction_deg)
+        source, *enhanced = (comparable & which for which in appearances(features0, features1))
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
-        asked = Comparison(features0, features1, geometry, taken)
-        found = self.scan(asked)
-        asked = replace(asked, where=where)
-        found = asked.within(found)
+        comparison = Comparison(features0, features1, geometry, source)
+        found = self.scan(comparison)
+        comparison = replace(comparison, where=where)
+        found = comparison.within(found)
         if len(found.rows) < self.guide_below_matches:
-            asked, found = yield from self._searched_harder(asked, found, enhanced)
-        return _matches(asked, found)
+            comparison, found = yield from self._search_again(comparison, found, enhanced)
+        return _matches(comparison, found)
 
     @abstractmethod
-    def scan(self, asked: Comparison) -> Found:
-        """Matches of all view pairs that are alike, only such as lie where they may.
+    def scan(self, comparison: Comparison) -> Found:
+        """Matches of all comparable view pairs, within the search windows.
 
         A keypoint may occur several times. Costs lie in 0-1; the score of a match is 1 - cost.
         """
 
-    def _searched_harder(
-        self, asked: Comparison, found: Found, enhanced: list[BoolArray]
+    def _search_again(
+        self, comparison: Comparison, found: Found, enhanced: list[BoolArray]
     ) -> Steps[tuple[Comparison, Found]]:
-        """The pictures that say most and their matches, where those of the pictures as taken are few.
+        """The comparison with most matches (source or enhanced pictures) and its matches after the guided search.
 
-        enhanced: view pairs (V0, V1) of the enhanced pictures, where there are any.
+        enhanced: comparable view pairs (V0, V1) of the enhanced pictures, if there are any.
         """
-        first = found if asked.where is None else self.scan(asked)
-        others = [replace(asked, alike=alike) for alike in enhanced]
-        scans = [(asked, first), *((other, self.scan(other)) for other in others)]
-        # Under one sun the borders of shadows are texture, under two they are not: the number of matches tells.
-        asked, found = max(scans, key=lambda scan: len(scan[1].rows))
-        again = SecondSearch(asked) if self.guided else None
-        return asked, (yield from self.look_closer(asked, again(found) if again else found, again))
+        first = found if comparison.where is None else self.scan(comparison)
+        others = [replace(comparison, comparable=comparable) for comparable in enhanced]
+        scans = [(comparison, first), *((other, self.scan(other)) for other in others)]
+        # Under the same sun the borders of shadows are texture, else they mislead: the number of matches decides.
+        comparison, found = max(scans, key=lambda scan: len(scan[1].rows))
+        again = SecondSearch(comparison) if self.guided else None
+        return comparison, (yield from self.refined(comparison, again(found) if again else found, again))
 
-    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
-        """What a dearer search makes of the matches found so far. again: the second search, where it is wanted."""
+    def refined(self, comparison: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
+        """Matches after a more expensive search, none by default. again: the guided search, None if it is off."""
         yield from ()
         return found
 
     def windows(self, features0: Features, geometry: PairGeometry) -> Windows | None:
-        """Where every keypoint of image 0 may lie in image 1, None where that is unknown."""
+        """Search windows in image 1 for every keypoint of image 0, None where poses or ground are unknown."""
         pose0, pose1, ground_z_m = geometry.pose0, geometry.pose1, geometry.ground_z_m
         if pose0 is None or pose1 is None or ground_z_m is None:
             return None
@@ -149,10 +166,10 @@ class Search(Strategy):
         )
 
 
-def _matches(asked: Comparison, found: Found) -> Matches:
+def _matches(comparison: Comparison, found: Found) -> Matches:
     """The cheapest matches in which each keypoint occurs once, and no two lie together in both images."""
-    features0, features1 = asked.features0, asked.features1
-    idx0, idx1 = asked.keypoints(found)
+    features0, features1 = comparison.features0, comparison.features1
+    idx0, idx1 = comparison.keypoints(found)
     kept = one_to_one(idx0, idx1, found.costs)
     places: FloatArray = np.concatenate(
         [features0.keypoints_px[idx0[kept]], features1.keypoints_px[idx1[kept]]], axis=1, dtype=np.float64

@@ -1,4 +1,4 @@
-"""Which views of two images show the same things alike."""
+"""Which views of two images show the same things comparable."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, Features, FloatArray
 
 
-def like_views(features0: Features, features1: Features, max_direction_deg: float) -> BoolArray:
+def comparable_views(features0: Features, features1: Features, max_direction_deg: float) -> BoolArray:
     """View pairs (V0, V1) worth comparing: source with source, and simulated views whose directions differ by at most
     max_direction_deg. A view of unknown direction is compared with every view.
     """
     directions0, directions1 = (np.asarray(f.view_directions, np.float64) for f in (features0, features1))
-    return alike(directions0, directions1, _is_source(features0), _is_source(features1), max_direction_deg)
+    return comparable(directions0, directions1, _is_source(features0), _is_source(features1), max_direction_deg)
 
 
-def alike(
+def comparable(
     directions0: FloatArray, directions1: FloatArray, source0: BoolArray, source1: BoolArray, max_direction_deg: float
 ) -> BoolArray:
-    """`like_views` of views whose directions (V, 3) of length 1, NaN where unknown, and whose being the source (V,) are
-    given: (V0, V1)."""
+    """(V0, V1) as in `comparable_views`. directions: (V, 3) unit vectors, NaN where unknown. source: (V,) bool."""
     known0, known1 = (np.asarray(np.isfinite(directions).all(axis=1)) for directions in (directions0, directions1))
     with np.errstate(invalid="ignore"):
         found = directions0 @ directions1.T >= np.cos(np.deg2rad(max_direction_deg)) - 1e-6

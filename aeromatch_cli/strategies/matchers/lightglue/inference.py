@@ -27,7 +27,7 @@ _BATCH_KEYPOINTS = 2**16
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class NetworkInput:
     """The keypoints of one view that are compared.
 
     rows: (N,) of the image's descriptors. points_px: (N, 2) from the corner; size_px: (2,) width, height.
@@ -41,7 +41,7 @@ class Shown:
     size_px: FloatArray
 
 
-def shown_of(features: Features, view: int, kept: BoolArray, most: int) -> Shown:
+def network_input(features: Features, view: int, kept: BoolArray, most: int) -> NetworkInput:
     """Of one view, such keypoints as are `kept` (K,), the strongest `most` of them.
 
     What is left of a view has a frame of its own, as in training.
@@ -60,7 +60,7 @@ def shown_of(features: Features, view: int, kept: BoolArray, most: int) -> Shown
         low = points.min(axis=0) - np.float32(FRAME_PX)
         size_px = points.max(axis=0) + np.float32(FRAME_PX) - low
         points = points - low
-    return Shown(
+    return NetworkInput(
         rows=rows,
         points_px=points,
         scales_px=features.view_size_px[rows].astype(np.float32) / 2.0,
@@ -71,17 +71,17 @@ def shown_of(features: Features, view: int, kept: BoolArray, most: int) -> Shown
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
-    """The network, ready to be asked. options: of `LightGlue.match`."""
+class LoadedNetwork:
+    """The network, ready to run. options: of `LightGlue.match`."""
 
     network: Any
     calibration: Any
     device: str
     options: dict[str, float]
 
-    def answers(self, questions: Sequence[tuple[Shown, Shown]]) -> list[tuple[IntArray, FloatArray]]:
+    def run_network(self, inputs: Sequence[tuple[NetworkInput, NetworkInput]]) -> list[tuple[IntArray, FloatArray]]:
         """Of each pair of views row pairs (M, 2) and their probabilities (M,). On a GPU in batches of similar size."""
-        sides = [(self._tensors(shown0), self._tensors(shown1)) for shown0, shown1 in questions]
+        sides = [(self._tensors(shown0), self._tensors(shown1)) for shown0, shown1 in inputs]
         found = self._in_batches(sides) if self.device == "cuda" else [self._alone(pair) for pair in sides]
         return [(pairs.cpu().numpy(), self.calibration.calibrated(scores.cpu().numpy())) for pairs, scores in found]
 
@@ -101,7 +101,7 @@ class Asked:
                 found[position] = answer
         return found
 
-    def _tensors(self, shown: Shown) -> Any:
+    def _tensors(self, shown: NetworkInput) -> Any:
         import torch
 
         from aeromatch_cli.nets.lightglue import Side, normalised
@@ -117,8 +117,8 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What decides how the network answers, of the matcher's settings. path: of the weights."""
+class NetworkOptions:
+    """The matcher's settings that decide what the network returns. path: of the weights."""
 
     path: str
     precision: Precision
@@ -128,11 +128,11 @@ class Wanted:
     width_confidence: float
 
 
-def ready(wanted: Wanted) -> Asked:
+def loaded_network(wanted: NetworkOptions) -> LoadedNetwork:
     """The network, built once per process and read anew where the file was replaced."""
     from aeromatch_cli.nets.loading import content_stamp
 
-    return _ready(wanted, content_stamp(Path(wanted.path)))
+    return _loaded(wanted, content_stamp(Path(wanted.path)))
 
 
 def check_length(expected: int, given: int) -> None:
@@ -145,7 +145,7 @@ def check_length(expected: int, given: int) -> None:
 
 
 @lru_cache(maxsize=2)
-def _ready(wanted: Wanted, stamp: tuple[int, int] | None) -> Asked:
+def _loaded(wanted: NetworkOptions, stamp: tuple[int, int] | None) -> LoadedNetwork:
     from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 
     del stamp
@@ -154,7 +154,7 @@ def _ready(wanted: Wanted, stamp: tuple[int, int] | None) -> Asked:
     calibration = read_calibration(path)
     options = {name: getattr(wanted, name) for name in ("depth_confidence", "width_confidence")}
     options["threshold"] = calibration.score_of(wanted.threshold)
-    return Asked(network, calibration, device, options)
+    return LoadedNetwork(network, calibration, device, options)
 
 
 def wrapped_rad(angles_deg: FloatArray) -> FloatArray:

@@ -22,17 +22,23 @@ from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison,
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.descriptors.search import Search, Steps
-from aeromatch_cli.strategies.matchers.lightglue.inference import Shown, Wanted, check_length, ready, shown_of
+from aeromatch_cli.strategies.matchers.lightglue.inference import (
+    NetworkInput,
+    NetworkOptions,
+    check_length,
+    loaded_network,
+    network_input,
+)
 from aeromatch_cli.strategies.matchers.lightglue.overlap import in_overlap
 
-# Cost at least of matches that are there without the network's having found them, beside those of 1 - probability.
+# Smallest cost of matches that the network did not find; those of the network have 1 - probability.
 _DOUBTFUL = 0.7
-# Where the network sees more than there is, its surest matches alone, or none, support a model better: probabilities.
+# The network's matches above these probabilities are tried as well: on unusual ground it is overconfident.
 _SURER = (0.3, 0.5, 0.8)
 
 
 class LightGlue(Search):
-    """LightGlue (Lindenberger et al., ICCV 2023) for the pairs that the mutual ratio test leaves poor.
+    """LightGlue (Lindenberger et al., ICCV 2023) for pairs in which the ratio test finds few matches.
 
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
@@ -43,35 +49,50 @@ class LightGlue(Search):
     network_below_matches: int = Field(
         250,
         ge=1,
-        description="Where the ratio test, and the guided search after it, find so many matches, the network is not "
-        "asked: it takes half a second a pair. For it everywhere, raise this and `ample` above `extract.keypoints`.",
+        description="The network runs only for pairs with fewer matches than this after the ratio test and guided "
+        "search (about half a second per pair). Larger: more pairs use it; above extract.keypoints, and "
+        "guide_below_matches too: every pair.",
     )
     weights: str | None = Field(
         None,
-        description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`).",
+        description="Path of a weights file, or its name in the weights folder (`aeromatch weights list`); null = the "
+        "package's own.",
         json_schema_extra={"path": "or name"},
     )
     threshold: float = Field(
         0.1,
         ge=0.0,
         le=1.0,
-        description="Smallest probability of a match of the network's, as far as the weights are calibrated. "
-        "Matches of the other searches join whatever it is.",
+        description="Smallest probability (0-1) of a match found by the network. Larger: fewer matches, fewer of them "
+        "wrong. Matches of the other searches are not affected.",
     )
     only_overlap: bool = Field(
         True,
-        description="Only keypoints that the other image may show are compared, as far as the plane of the matches "
-        "found before, or else poses and ground, tell.",
+        description="Give the network only the keypoints within the predicted overlap of both images (from earlier "
+        "matches, else from poses and ground).",
     )
-    depth_confidence: float = Field(0.95, ge=-1.0, le=1.0, description="Early stopping; -1 turns it off.")
-    width_confidence: float = Field(0.99, ge=-1.0, le=1.0, description="Point pruning; -1 turns it off.")
+    depth_confidence: float = Field(
+        0.95,
+        ge=-1.0,
+        le=1.0,
+        description="Confidence (0-1) at which the network stops early; -1 = never. Larger: more layers, more time.",
+    )
+    width_confidence: float = Field(
+        0.99,
+        ge=-1.0,
+        le=1.0,
+        description="Confidence (0-1) at which the network drops keypoints; -1 = never. Larger: fewer are dropped, "
+        "more time.",
+    )
     max_keypoints: int = Field(
-        2048, ge=1, description="Strongest descriptors kept per view; time grows with its square."
+        2048,
+        ge=1,
+        description="Number of strongest descriptors per view that the network compares; time grows with its square.",
     )
     precision: Precision = Field(
         "auto",
-        description="Of the network's layers; auto is bfloat16 where the processor has it. Matches "
-        "depend on it: name one for shards on different processors.",
+        description="Number type of the network's layers; auto is bfloat16 where the processor has it. Matches depend "
+        "on it: set it explicitly for shards on different processors.",
     )
     device: Device = DEVICE
 
@@ -94,7 +115,7 @@ class LightGlue(Search):
         return (str(SHIPPED_LIGHTGLUE),)
 
     def check_files(self, descriptor_length: int) -> None:
-        """Weights that a user names are loaded once; those that ship are `aeromatch weights verify`'s."""
+        """Loads the user's own weights once. Those of the package are checked by `aeromatch weights verify`."""
         (path,) = self.fingerprint_files()
         device_of(self.device)
         if self.weights is not None:
@@ -105,62 +126,67 @@ class LightGlue(Search):
             read_calibration(Path(path))
 
     def own_weights(self) -> tuple[str, ...]:
-        """The file that `weights` stands for."""
+        """The file named by `weights`."""
         return () if self.weights is None else self.fingerprint_files()
 
-    def scan(self, asked: Comparison) -> Found:
+    def scan(self, comparison: Comparison) -> Found:
         """The mutual ratio test."""
-        return ratio_test(asked)
+        return ratio_test(comparison)
 
-    def look_closer(self, asked: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
-        """Where there are too few: the network's matches and those found before; guided, they lead the search anew."""
+    def refined(self, comparison: Comparison, found: Found, again: SecondSearch | None) -> Steps[Found]:
+        """With too few matches: those of the network and the earlier ones, and the guided search after them."""
         if len(found.rows) >= self.network_below_matches:
             return found
-        shown = in_overlap(asked, found, self.windows) if self.only_overlap else None
-        closer = yield from self.by_network(asked, shown)
+        shown = in_overlap(comparison, found, self.windows) if self.only_overlap else None
+        closer = yield from self.by_network(comparison, shown)
         doubtful = replace(found, costs=np.maximum(found.costs, _DOUBTFUL))
         surer = [joined([closer.take(closer.costs <= 1.0 - least), doubtful]) for least in self._least_probabilities()]
-        closer = most_evident(asked, [*surer, doubtful])
+        closer = most_evident(comparison, [*surer, doubtful])
         return again(closer, keep=True) if again else closer
 
     def _least_probabilities(self) -> list[float]:
         return [self.threshold, *(least for least in _SURER if least > self.threshold)]
 
-    def by_network(self, asked: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Steps[Found]:
-        """Matches of all view pairs that are alike, each keypoint once, costs 1 - probability.
+    def by_network(self, comparison: Comparison, shown: tuple[BoolArray, BoolArray] | None = None) -> Steps[Found]:
+        """Matches of all view pairs that are comparable, each keypoint once, costs 1 - probability.
 
         shown: (K0,), (K1,) the keypoints that the other image may show.
         The network is symmetric up to rounding, and image_id0 < image_id1 fixes which image comes first, so that the
         order of the files changes nothing. Raises ConfigError where weights are missing or expect other descriptors.
         """
         if shown is None:
-            shown = np.ones(len(asked.features0.keypoints_px), bool), np.ones(len(asked.features1.keypoints_px), bool)
+            shown = (
+                np.ones(len(comparison.features0.keypoints_px), bool),
+                np.ones(len(comparison.features1.keypoints_px), bool),
+            )
         views = [
             (
-                shown_of(asked.features0, int(view0), shown[0], self.max_keypoints),
-                shown_of(asked.features1, int(view1), shown[1], self.max_keypoints),
+                network_input(comparison.features0, int(view0), shown[0], self.max_keypoints),
+                network_input(comparison.features1, int(view1), shown[1], self.max_keypoints),
             )
-            for view0, view1 in np.argwhere(asked.alike)
+            for view0, view1 in np.argwhere(comparison.comparable)
         ]
         views = [(side0, side1) for side0, side1 in views if len(side0.rows) and len(side1.rows)]
-        answers = yield views
-        found = asked.within(
+        outputs = yield views
+        found = comparison.within(
             joined(
                 [
                     Found(side0.rows[pairs[:, 0]], side1.rows[pairs[:, 1]], 1.0 - probabilities)
-                    for (side0, side1), (pairs, probabilities) in zip(views, answers, strict=True)
+                    for (side0, side1), (pairs, probabilities) in zip(views, outputs, strict=True)
                 ]
             )
         )
-        return found.take(one_to_one(*asked.keypoints(found), found.costs))
+        return found.take(one_to_one(*comparison.keypoints(found), found.costs))
 
     @property
-    def asks_together(self) -> bool:
-        """A GPU answers many pairs in the time of one."""
+    def batches_pairs(self) -> bool:
+        """A GPU takes many pairs in the time of one."""
         return device_of(self.device) == "cuda"
 
-    def answers(self, questions: Sequence[tuple[Shown, Shown]]) -> list[tuple[IntArray, FloatArray]]:
+    def run_network(self, inputs: Sequence[tuple[NetworkInput, NetworkInput]]) -> list[tuple[IntArray, FloatArray]]:
         """Of each pair of views row pairs (M, 2) and their probabilities (M,)."""
         (path,) = self.fingerprint_files()
-        wanted = Wanted(path, self.precision, self.device, self.threshold, self.depth_confidence, self.width_confidence)
-        return ready(wanted).answers(questions)
+        wanted = NetworkOptions(
+            path, self.precision, self.device, self.threshold, self.depth_confidence, self.width_confidence
+        )
+        return loaded_network(wanted).run_network(inputs)

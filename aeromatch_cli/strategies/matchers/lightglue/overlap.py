@@ -21,23 +21,23 @@ _PLANE_SHARE, _MARGIN_SHARE = 0.02, 0.15
 
 
 def in_overlap(
-    asked: Comparison, found: Found, windows: Callable[[Features, PairGeometry], Windows | None]
+    comparison: Comparison, found: Found, windows: Callable[[Features, PairGeometry], Windows | None]
 ) -> tuple[BoolArray, BoolArray]:
     """Which keypoints (K0,), (K1,) the other image may show: by the plane of the matches found where they have one
     beyond chance, else by the poses, else all.
 
     windows: where each keypoint of its image may lie in the other one of a geometry.
     """
-    geometry = asked.geometry
-    points0 = undistort(geometry.camera0, asked.features0.keypoints_px)
-    points1 = undistort(geometry.camera1, asked.features1.keypoints_px)
-    idx0, idx1 = asked.keypoints(found)
+    geometry = comparison.geometry
+    points0 = undistort(geometry.camera0, comparison.features0.keypoints_px)
+    points1 = undistort(geometry.camera1, comparison.features1.keypoints_px)
+    idx0, idx1 = comparison.keypoints(found)
     plane = _plane(points0[idx0], points1[idx1])
     if plane is not None:
         there0, there1 = apply_homography(plane, points0), apply_homography(_turned(plane, points0[idx0]), points1)
         return _near(there0, points1), _near(there1, points0)
-    forward = asked.where.windows if asked.where else windows(asked.features0, geometry)
-    backward = windows(asked.features1, geometry.turned()) if forward is not None else None
+    forward = comparison.where.windows if comparison.where else windows(comparison.features0, geometry)
+    backward = windows(comparison.features1, geometry.turned()) if forward is not None else None
     if forward is None or backward is None:
         return np.ones(len(points0), dtype=bool), np.ones(len(points1), dtype=bool)
     return _meets(forward, points1), _meets(backward, points0)

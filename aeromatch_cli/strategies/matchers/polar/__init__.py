@@ -55,20 +55,45 @@ class Measured:
 
 
 class Polar(Strategy):
-    """Least-squares registration of the whole overlap, and least-squares tie points."""
+    """Least-squares registration of the whole overlap in dynamic polar coordinates, and least-squares tie points."""
 
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset({"camera", "pose", "sigma", "ground"})
     reads_pixels: ClassVar[bool] = True
     name: Literal["polar"] = "polar"
-    sigmas: float = Field(3.0, gt=0.0, description="Poses may be wrong by so many standard deviations.")
-    min_scale: float = Field(SCALES[0], gt=0.0, description="Without poses: scale of image 1 over image 0, at least.")
-    max_scale: float = Field(SCALES[1], gt=0.0, description="Without poses: at most.")
-    window_px: int = Field(
-        21, ge=7, le=101, description="Side of the windows that tie points are measured with, odd, pixels."
+    sigmas: float = Field(
+        3.0,
+        gt=0.0,
+        description="Largest error of the poses, in their standard deviations. Larger: a wider search for the start, "
+        "more time.",
     )
-    min_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="Of a tie point's windows.")
-    max_sigma_px: float = Field(0.5, gt=0.0, description="Standard deviation of a tie point, from its residuals.")
+    min_scale: float = Field(
+        SCALES[0], gt=0.0, description="Without poses: smallest scale of image 1 relative to image 0."
+    )
+    max_scale: float = Field(
+        SCALES[1],
+        gt=0.0,
+        description="Without poses: largest scale of image 1 relative to image 0. A wider range takes more time.",
+    )
+    window_px: int = Field(
+        21,
+        ge=7,
+        le=101,
+        description="Side of the window by which a tie point is measured, odd, pixels. Larger: more robust, less "
+        "local.",
+    )
+    min_correlation: float = Field(
+        0.6,
+        ge=0.0,
+        lt=1.0,
+        description="Smallest correlation (0-1) of a tie point's windows. Larger: fewer, better tie points.",
+    )
+    max_sigma_px: float = Field(
+        0.5,
+        gt=0.0,
+        description="Largest standard deviation of a tie point, from its residuals, pixels. Larger: more, less "
+        "accurate tie points.",
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> Polar:

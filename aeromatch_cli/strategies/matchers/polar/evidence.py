@@ -20,7 +20,7 @@ from aeromatch_cli.strategies.matchers.polar.level import Level, normalised
 _CELLS = 64  # over the overlap, about
 _LEAST_CELL_PX = 10
 _SPREAD_PX = 3.0  # pictures are normalised within
-_FULL = 0.6  # of a cell, to be asked
+_FULL = 0.6  # share of a cell that must be known to judge it
 _HALF = 0.5  # of what is known as registered, for another place to be compared
 # Rivals: rings of places around, farther off than the normalised pictures resemble themselves.
 _RIVAL_RADII_PX, _RIVALS_A_RING = (5.0, 9.0, 14.0), 8
@@ -30,8 +30,8 @@ _ALIKE, _ALIKE_PX, _ALIKE_APART_PX = 24, (5.0, 30.0), 2.0
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """cells: that could be asked. agreeing: which correlate best as registered. by_chance: expected to, were it wrong.
-    correlations: (rows, columns) of every cell of side 0, of locally normalised pictures; NaN where not asked.
+    """cells: number judged. agreeing: which correlate best as registered. by_chance: expected to, were it wrong.
+    correlations: (rows, columns) of every cell of side 0, of locally normalised pictures; NaN where not judged.
     """
 
     cells: int
@@ -45,7 +45,7 @@ class Evidence:
         return float(np.nanmedian(self.correlations)) if self.cells else 0.0
 
     def preferred_to(self, other: Evidence) -> float:
-        """Share of the cells that both could ask, which correlate better here than there; 1 where none."""
+        """Share of the cells that both judge, which correlate better here than there; 1 where none."""
         with np.errstate(invalid="ignore"):
             better = self.correlations > other.correlations
         both = np.isfinite(self.correlations) & np.isfinite(other.correlations)
@@ -71,15 +71,15 @@ def evidence(level0: Level, level1: Level, matrix: FloatArray, cell_px: int) -> 
     shared = ones0 * known1
     shifts = [(0, 0), *_around(), *_alike(flat0 * shared)]
     both = _sums(shared, cell_px)
-    asked = both >= _FULL * cell_px**2
+    judged = both >= _FULL * cell_px**2
     # By what is known of either place: at the rim a place further out would fit badly for want of a picture.
-    found = np.array([_sums(flat0 * _shifted(flat1, *shift), cell_px)[asked] for shift in shifts])
-    known = np.array([_sums(ones0 * _shifted(known1, *shift), cell_px)[asked] for shift in shifts])
-    correlations = np.where(known >= _HALF * both[asked], found / np.maximum(known, 1.0), -np.inf)
-    agreeing = correlations[0] > correlations[1:].max(axis=0) if asked.any() else np.zeros(0, bool)
+    found = np.array([_sums(flat0 * _shifted(flat1, *shift), cell_px)[judged] for shift in shifts])
+    known = np.array([_sums(ones0 * _shifted(known1, *shift), cell_px)[judged] for shift in shifts])
+    correlations = np.where(known >= _HALF * both[judged], found / np.maximum(known, 1.0), -np.inf)
+    agreeing = correlations[0] > correlations[1:].max(axis=0) if judged.any() else np.zeros(0, bool)
     of_cells = np.full(both.shape, np.nan)
-    of_cells[asked] = correlations[0]
-    count = int(asked.sum())
+    of_cells[judged] = correlations[0]
+    count = int(judged.sum())
     return Evidence(count, int(agreeing.sum()), count / len(shifts), of_cells)
 
 
