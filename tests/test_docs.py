@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks import pages, stamps
+from benchmarks import __main__ as launcher
+from benchmarks import options, pages, stamps
 
 from aeromatch_cli.config import load
+from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, shipped_weights
 
 PRESENT = stamps.present_versions()
@@ -122,3 +126,21 @@ def test_a_stamp_has_every_fact(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stamps.commit() == "95a1b2c"
     answers["rev-parse"] = ""
     assert stamps.commit() is None
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
+def test_commands_of_tables_have_options_that_there_are(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+
+    def parse(parser: argparse.ArgumentParser, arguments: list[str], quick: Any = None) -> None:
+        parser.parse_args(arguments)
+        read.append(parser.prog)
+        raise AeromatchError("nothing is run here")
+
+    monkeypatch.setattr(options, "parse", parse)
+    commands = [stamp["command"] for _, stamp in pages.stamps(path.read_text(encoding="utf-8"))]
+    for command in commands:
+        script, *arguments = shlex.split(command)
+        assert script == "scripts/bench"
+        assert launcher.main(arguments) == AeromatchError.exit_code
+    assert len(read) == len(commands)

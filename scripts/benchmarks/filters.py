@@ -39,17 +39,7 @@ from aeromatch_cli.strategies.filters.homography import Homography
 from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.synthetic import PRESETS
-from benchmarks import stamps
-from benchmarks.options import (
-    add_flight,
-    add_output,
-    add_rendered,
-    command_line,
-    make_parser,
-    parse,
-    positive,
-    publish,
-)
+from benchmarks import options, stamps
 from benchmarks.peers.base import Options
 from benchmarks.peers.ours import Preset
 from benchmarks.processes import limit_threads
@@ -108,8 +98,8 @@ def variants(threshold_px: float) -> list[Variant]:
 def inputs(judged: Judged, args: argparse.Namespace) -> Iterator[Input]:
     """The matches of every judged pair of a scene whose share of correct ones lies in the range."""
     name, settings = parse_method(args.features)
-    options = Options(args.keypoints, "image", 1, args.seed, None)
-    preset = Preset(judged.scene, options, preset=name, settings=(*settings, *_matched(args)))
+    limits = Options(args.keypoints, "image", 1, args.seed, None)
+    preset = Preset(judged.scene, limits, preset=name, settings=(*settings, *_matched(args)))
     known: dict[str, Any] = {}
     for pair in judged.pairs:
         for image in pair.images:
@@ -245,7 +235,7 @@ def _median_error(rows: Sequence[Row]) -> float:
 def run(args: argparse.Namespace) -> list[Row]:
     """All rows, written scene by scene."""
     rows: list[Row] = []
-    for judged in rendered_scenes(args, "all", args.flight):
+    for _, judged in rendered_scenes(args, "all"):
         found = list(inputs(judged, args))
         print(f"{judged.scene.name}: {len(found)} of {len(judged.pairs)} pairs are 30 to 80 % correct", file=sys.stderr)
         if found and not rows:  # imports and caches are not timed
@@ -257,22 +247,21 @@ def run(args: argparse.Namespace) -> list[Row]:
 
 
 def make_options() -> argparse.ArgumentParser:
-    parser = make_parser("filters", __doc__)
+    parser = options.make_parser("filters", __doc__)
     add = parser.add_argument
     add("--features", default="baseline", help="preset, with settings in brackets, whose features are matched")
     # Its pairs, before the share of correct matches chooses.
-    add_rendered(parser, scenes=",".join(PRESETS), pairs=16, size="1000x750", images=24)
-    add_flight(parser)
-    add("--keypoints", type=positive, default=2048, help="descriptors per image")
+    options.add_rendered(parser, scenes=",".join(PRESETS), pairs=16, size="1000x750", images=24, flights="mixed")
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image")
     add("--threshold", type=int, default=3, choices=SWEPT_PX, help="of clustered RANSAC and of the peers, px")
     add("--ratio", type=float, default=1.0, help="of the input's nearest to its second; 1: none")
-    add_output(parser)
+    options.add_output(parser)
     return parser
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = make_options()
-    args = parse(parser, arguments)
+    args = options.parse(parser, arguments)
     limit_threads(1)
     rows = run(args)
     if not rows:
@@ -280,8 +269,8 @@ def main(arguments: Sequence[str]) -> None:
     versions = stamps.of_settings(_settings(args), families=("pairs", "enhance", "simulate", "extract", "match"))
     for variant in variants(args.threshold):
         versions |= stamps.of_strategies("filter", *variant.chain)
-    publish(
+    options.publish(
         args, table_of(rows, args.threshold), args.out / "filters.md",
-        table="bench_filters" if args.flight == "mixed" else f"bench_filters_{args.flight}",
-        command=command_line(parser, args), versions=versions,
+        table="_".join(["bench_filters", *(flight for flight in args.flights if flight != "mixed")]),
+        command=options.command_line(parser, args), versions=versions,
     )  # fmt: skip

@@ -69,7 +69,7 @@ def runs(data: str, out: str, seed: str, docs: Sequence[str]) -> list[Run]:
         ),
         ("shadow", "--data", data, *rendered),
         ("filters", *rendered),
-        ("filters", "--flight", "oblique", "--ratio", "0.9", "--seed", seed, *docs, "--out", f"{out}/oblique"),
+        ("filters", "--flights", "oblique", "--ratio", "0.9", "--seed", seed, *docs, "--out", f"{out}/oblique"),
         blocks("cross", "pycolmap-uncut-guided", "pycolmap-guided", *MATCHERS),
         blocks("thinned", "pycolmap-uncut", "baseline", *MATCHERS),
         blocks("easy", "baseline", "fusion", NEAREST),
@@ -81,6 +81,6 @@ def main(arguments: Sequence[str]) -> int:
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
     options.add_runs(parser)
-    args = parser.parse_args(arguments)
+    args = options.parse(parser, arguments)
     found = runs(str(args.data.resolve()), str(args.out.resolve()), str(args.seed), ("--docs",) if args.docs else ())
     return run_all(found, listed=args.list)

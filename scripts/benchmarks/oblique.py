@@ -24,7 +24,7 @@ def runs(data: str, weights: str, out: str, seed: str, docs: Sequence[str]) -> l
 
     def methods(table: str, asked: Sequence[str], *more: str, pairs: str = "12") -> Run:
         common = (
-            "--flight",
+            "--flights",
             "oblique",
             "--condition",
             "angles",
@@ -58,6 +58,6 @@ def main(arguments: Sequence[str]) -> int:
     add("--data", type=Path, required=True, metavar="DIR", help="folder of real blocks")
     add("--reference-weights", type=Path, required=True, metavar="DIR", help="weights of the peers")
     options.add_runs(parser)
-    args = parser.parse_args(arguments)
+    args = options.parse(parser, arguments)
     places = (str(path.resolve()) for path in (args.data, args.reference_weights, args.out))
     return run_all(runs(*places, str(args.seed), ("--docs",) if args.docs else ()), listed=args.list)

@@ -51,27 +51,30 @@ def size_px(text: str) -> tuple[int, int]:
 
 
 def add_rendered(
-    parser: argparse.ArgumentParser, *, scenes: str, size: str, images: int, pairs: int | None = None, seed: int = 0
+    parser: argparse.ArgumentParser, *, scenes: str, size: str, images: int, pairs: int = 0, flights: str = ""
 ) -> None:
-    """Options of rendered blocks. pairs: none where the benchmark looks at no pairs."""
+    """Options of rendered blocks. pairs, flights: none where the benchmark has no choice of them."""
     add = parser.add_argument
     choices = f"rendered blocks, comma-separated of {', '.join(PRESETS)}; '' for none"
     add("--scenes", type=names, default=scenes, help=choices)
-    if pairs is not None:
+    if flights:
+        about = f"of rendered blocks, comma-separated of {', '.join(FLIGHTS)}; mixed has two suns"
+        add("--flights", type=flight_names, default=flights, help=about)
+    if pairs:
         add("--pairs", type=positive, default=pairs, help="of each block")
-    add("--seed", type=int, default=seed, help="another seed gives other blocks, pairs and samples")
+    add("--seed", type=int, default=0, help="another seed gives other blocks, pairs and samples")
     add("--size", metavar="WxH", default=size, help="of rendered images")
     add("--images", type=positive, default=images, help="of each rendered block")
 
 
-def add_flight(parser: argparse.ArgumentParser, default: str = "mixed") -> None:
-    parser.add_argument("--flight", choices=tuple(FLIGHTS), default=default, help="of rendered blocks")
-
-
-def add_output(parser: argparse.ArgumentParser) -> None:
-    """Where results and tables go."""
-    about = "write the table into its page of docs/results; TABLE: another one's name"
-    parser.add_argument("--docs", type=table_name, nargs="?", const="", metavar="TABLE", help=about)
+def add_output(parser: argparse.ArgumentParser, tables: int = 1) -> None:
+    """Where results and tables go. tables: several have names of their own."""
+    about = "write into docs/results"
+    if tables == 1:
+        about += "; TABLE: another table than the benchmark's own"
+        parser.add_argument("--docs", type=table_name, nargs="?", const="", metavar="TABLE", help=about)
+    else:
+        parser.add_argument("--docs", action="store_const", const="", help=about)
     parser.add_argument("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
 
 
@@ -82,6 +85,13 @@ def add_runs(parser: argparse.ArgumentParser) -> None:
     add("--docs", action="store_true", help="write the tables into their pages of docs/results")
     add("--list", action="store_true", help="print the commands instead of running them")
     add("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
+
+
+def flight_names(text: str) -> list[str]:
+    """For argparse: names of flights."""
+    if unknown := set(names(text)) - set(FLIGHTS):
+        raise argparse.ArgumentTypeError(f"{', '.join(unknown)} is none of {', '.join(FLIGHTS)}")
+    return names(text)
 
 
 def positive(text: str) -> int:

@@ -37,17 +37,7 @@ from aeromatch_cli.strategies.matchers.descriptors.search import Search
 from aeromatch_cli.strategies.matchers.descriptors.views import comparable
 from aeromatch_cli.synthetic import Truth, load_truth
 from aeromatch_cli.workspace import stable_hash
-from benchmarks import stamps
-from benchmarks.options import (
-    add_output,
-    command_line,
-    make_parser,
-    names,
-    numbers,
-    parse,
-    positive,
-    publish,
-)
+from benchmarks import options, stamps
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.ours import Preset
 from benchmarks.processes import limit_threads
@@ -131,8 +121,8 @@ def rows_of(folder: Path, scene: str, seed: int, args: argparse.Namespace) -> It
     listed = tuple(pair for pair, _, _ in pairs)
     described = Scene(scene, folder / "images", poses, folder / "block.json", judge.cameras, listed)
     for simulator in args.simulators:
-        options = Options(512, "image", THREADS, seed, None)
-        preset = Preset(described, options, preset="baseline", settings=(f"simulate={simulator}",))
+        limits = Options(512, "image", THREADS, seed, None)
+        preset = Preset(described, limits, preset="baseline", settings=(f"simulate={simulator}",))
         context, sides = preset.context, {}
         for name in sorted({name for pair in listed for name in pair}):
             task = simulate.make_task(context, context.image_by_id[preset.id_of[name]])
@@ -187,23 +177,23 @@ def table_of(rows: Sequence[Row]) -> str:
 
 
 def make_options() -> argparse.ArgumentParser:
-    parser = make_parser("rectification", __doc__)
+    parser = options.make_parser("rectification", __doc__)
     add = parser.add_argument
     about = "comma-separated, with settings as for `simulate`"
-    add("--simulators", type=names, default="none,ground,neighbours", help=about)
-    add("--scenes", type=names, default="city,suburb,hills", help="rendered blocks, comma-separated")
-    add("--pairs", type=positive, default=12, help="of each block and class of view angle, at most")
-    add("--seeds", type=numbers, default="0", help="as 1,2 or 1-4: each gives other scenes, poses, pairs")
+    add("--simulators", type=options.names, default="none,ground,neighbours", help=about)
+    add("--scenes", type=options.names, default="city,suburb,hills", help="rendered blocks, comma-separated")
+    add("--pairs", type=options.positive, default=12, help="of each block and class of view angle, at most")
+    add("--seeds", type=options.numbers, default="0", help="as 1,2 or 1-4: each gives other scenes, poses, pairs")
     add("--size", metavar="WxH", default="480x360", help="of rendered images")
-    add("--images", type=positive, default=25, help="of each rendered block, five at every place")
+    add("--images", type=options.positive, default=25, help="of each rendered block, five at every place")
     add("--exact", action="store_true", help="poses without noise")
-    add_output(parser)
+    options.add_output(parser)
     return parser
 
 
 def main(arguments: Sequence[str]) -> None:
     parser = make_options()
-    args = parse(parser, arguments, QUICK)
+    args = options.parse(parser, arguments, QUICK)
     limit_threads(THREADS)
     rows: list[Row] = []
     for scene, seed in product(args.scenes, args.seeds):
@@ -211,7 +201,8 @@ def main(arguments: Sequence[str]) -> None:
         rows += rows_of(render_asked(args, scene, flight="oblique", seed=seed), scene, seed, args)
         write_rows(args.out / "rectification.json", rows)
     used = (load("baseline", [f"simulate={simulator}"]) for simulator in args.simulators)
-    publish(
+    options.publish(
         args, table_of(rows) + "\n", args.out / "rectification.md", table="bench_rectification",
-        command=command_line(parser, args), versions=stamps.of_settings(*used, families=("pairs", "simulate", "match")),
+        command=options.command_line(parser, args),
+        versions=stamps.of_settings(*used, families=("pairs", "simulate", "match")),
     )  # fmt: skip

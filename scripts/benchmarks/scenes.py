@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -84,12 +84,12 @@ def render_asked(args: argparse.Namespace, preset: str, *, flight: str, seed: in
     return render_once(args.out / "scenes", preset, seed=args.seed if seed is None else seed, flight=flight, **size)
 
 
-def rendered_scenes(args: argparse.Namespace, condition: str, flight: str) -> Iterator[Judged]:
-    """The blocks that the options ask for, one after the other, each made when it is needed."""
+def rendered_scenes(args: argparse.Namespace, condition: str) -> Iterator[tuple[str, Judged]]:
+    """Flight and scene of the blocks that the options ask for, one after the other, each made when it is needed."""
     selection = Selection(condition, args.pairs, args.seed)
-    for preset in args.scenes:
+    for flight, preset in product(args.flights, args.scenes):
         out = render_asked(args, preset, flight=flight)
-        yield _judged(preset, out, open_truth(out), selection, set())
+        yield flight, _judged(preset, out, open_truth(out), selection, set())
 
 
 def real(folder: Path, data: Path, block: str, selection: Selection, *, max_size_px: int) -> Judged:

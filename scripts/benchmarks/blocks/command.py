@@ -30,11 +30,10 @@ from pathlib import Path
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic.presets import PRESETS
-from benchmarks import stamps
+from benchmarks import options, stamps
 from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, cross_pairs
 from benchmarks.blocks.counts import count_matches
 from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
-from benchmarks.options import add_output, command_line, make_parser, names, numbers, parse, positive, publish
 from benchmarks.peers.table import Named, check_method, named_methods, settings_of
 from benchmarks.scenes import render_once
 from benchmarks.tables import Row, write_rows
@@ -98,25 +97,25 @@ def block_folders(args: argparse.Namespace, block: str) -> tuple[Path, Path]:
 
 def make_options(section: str) -> argparse.ArgumentParser:
     default = SECTIONS[section]
-    parser = make_parser(f"blocks {section}", __doc__)
+    parser = options.make_parser(f"blocks {section}", __doc__)
     add = parser.add_argument
     add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
-    add("--blocks", type=names, default=default.blocks, help="names, comma-separated")
-    add("--thin", type=numbers, default=default.thin, help="keep every k-th image; several k comma-separated")
-    add("--keypoints", type=positive, default=default.keypoints, help="descriptors per image")
+    add("--blocks", type=options.names, default=default.blocks, help="names, comma-separated")
+    add("--thin", type=options.numbers, default=default.thin, help="keep every k-th image; several k comma-separated")
+    add("--keypoints", type=options.positive, default=default.keypoints, help="descriptors per image")
     add("--methods", default=default.methods, help="comma-separated; the first is what others are compared with")
-    add("--jobs", type=positive, default=2)
+    add("--jobs", type=options.positive, default=2)
     add("--no-mapping", action="store_true", help="leave out pycolmap's mapping")
-    add_output(parser)
+    options.add_output(parser)
     return parser
 
 
 def main(arguments: Sequence[str]) -> None:
-    first = make_parser("blocks", __doc__)
+    first = options.make_parser("blocks", __doc__)
     first.add_argument("section", choices=tuple(SECTIONS))
     section = first.parse_args(arguments[:1]).section
     parser = make_options(section)
-    args = parse(parser, arguments[1:], QUICK)
+    args = options.parse(parser, arguments[1:], QUICK)
     methods = named_methods(args.methods)
     for name in methods:
         check_method(name.spec, COLMAP)
@@ -125,7 +124,7 @@ def main(arguments: Sequence[str]) -> None:
         rows.append(row)
         print(json.dumps(row), file=sys.stderr, flush=True)
         write_rows(args.out / f"{section}.json", rows)
-    publish(
+    options.publish(
         args, SECTIONS[section].table(rows) + "\n", args.out / f"{section}.md", table=f"bench_{section}",
-        command=command_line(parser, args), versions=stamps.of_settings(*settings_of(methods)),
+        command=options.command_line(parser, args), versions=stamps.of_settings(*settings_of(methods)),
     )  # fmt: skip

@@ -179,7 +179,7 @@ def make_options() -> argparse.ArgumentParser:
     add("--seed", type=int, default=1, help="another seed gives other groups and blocks")
     add("--threads", type=options.positive, default=2)
     add("--parts", type=options.names, default=",".join(PARTS), help=f"comma-separated: {', '.join(PARTS)}")
-    options.add_output(parser)
+    options.add_output(parser, tables=2)
     return parser
 
 

@@ -27,21 +27,10 @@ from pathlib import Path
 from aeromatch_cli.config import FAMILIES
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic import PRESETS
-from benchmarks import stamps
+from benchmarks import options, stamps
 from benchmarks.methods.goals import Comparison
 from benchmarks.methods.results import PARTS, make_row, tables
 from benchmarks.methods.worker import measure
-from benchmarks.options import (
-    add_flight,
-    add_output,
-    add_rendered,
-    command_line,
-    make_parser,
-    names,
-    parse,
-    positive,
-    publish,
-)
 from benchmarks.peers.base import Options
 from benchmarks.peers.table import (
     CLASSICAL,
@@ -66,7 +55,7 @@ _FAMILIES = tuple(family for family in FAMILIES if family != "export")
 
 def scenes(args: argparse.Namespace) -> Iterator[Judged]:
     """One after the other, each made when it is needed."""
-    yield from rendered_scenes(args, args.condition, args.flight)
+    yield from (judged for _, judged in rendered_scenes(args, args.condition))
     for block in args.blocks:
         selection = Selection(args.condition, args.pairs, args.seed)
         yield real(args.out / "scenes", args.data, block, selection, max_size_px=args.max_size)
@@ -81,21 +70,21 @@ def poses_of(name: Named, judged: Judged, asked: str) -> list[Judged]:
     return [noisy] if asked == "noisy" else [judged, noisy]
 
 
-def rows_of(name: Named, judged: Judged, options: Options, store: Path) -> Iterator[Row]:
+def rows_of(name: Named, judged: Judged, limits: Options, store: Path) -> Iterator[Row]:
     """Of one method on one scene, pair by pair."""
-    answers = measure(name.spec, judged, options, store)
+    answers = measure(name.spec, judged, limits, store)
     for pair, (key, measured) in zip(judged.pairs, answers, strict=True):
         found = measured.found
         answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
         score = judged.truth.judge(*pair.images, *answer)
-        yield make_row(name, judged, pair, score, measured, options, key)
+        yield make_row(name, judged, pair, score, measured, limits, key)
 
 
 def run(args: argparse.Namespace, methods: list[Named]) -> list[Row]:
     """All rows, written as they come."""
-    options = Options(args.keypoints, args.budget, THREADS, args.seed, args.reference_weights)
+    limits = Options(args.keypoints, args.budget, THREADS, args.seed, args.reference_weights)
     rows: list[Row] = []
-    total = (len(args.scenes) + len(args.blocks)) * len(methods)
+    total = (len(args.scenes) * len(args.flights) + len(args.blocks)) * len(methods)
     started, done = time.monotonic(), 0
     for judged in scenes(args):
         if len(judged.pairs) < args.pairs:
@@ -105,7 +94,7 @@ def run(args: argparse.Namespace, methods: list[Named]) -> list[Row]:
             before = time.monotonic()
             poses = args.poses if args.noisy_methods is None or name.label in args.noisy_methods else "exact"
             for posed in poses_of(name, judged, poses):
-                for row in rows_of(name, posed, options, args.out / "scenes" / "found"):
+                for row in rows_of(name, posed, limits, args.out / "scenes" / "found"):
                     rows.append(row)
                     write_rows(args.out / "results.json", rows)
             done += 1
@@ -119,28 +108,27 @@ def run(args: argparse.Namespace, methods: list[Named]) -> list[Row]:
 
 
 def make_options() -> argparse.ArgumentParser:
-    parser = make_parser("methods", __doc__)
+    parser = options.make_parser("methods", __doc__)
     add = parser.add_argument
     default = ",".join((*CLASSICAL, "baseline"))
     add("--methods", default=default, help=f"comma-separated: {', '.join(PEERS)}, or presets")
     about = "all: half hard, half easy; angles: a quarter of each class of view angle"
     add("--condition", choices=tuple(CONDITIONS), default="all", help=about)
-    add_rendered(parser, scenes=",".join(PRESETS), pairs=16, size="1000x750", images=24)
-    add_flight(parser)
-    add("--keypoints", type=positive, default=2048, help="descriptors per image (or view), exactly")
+    options.add_rendered(parser, scenes=",".join(PRESETS), pairs=16, size="1000x750", images=24, flights="mixed")
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image (or view), exactly")
     add("--budget", choices=("image", "view"), default="image", help="what --keypoints is counted over")
     add("--poses", choices=("exact", "noisy", "both"), default="exact", help="what presets get; both: a row for each")
     about = "comma-separated labels: only these with noisy poses, the others with exact"
-    add("--noisy-methods", type=names, metavar="LABELS", help=about)
+    add("--noisy-methods", type=options.names, metavar="LABELS", help=about)
     add("--reference", help="the method whose weak pairs the goals are about, as in --methods: opencv-sift")
     add("--unprocessed", help="the method without enhancement and views that the goals compare with")
     add("--reference-weights", type=Path, metavar="DIR", help=f"weights of {', '.join(NEED_WEIGHTS)}")
     add("--data", type=Path, metavar="DIR", help="folder of real blocks")
-    add("--blocks", type=names, default="", help="names of real blocks, comma-separated")
-    add("--max-size", type=positive, default=REAL_MAX_SIZE_PX, help="longer side of real images, px")
+    add("--blocks", type=options.names, default="", help="names of real blocks, comma-separated")
+    add("--max-size", type=options.positive, default=REAL_MAX_SIZE_PX, help="longer side of real images, px")
     about = f"what --docs writes, comma-separated: {', '.join(PARTS)}"
-    add("--tables", type=names, default="condition,scene,angle", help=about)
-    add_output(parser)
+    add("--tables", type=options.names, default="condition,scene,angle", help=about)
+    options.add_output(parser)
     return parser
 
 
@@ -162,15 +150,15 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> tuple[li
 
 def main(arguments: Sequence[str]) -> None:
     parser = make_options()
-    args = parse(parser, arguments, QUICK)
+    args = options.parse(parser, arguments, QUICK)
     limit_threads(THREADS)
     methods, comparison = check(parser, args)
     rows = run(args, methods)
     if not rows:
         raise ConfigError(f"no scene has a pair of condition {args.condition}: give another --seed or --condition")
-    publish(
+    options.publish(
         args, tables(rows, comparison), args.out / "table.md",
-        table="bench_methods", command=command_line(parser, args),
+        table="bench_methods", command=options.command_line(parser, args),
         versions=stamps.of_settings(*settings_of(methods), families=_FAMILIES),
         page_text=tables(rows, comparison, args.tables),
     )  # fmt: skip
