@@ -13,7 +13,9 @@ from typing import Any
 
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.workspace import fingerprint, read_json, write_json, write_text
+from benchmarks.blocks import steps
 from benchmarks.blocks.series import pairs_across, read_block, two_series
 from benchmarks.blocks.steps import run_step
 from benchmarks.peers.table import Named
@@ -21,7 +23,7 @@ from benchmarks.scenes import brightness_of
 from benchmarks.sources import OUR_CODE, code_digest, library_versions
 
 COLMAP = ("pycolmap", "pycolmap-guided", "pycolmap-uncut", "pycolmap-uncut-guided")
-_STEPS = "benchmarks/blocks/steps.py"
+_STEPS = ("benchmarks/blocks/steps.py", "benchmarks/peers/colmap.py")
 Answer = dict[str, Any]
 
 
@@ -67,7 +69,7 @@ def cross_pairs(images: Path, reference: Path) -> tuple[tuple[str, str], ...]:
 def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
     """Figures and database of one method; made unless `store` has them."""
     ours = None if name.spec in COLMAP else load(*parse_method(name.spec)).model_dump(mode="json")
-    code = (_STEPS, *(OUR_CODE if ours else ()))
+    code = (*_STEPS, *(OUR_CODE if ours else ()))
     basis = [name.spec, ours, case.pictures, case.pairs, case.keypoints, case.jobs, case.command and bool(ours)]
     folder = store / fingerprint(basis, code_digest(*code), library_versions())[:16]
     folder.mkdir(parents=True, exist_ok=True)
@@ -80,7 +82,7 @@ def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
     found: Answer = read_json(facts)
     if case.mapping:
         if not mapped.is_file():
-            write_json(mapped, run_step("mapping", folder, images=case.images.resolve(), database=database.resolve()))
+            write_json(mapped, map_database(database, case.images))
         found |= read_json(mapped)
     return found, database
 
@@ -90,9 +92,9 @@ def _preset(case: Case, spec: str, folder: Path) -> Answer:
     if case.command:
         return _run_command(case, preset, settings, folder)
     pairs = _pair_list(case, folder, ",")
-    places = {"images": case.images.resolve(), "reference": case.reference.resolve(), "work": folder.resolve()}
-    task = {"preset": preset, "set": settings, "keypoints": case.keypoints, "jobs": case.jobs, "pairs": pairs}
-    return run_step("preset", folder, **places, **task)
+    return run_step(
+        steps.preset, preset, settings, case.images, case.reference, folder, case.keypoints, case.jobs, pairs
+    )
 
 
 def _run_command(case: Case, preset: str, settings: list[str], folder: Path) -> Answer:
@@ -120,28 +122,27 @@ def _processor_seconds() -> float:
 def _colmap(case: Case, spec: str, folder: Path, store: Path) -> Answer:
     """Features are made once for guided and unguided matching; their seconds count for both."""
     cut = "uncut" not in spec
-    basis = [case.pictures, case.keypoints, case.jobs, cut, code_digest(_STEPS), library_versions()]
+    basis = [case.pictures, case.keypoints, case.jobs, cut, code_digest(*_STEPS), library_versions()]
     shared = store / f"features-{fingerprint(basis)[:16]}"
     shared.mkdir(parents=True, exist_ok=True)
     facts, features = shared / "answer.json", shared / "database.db"
     if not facts.is_file():
         features.unlink(missing_ok=True)
-        places = {"images": case.images, "reference": case.reference, "database": features}
-        places = {name: path.resolve() for name, path in places.items()}
-        found = run_step("colmap_extract", shared, **places, keypoints=case.keypoints, jobs=case.jobs, cut=cut)
+        asked = case.images, case.reference, features, case.keypoints, case.jobs, cut
+        found = run_step(steps.colmap_extract, *asked)
         write_json(facts, found)
     extracted = read_json(facts)["seconds"]
     database = folder / "matching.db"
     shutil.copy(features, database)
     pairs, guided = _pair_list(case, folder, " "), spec.endswith("-guided")
-    found = run_step("colmap_match", folder, database=database.resolve(), jobs=case.jobs, guided=guided, pairs=pairs)
+    found = run_step(steps.colmap_match, database, case.jobs, guided, pairs)
     stages = {"extract": extracted, "match+verify": found["seconds"]}
     return {"database": str(database), "seconds": sum(stages.values()), "stages": stages}
 
 
-def _pair_list(case: Case, folder: Path, separator: str) -> str | None:
+def _pair_list(case: Case, folder: Path, separator: str) -> Path | None:
     if case.pairs is None:
         return None
     path = (folder / "pairs.txt").resolve()
     write_text(path, "".join(f"{a}{separator}{b}\n" for a, b in case.pairs))
-    return str(path)
+    return path

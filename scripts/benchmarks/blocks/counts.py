@@ -13,7 +13,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate.metrics import GRID_CELLS, thin
 from aeromatch_cli.evaluate.reference import load_reference
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX
-from benchmarks.blocks.steps import MIN_INLIERS
+from benchmarks.peers.base import MIN_INLIERS
 
 MAX_IMAGE_ID = 2147483647  # COLMAP's pair_id = id1 * MAX_IMAGE_ID + id2
 NamePair = tuple[str, str]

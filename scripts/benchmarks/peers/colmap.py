@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,20 +31,12 @@ class Colmap:
     """
 
     def __init__(self, scene: Scene, options: Options, *, guided: bool = False) -> None:
-        zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
-        import pycolmap
-
-        pycolmap.logging.minloglevel = 2
+        pycolmap = imported_pycolmap()
         self.scene, self.options = scene, options
-        extraction = pycolmap.FeatureExtractionOptions()
-        extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, options.threads, 100_000
-        extraction.sift.max_num_features, extraction.sift.peak_threshold = options.keypoints, PEAK_THRESHOLD
-        self.matching = pycolmap.FeatureMatchingOptions()
-        self.matching.use_gpu, self.matching.num_threads, self.matching.guided_matching = False, options.threads, guided
-        self.matching.sift.max_ratio, self.matching.sift.cross_check = RATIO, True
-        self.verification = pycolmap.TwoViewGeometryOptions()
-        self.verification.min_num_inliers = MIN_INLIERS
-        self.verification.ransac.random_seed = options.seed
+        extraction, self.matching, self.verification = colmap_options(
+            options.keypoints, options.threads, guided=guided, seed=options.seed
+        )
+        extraction.sift.peak_threshold = PEAK_THRESHOLD
         self.extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
         self._folder = tempfile.TemporaryDirectory()  # lives as long as this object
         self.list, self.path = Path(self._folder.name) / "pair.txt", Path(self._folder.name) / "database.db"
@@ -86,3 +79,26 @@ class Colmap:
         kept = np.asarray(geometry.inlier_matches).reshape(-1, 2)
         points0, points1 = features0.places_px[kept[:, 0]], features1.places_px[kept[:, 1]]
         return found(features0, features1, points0, points1, np.ones(len(kept)))
+
+
+def imported_pycolmap() -> Any:
+    """The module, its messages on errors alone."""
+    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2
+    return pycolmap
+
+
+def colmap_options(keypoints: int, threads: int, *, guided: bool = False, seed: int = 0) -> tuple[Any, Any, Any]:
+    """Of extraction, matching and verification, on the CPU."""
+    pycolmap = imported_pycolmap()
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, threads, 100_000
+    extraction.sift.max_num_features = keypoints
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu, matching.num_threads, matching.guided_matching = False, threads, guided
+    matching.sift.max_ratio, matching.sift.cross_check = RATIO, True
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.min_num_inliers, verification.ransac.random_seed = MIN_INLIERS, seed
+    return extraction, matching, verification
