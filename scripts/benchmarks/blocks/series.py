@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import Block
-from aeromatch_cli.executor import Executor
-from aeromatch_cli.stages.pairs import prepare
 from aeromatch_cli.strategies.pairings import PAIRINGS
+from benchmarks.peers.base import prepared
 from benchmarks.scenes import MIN_OVERLAP
 
 
@@ -40,8 +38,6 @@ def pairs_across(block: Block, series: tuple[set[str], set[str]]) -> list[tuple[
 
 def read_block(images: Path, reference: Path) -> Block:
     """A block with its reference poses, cameras and ground height."""
-    given = {"images": str(images), "poses": str(reference / "poses.csv"), "cameras": str(reference / "block.json")}
     with tempfile.TemporaryDirectory() as scratch:
-        settings = load("baseline", ["pairs=exhaustive"], given, workspace=scratch)
-        context, _ = prepare(settings, Executor("serial", 1), dry=True)
-    return context.block
+        places = images, reference / "poses.csv", reference / "block.json", Path(scratch)
+        return prepared("baseline", ["pairs=exhaustive"], *places, dry=True).block

@@ -17,7 +17,7 @@ from aeromatch_cli.strategies.extractors.detection import Raw
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from aeromatch_cli.workspace import stable_hash
 from benchmarks.keypoints.correspondence import Keypoints, Partners, in_overlap, of_one_size, partners
-from benchmarks.keypoints.detectors import detect_sift
+from benchmarks.keypoints.detectors import strongest_sift
 from benchmarks.keypoints.figures import Asked
 from benchmarks.keypoints.metrics import distances, false_positive_rate, nearest_neighbours
 from benchmarks.keypoints.pictures import Picture, Pictures
@@ -152,17 +152,6 @@ def patches_of(picture: Picture, keypoints: Keypoints) -> NDArray[np.uint8]:
     return cut_patches(levels_of(picture.gray), keypoints.points_px, keypoints.sizes_px, keypoints.angles_deg)
 
 
-def strongest_sift(picture: Picture, most: int, *, upright: bool) -> tuple[FloatArray, list[Any]]:
-    """x, y, size, angle, response (N, 5) and OpenCV's keypoints: the strongest; upright: each place and size once."""
-    table, own = detect_sift(picture)
-    order = np.lexsort((table[:, 3], table[:, 2], table[:, 0], table[:, 1], -table[:, 4]))
-    if upright:
-        _, first = np.unique(table[order, :3], axis=0, return_index=True)
-        order = order[np.sort(first)]
-    order = order[:most]
-    return table[order], [own[i] for i in order]
-
-
 @dataclass(frozen=True, eq=False)
 class Task:
     """What descriptors are asked about one pair.
@@ -197,7 +186,7 @@ def make_task(
     """From the keypoints of both pictures of a pair."""
     sides = []
     for picture, other in (both, both[::-1]):
-        table, own = strongest_sift(picture, MOST, upright=upright)
+        table, own = strongest_sift(picture, MOST, once=3 if upright else 0)
         rows = np.flatnonzero(in_overlap(truth, picture, table[:, :2], other))[:count]
         sides.append(make_side(picture, table, own, rows, upright=upright))
     first, second = (side.picture.stored_px(side.keypoints.points_px) for side in sides)

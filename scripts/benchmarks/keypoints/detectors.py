@@ -35,22 +35,13 @@ class Detector(Protocol):
 
 
 class Sift:
-    """OpenCV's SIFT with precise upscaling; angles are the first of each place's."""
+    """OpenCV's SIFT with precise upscaling: every place once, whatever its sizes and angles."""
 
     def __init__(self, options: Options) -> None:
         del options
 
     def __call__(self, picture: Picture, most: int) -> Keypoints:
-        return self.strongest_places(picture, most)
-
-    @staticmethod
-    def strongest_places(picture: Picture, most: int) -> Keypoints:
-        """Every place once, whatever its sizes and orientations."""
-        table, _ = detect_sift(picture)
-        # The fixed order of the benchmark's peers: by response, then place.
-        table = table[np.lexsort((table[:, 3], table[:, 0], table[:, 1], -table[:, 4]))]
-        _, first = np.unique(table[:, :2], axis=0, return_index=True)
-        table = table[np.sort(first)[:most]]
+        table, _ = strongest_sift(picture, most, once=2)
         return Keypoints(table[:, :2], table[:, 2], table[:, 3])
 
 
@@ -113,6 +104,19 @@ def detect_sift(picture: Picture) -> tuple[FloatArray, tuple[Any, ...]]:
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], np.float64).reshape(-1, 5)
     kept = np.flatnonzero(away_from_unseen(table[:, :2], picture.seen, _MARGIN_PX))
     return table[kept], tuple(found[i] for i in kept)
+
+
+def strongest_sift(picture: Picture, most: int, *, once: int) -> tuple[FloatArray, list[Any]]:
+    """x, y, size, angle, response (N, 5) and OpenCV's keypoints: the strongest, in an order that does not depend on
+    OpenCV's. once: of keypoints that are alike in so many columns one is kept; 0: all are.
+    """
+    table, own = detect_sift(picture)
+    order = np.lexsort((table[:, 3], table[:, 2], table[:, 0], table[:, 1], -table[:, 4]))
+    if once:
+        _, first = np.unique(table[order, :once], axis=0, return_index=True)
+        order = order[np.sort(first)]
+    order = order[:most]
+    return table[order], [own[i] for i in order]
 
 
 def _kept(picture: Picture, keypoints: Keypoints) -> Keypoints:

@@ -15,7 +15,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate import RenderedTruth
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from benchmarks.keypoints.correspondence import Keypoints, in_overlap, of_one_size, partners, wrapped_deg
-from benchmarks.keypoints.detectors import MOST, Sift, detect_sift
+from benchmarks.keypoints.detectors import DETECTORS, MOST, detect_sift
 from benchmarks.keypoints.figures import Asked
 from benchmarks.keypoints.pictures import Picture, Pictures
 from benchmarks.peers.base import Options
@@ -100,9 +100,9 @@ def turned_keypoints(truth: RenderedTruth, pictures: tuple[Picture, Picture], mo
 
     most: keypoints of a picture; shown: the strongest of them in the overlap.
     """
-    sides = []
+    sift, sides = DETECTORS["sift"](None), []
     for picture, other in (pictures, pictures[::-1]):
-        found = Sift.strongest_places(picture, most)
+        found = sift(picture, most)
         rows = np.flatnonzero(in_overlap(truth, picture, found.points_px, other))[:shown]
         sides.append(found.take(rows))
     stored = [picture.stored_px(side.points_px) for picture, side in zip(pictures, sides, strict=True)]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.context import Context
 
 MIN_INLIERS = 15  # fewer than this after any estimator: the pair counts as not matched, for every method
 
@@ -131,3 +135,15 @@ def read_weights(options: Options, name: str) -> dict[str, Any]:
     content = torch.load(options.weights / name, map_location="cpu", weights_only=True)
     tensors: dict[str, Any] = content.get("state_dict", content)
     return tensors
+
+
+def prepared(
+    preset: str, changes: Sequence[str], images: Path, poses: Path, cameras: Path, workspace: Path, **more: Any
+) -> Context:
+    """A block with its chosen pairs as a preset with these settings reads it, in this process. more: seed, dry."""
+    from aeromatch_cli.executor import Executor
+    from aeromatch_cli.stages.pairs import prepare
+
+    block = {"images": str(images), "poses": str(poses), "cameras": str(cameras)}
+    top = {"workspace": str(workspace), "run": {"executor": "serial", "jobs": 1}, "seed": more.get("seed", 0)}
+    return prepare(load(preset, list(changes), block, **top), Executor("serial", 1), dry=more.get("dry", False))[0]

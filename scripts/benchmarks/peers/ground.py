@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.images.views import render_view
-from aeromatch_cli.stages import enhance, pairs, simulate
-from benchmarks.peers.base import Described, Found, Method, Options, Scene
+from aeromatch_cli.stages import enhance, simulate
+from benchmarks.peers.base import Described, Found, Method, Options, Scene, prepared
 from benchmarks.views import ImageView, away_from_unseen, filled, inside
 
 # A peer is asked for so many times the budget: what it finds where nothing was seen does not count.
@@ -66,10 +64,8 @@ class GroundViews:
     """The north-up ground view of each image of a scene, as preset `baseline` makes it."""
 
     def __init__(self, scene: Scene, workspace: Path) -> None:
-        block = {"images": str(scene.images), "poses": str(scene.poses), "cameras": str(scene.block)}
-        top = {"workspace": str(workspace), "run": {"executor": "serial", "jobs": 1}}
         asked = ["pairs=exhaustive", "extract.colours=true"]  # the views depend on neither
-        self.context, _ = pairs.prepare(load("baseline", asked, block, **top), Executor("serial", 1))
+        self.context = prepared("baseline", asked, scene.images, scene.poses, scene.block, workspace)
         self.image_of = {image.name: image for image in self.context.block.images}
 
     def __call__(self, image: str) -> tuple[ImageView, NDArray[np.uint8], BoolArray]:

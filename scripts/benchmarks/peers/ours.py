@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import Features, FloatArray, Pair
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats import read_features
-from aeromatch_cli.stages import extract, pairs
+from aeromatch_cli.stages import extract
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.strategies.filters import apply_chain
-from benchmarks.peers.base import Found, Options, Scene
+from benchmarks.peers.base import Found, Options, Scene, prepared
 
 
 class Preset:
@@ -32,16 +30,14 @@ class Preset:
         work = Path(self._folder.name)
         budget = [] if options.budget == "image" else [f"extract.budget={options.budget}"]
         own = [f"extract.keypoints={options.keypoints}", *budget, *settings]
-        block = {"images": str(scene.images), "poses": str(scene.poses), "cameras": str(scene.block)}
-        top = {"workspace": str(work / "work"), "run": {"executor": "serial", "jobs": 1}, "seed": options.seed}
-        executor = Executor("serial", 1)
-        chosen, _ = pairs.prepare(load(preset, own, block, **top), executor)
+        places = scene.images, scene.poses, scene.block, work / "work"
+        chosen = prepared(preset, own, *places, seed=options.seed)
         names = {image.image_id: image.name for image in chosen.block.images}
         both = {(names[pair.image_id0], names[pair.image_id1]) for pair in chosen.pairs} | set(scene.pairs)
         listed = work / "pairs.txt"
         listed.write_text("".join(f"{a},{b}\n" for a, b in sorted(both)), encoding="utf-8")
         own += ["pairs=file", f"pairs.path={listed}"]
-        self.context, _ = pairs.prepare(load(preset, own, block, **top), executor)
+        self.context = prepared(preset, own, *places, seed=options.seed)
         self.id_of = {image.name: image.image_id for image in self.context.block.images}
         self.pair_of = {(pair.image_id0, pair.image_id1): pair for pair in self.context.pairs}
 

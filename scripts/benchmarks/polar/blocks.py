@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray, Pair, PairGeometry
 from aeromatch_cli.evaluate import BlockTruth, open_truth
 from aeromatch_cli.evaluate.scores import PairScore
-from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.pairs import prepare
+from benchmarks.peers.base import prepared
 from benchmarks.polar.grounds import RENDERED, block
 from benchmarks.scenes import EXACT_POSES, NOISY_POSES, overlapping, render_once
 
@@ -88,9 +86,7 @@ def _real(folder: Path) -> tuple[Path, Poses]:
 
 def _context(folder: Path, poses: Path, workspace: Path) -> Context:
     cameras = folder / "block.json" if (folder / "block.json").is_file() else folder / "reference" / "block.json"
-    block = {"images": str(folder / "images"), "poses": str(poses), "cameras": str(cameras)}
-    settings = load("polar", ["pairs=exhaustive"], block, workspace=str(workspace))
-    return prepare(settings, Executor("serial", 1), dry=True)[0]
+    return prepared("polar", ["pairs=exhaustive"], folder / "images", poses, cameras, workspace, dry=True)
 
 
 def _pair(
