@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from benchmarks.polar.own import Shot
+from benchmarks.polar.sides import Shot
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray

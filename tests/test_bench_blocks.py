@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks import __main__
-from benchmarks.blocks import cases, counts, series, tables
+from benchmarks.blocks import cases, tables
 from benchmarks.peers.table import check_method
 
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -25,8 +25,8 @@ NADIR = from_omega_phi_kappa(0.0, 0.0, 0.0)
 
 def test_series_are_cut_at_the_largest_factor() -> None:
     levels = {"a": 110.0, "b": 60.0, "c": 150.0, "d": 52.0, "e": 0.0}
-    assert series.two_series({k: v for k, v in levels.items() if k != "e"}) == ({"b", "d"}, {"a", "c"})
-    assert series.two_series(levels)[0] == {"e"}  # a black frame is a series of its own
+    assert cases.two_series({k: v for k, v in levels.items() if k != "e"}) == ({"b", "d"}, {"a", "c"})
+    assert cases.two_series(levels)[0] == {"e"}  # a black frame is a series of its own
 
 
 def test_pairs_across_share_a_fifth_of_the_smaller_footprint() -> None:
@@ -36,7 +36,7 @@ def test_pairs_across_share_a_fifth_of_the_smaller_footprint() -> None:
     block = Block(images, {"cam": CAMERA}, poses, "local", (0.0, 0.0, 0.0), ConstantGround(0.0), "given", 0.1)
     two = ({"dark0.jpg", "dark1.jpg"}, {"lit0.jpg", "lit1.jpg", "lit2.jpg"})
     # 79 m apart share 21 m of 100 m, 81 m only 19 m; dark1 is 10 m farther, so 71 m and 85 m; pairs within a series go.
-    assert series.pairs_across(block, two) == [
+    assert cases.pairs_across(block, two) == [
         ("dark0.jpg", "lit0.jpg"), ("dark1.jpg", "lit0.jpg"), ("dark1.jpg", "lit1.jpg"),
     ]  # fmt: skip
 
@@ -78,12 +78,12 @@ def test_matches_are_counted_within_3_and_5_px_once_a_place_and_thinned(tmp_path
     places0, places1 = np.vstack([places0, places0[19:] + 1.0]), np.vstack([places1, places1[19:] + 1.0])
     matches = [(i, i) for i in range(21)] + [(0, 0)]  # the last place is 1.4 px from another, the first comes twice
     write_database(tmp_path / "database.db", places0, places1, matches)
-    found = counts.count_matches(tmp_path / "database.db", tmp_path / "reference")
+    found = cases.count_matches(tmp_path / "database.db", tmp_path / "reference")
     assert (found["pairs"], found["matches"], found["unique_matches"]) == (1, 22, 21)
     assert (found["within_3px"], found["within_5px"]) == (14, 19)
     assert (found["thinned"], found["thinned_3px"], found["thinned_5px"]) == (20, 13, 18)
     assert (found["keypoints_mean"], found["keypoints_max"]) == (21.0, 21)
-    none = counts.count_matches(tmp_path / "database.db", tmp_path / "reference", {("a.jpg", "c.jpg")})
+    none = cases.count_matches(tmp_path / "database.db", tmp_path / "reference", {("a.jpg", "c.jpg")})
     assert none["pairs"] == none["matches"] == 0
 
 

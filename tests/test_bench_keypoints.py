@@ -9,17 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmarks.keypoints import (
-    correspondence,
-    descriptors,
-    detectors,
-    figures,
-    metrics,
-    named,
-    orientations,
-    pictures,
-    tables,
-)
+from benchmarks.keypoints import correspondence, descriptors, detectors, figures, orientations, tables
 from benchmarks.peers import base
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
@@ -34,7 +24,7 @@ def names_of(block: Path) -> list[str]:
 def pictures_of(block: Path, work: Path) -> Any:
     files = block / "images", block / "poses.csv", block / "block.json"
     scene = base.Scene("suburb", *files, open_truth(block).cameras, ())
-    return pictures.Pictures(scene, work)
+    return correspondence.Pictures(scene, work)
 
 
 def both(block: Path, work: Path, frame: str) -> Any:
@@ -68,7 +58,7 @@ def test_true_places_are_partners_and_shifted_ones_as_far_off_as_they_were_shift
 
 
 def test_places_go_to_stored_pixels_and_back(rendered: Path, tmp_path: Path) -> None:
-    ground, _ = both(rendered, tmp_path, pictures.GROUND)
+    ground, _ = both(rendered, tmp_path, correspondence.GROUND)
     assert ground.view is not None
     height, width = ground.seen.shape
     points = np.array([[0.5 * width, 0.5 * height], [0.4 * width, 0.6 * height]])
@@ -87,7 +77,7 @@ def flat_truth(matrix: FloatArray, camera: Camera) -> tuple[Any, Any]:
         return there, np.zeros(len(there), bool)
 
     blank = np.zeros((10, 10), np.uint8)
-    picture = pictures.Picture("a", camera, None, blank, blank, blank == 0)
+    picture = correspondence.Picture("a", camera, None, blank, blank, blank == 0)
     return SimpleNamespace(truth=SimpleNamespace(transfer=transfer)), picture
 
 
@@ -140,15 +130,15 @@ def test_sift_is_found_again_and_its_angles_agree(rendered: Path, tmp_path: Path
 
 def test_figures_of_descriptors_worked_by_hand() -> None:
     same, other = np.arange(1.0, 21.0), np.array([5.0, 18.9, 19.0, 19.1, 30.0])
-    assert metrics.false_positive_rate(same, other) == pytest.approx(3 / 5)  # 19 of 20 accepted at 19
-    assert math.isnan(metrics.false_positive_rate(same[:0], other))
+    assert descriptors.false_positive_rate(same, other) == pytest.approx(3 / 5)  # 19 of 20 accepted at 19
+    assert math.isnan(descriptors.false_positive_rate(same[:0], other))
     scores, correct = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, False, True, False])
-    assert metrics.average_precision(scores, correct, 4) == pytest.approx((1 / 1 + 2 / 3) / 4)
-    assert metrics.average_precision(np.ones(4), correct, 2) == pytest.approx(0.5)  # ties come at once
-    assert math.isnan(metrics.average_precision(scores, correct, 0))
+    assert descriptors.average_precision(scores, correct, 4) == pytest.approx((1 / 1 + 2 / 3) / 4)
+    assert descriptors.average_precision(np.ones(4), correct, 2) == pytest.approx(0.5)  # ties come at once
+    assert math.isnan(descriptors.average_precision(scores, correct, 0))
     first, second = np.random.default_rng(0).normal(size=(2, 30, 8)).astype(np.float32)
     wanted = np.linalg.norm(first[:, None] - second[None], axis=2)
-    np.testing.assert_allclose(metrics.distances(first, second), wanted, atol=1e-4)
+    np.testing.assert_allclose(descriptors.distances(first, second), wanted, atol=1e-4)
 
 
 def test_nearest_neighbours_are_right_within_three_pixels_of_the_partner() -> None:
@@ -156,7 +146,7 @@ def test_nearest_neighbours_are_right_within_three_pixels_of_the_partner() -> No
     # Partner itself; another keypoint of its place; elsewhere; without partner; not asked.
     apart = np.array([[1, 5, 9], [3, 9, 9], [9, 9, 1], [2, 3, 9], [1, 9, 9]], np.float32)
     partner, asked = np.array([0, 1, 0, -1, 0]), np.array([True, True, True, True, False])
-    found = metrics.nearest_neighbours(apart, partner, places, asked)
+    found = descriptors.nearest_neighbours(apart, partner, places, asked)
     assert found.right == pytest.approx(2 / 3)
     # By ratio: wrong 1/9, right 1/5, right 3/9, without partner 2/3.
     assert found.by_ratio == pytest.approx((1 / 2 + 2 / 3) / 3)
@@ -180,15 +170,15 @@ def test_sift_tells_places_apart_and_noise_does_not(rendered: Path, tmp_path: Pa
 
 
 def test_names_may_have_labels_and_weights(tmp_path: Path) -> None:
-    found = named.named("sift, mine=ours, new=ours:a/b=c.safetensors", {"sift": None, "ours": None})
+    found = figures.named("sift, mine=ours, new=ours:a/b=c.safetensors", {"sift": None, "ours": None})
     assert [(one.label, one.name) for one in found] == [("sift", "sift"), ("mine", "ours"), ("new", "ours")]
     assert found[2].weights == Path("a/b=c.safetensors")
-    assert named.without_paths("sift,new=ours:a/b.safetensors,tfeat") == "sift,new=ours:FILE,tfeat"
+    assert figures.without_paths("sift,new=ours:a/b.safetensors,tfeat") == "sift,new=ours:FILE,tfeat"
     for wrong, said in (("surf", "none of"), ("ours,ours:x", "two methods")):
         with pytest.raises(ConfigError, match=said):
-            named.named(wrong, {"sift": None, "ours": None})
+            figures.named(wrong, {"sift": None, "ours": None})
     with pytest.raises(ConfigError, match="not found"):
-        named.make({"ours": lambda _options, weights: weights}, found[2], None)
+        figures.make({"ours": lambda _options, weights: weights}, found[2], None)
 
 
 def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
@@ -201,7 +191,7 @@ def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
         return {"figure": len(made)}
 
     def row(settings: int, method: str) -> Any:
-        one = named.Named(method, method, None)
+        one = figures.Named(method, method, None)
         return figures.Store(tmp_path, settings).row(judged, pair, "detector", "ground", one, make)
 
     first = row(1, "sift")

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from benchmarks.polar.grounds import errors, known_pair
-from benchmarks.polar.sift import SiftPair
+from benchmarks.polar.sides import SiftPair
 from benchmarks.polar.tables import tables
 from make_ground import ground
 

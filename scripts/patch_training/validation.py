@@ -141,7 +141,7 @@ def table(describe: Describe, pairs: Sequence[Pair]) -> dict[str, dict[str, floa
 
 def tfeat(weights: Any) -> Describe:
     """TFeat or HardTFeat (kornia) with these weights, lengths normalised."""
-    from benchmarks.peers.keynet import in_tfeat_words
+    from benchmarks.peers.kornia_peers import in_tfeat_words
     from kornia.feature import TFeat
 
     network: Any = TFeat(pretrained=False)

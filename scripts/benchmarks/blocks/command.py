@@ -31,8 +31,7 @@ from pathlib import Path
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic.presets import PRESETS
 from benchmarks import options, stamps
-from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, cross_pairs
-from benchmarks.blocks.counts import count_matches
+from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, count_matches, cross_pairs
 from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
 from benchmarks.peers.table import Named, check_method, named_methods, settings_of
 from benchmarks.scenes import render_once

@@ -43,12 +43,11 @@ from typing import Any
 from aeromatch_cli.config import load
 from aeromatch_cli.evaluate import RenderedTruth
 from benchmarks import options, stamps
+from benchmarks.keypoints.correspondence import GROUND, SOURCE, Pictures
 from benchmarks.keypoints.descriptors import DESCRIBERS, descriptor_figures
 from benchmarks.keypoints.detectors import DETECTORS, detector_figures
-from benchmarks.keypoints.figures import Asked, Store
-from benchmarks.keypoints.named import Named, make, named, without_paths
+from benchmarks.keypoints.figures import Asked, Named, Store, make, named, without_paths
 from benchmarks.keypoints.orientations import ORIENTERS, orientation_figures
-from benchmarks.keypoints.pictures import GROUND, SOURCE, Pictures
 from benchmarks.keypoints.tables import descriptor_table, detector_table, orientation_table
 from benchmarks.peers.base import Options
 from benchmarks.processes import limit_threads

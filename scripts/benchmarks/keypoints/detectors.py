@@ -11,12 +11,10 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate import RenderedTruth
-from benchmarks.keypoints.correspondence import Keypoints, in_overlap, partners
+from benchmarks.keypoints.correspondence import Keypoints, Picture, Pictures, in_overlap, partners
 from benchmarks.keypoints.figures import Asked
-from benchmarks.keypoints.pictures import Picture, Pictures
-from benchmarks.peers.aliked import aliked_network
 from benchmarks.peers.base import Options
-from benchmarks.peers.keynet import keynet_detector, keynet_keypoints
+from benchmarks.peers.kornia_peers import aliked_network, keynet_detector, keynet_keypoints
 from benchmarks.tables import Row
 from benchmarks.views import away_from_unseen, filled
 

@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate import RenderedTruth
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
-from benchmarks.keypoints.correspondence import Keypoints, in_overlap, of_one_size, partners, wrapped_deg
+from benchmarks.keypoints.correspondence import (
+    Keypoints,
+    Picture,
+    Pictures,
+    in_overlap,
+    of_one_size,
+    partners,
+    wrapped_deg,
+)
 from benchmarks.keypoints.detectors import DETECTORS, MOST, detect_sift
 from benchmarks.keypoints.figures import Asked
-from benchmarks.keypoints.pictures import Picture, Pictures
 from benchmarks.peers.base import Options
-from benchmarks.peers.keynet import on_patches, orinet
+from benchmarks.peers.kornia_peers import on_patches, orinet
 from benchmarks.tables import Row
 
 WITHIN_DEG = (5.0, 10.0, 20.0, 45.0)

@@ -10,8 +10,17 @@ import numpy as np
 from aeromatch_cli.evaluate import PairScore
 from aeromatch_cli.evaluate.metrics import auc
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES, class_of
-from benchmarks.methods.goal_tables import goals_table, noise_table, shadow_table, strategies_table
-from benchmarks.methods.goals import ENOUGH_CORRECT, EXACT, NOISY, Comparison, noisy_label
+from benchmarks.methods.goals import (
+    ENOUGH_CORRECT,
+    EXACT,
+    NOISY,
+    Comparison,
+    goals_table,
+    noise_table,
+    noisy_label,
+    shadow_table,
+    strategies_table,
+)
 from benchmarks.methods.oblique import oblique_table
 from benchmarks.methods.worker import Measured
 from benchmarks.peers.base import Options

@@ -2,7 +2,7 @@
 
 base      what a method is given and what it answers; pictures and weights of peers
 matching  nearest neighbours and MAGSAC++, as users of OpenCV and kornia call them
-opencv, colmap, aliked, keynet, superpoint   the peers; ground: any of them on rectified views
+opencv, colmap, kornia_peers, superpoint   the peers; ground: any of them on rectified views
 ours      a preset of this project
 table     name -> method
 """

@@ -9,11 +9,10 @@ from functools import partial
 
 from aeromatch_cli.config import Settings, load, parse_method, preset_names
 from aeromatch_cli.errors import ConfigError
-from benchmarks.peers.aliked import Aliked
 from benchmarks.peers.base import Method, Options, Scene
 from benchmarks.peers.colmap import Colmap
 from benchmarks.peers.ground import OnGround
-from benchmarks.peers.keynet import TFEAT, KeyNet
+from benchmarks.peers.kornia_peers import TFEAT, Aliked, KeyNet
 from benchmarks.peers.opencv import OpenCvAsift, OpenCvSift
 from benchmarks.peers.ours import Preset
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
-from benchmarks.polar import own
 from benchmarks.polar.blocks import BlockPair, block_pairs
 from benchmarks.polar.grounds import KnownPair, apart, differences, errors, ground, known_pair, turn_deg
-from benchmarks.polar.sift import RATIO, SiftPair, SiftResult
+from benchmarks.polar.sides import RATIO, PolarResult, SiftPair, SiftResult, registered
 from benchmarks.tables import Row
 
 TIE_POINTS = 1000
@@ -55,7 +54,7 @@ def known_rows(task: Task, pairs: int, with_sift: int) -> Iterator[Row]:
             pair = known_pair(source, task.size, np.random.default_rng([task.seed, _number(kind), number]))
             head = {"section": "known", "kind": kind, "pair": number, "size": _size(pair.first),
                     "overlap": pair.overlap, "valid": True}  # fmt: skip
-            found = own.registered(pair.first, pair.second, TIE_POINTS)
+            found = registered(pair.first, pair.second, TIE_POINTS)
             yield head | {"method": "polar"} | _of_polar(found) | _against_truth(found.matrix, found, pair)
             scales = ((1.0,) if number * count + index < with_sift else ()) + (_REDUCED,)
             for scale in scales:
@@ -68,7 +67,7 @@ def _size(picture: NDArray[np.uint8]) -> str:
     return f"{picture.shape[1]}x{picture.shape[0]}"
 
 
-def _of_polar(found: own.PolarResult) -> Row:
+def _of_polar(found: PolarResult) -> Row:
     proof = found.registration.evidence
     return {
         "seconds": round(found.seconds, 4), "seconds_tie_points": round(found.seconds_tie_points, 4),
@@ -84,7 +83,7 @@ def _of_sift(found: SiftResult) -> Row:
     }  # fmt: skip
 
 
-def _against_truth(matrix: FloatArray, found: own.PolarResult | SiftResult, pair: KnownPair) -> Row:
+def _against_truth(matrix: FloatArray, found: PolarResult | SiftResult, pair: KnownPair) -> Row:
     size = pair.first.shape[1], pair.first.shape[0]
     translation, rotation, scale = errors(matrix, pair.truth, size)
     off = np.linalg.norm(apply_homography(pair.truth, found.points0) - found.points1, axis=1)
@@ -121,7 +120,7 @@ def unknown_rows(task: Task, pairs: int) -> Iterator[Row]:
                 right = {"right": _registered(found, pair)}
                 yield head | {"method": f"sift {ratio}"} | _of_sift(found) | _judged(found, pair) | right
             for method, geometry in (("polar", None), ("polar, poses", pair.geometry)):
-                mine = own.registered(pair.first, pair.second, TIE_POINTS, geometry)
+                mine = registered(pair.first, pair.second, TIE_POINTS, geometry)
                 row = head | {"method": method} | _of_polar(mine) | _judged(mine, pair)
                 right = mine.registration.accepted and pair.right(mine.points0, mine.points1)
                 yield row | {"right": right} | (_against(mine, reference) if usable else {})
@@ -131,7 +130,7 @@ def _registered(found: SiftResult, pair: BlockPair) -> bool:
     return found.accepted and pair.right(found.points0[found.agree], found.points1[found.agree])
 
 
-def _judged(found: own.PolarResult | SiftResult, pair: BlockPair) -> Row:
+def _judged(found: PolarResult | SiftResult, pair: BlockPair) -> Row:
     score = pair.judged(found.points0, found.points1)
     return {
         "tie_points": score.kept, "tie_points_right": score.correct, "coverage": round(score.coverage, 4),
@@ -139,7 +138,7 @@ def _judged(found: own.PolarResult | SiftResult, pair: BlockPair) -> Row:
     }  # fmt: skip
 
 
-def _against(mine: own.PolarResult, reference: SiftResult) -> Row:
+def _against(mine: PolarResult, reference: SiftResult) -> Row:
     """Differences between both similarities over SIFT's verified matches; `translation_px` is how far it moves them.
 
     A similarity of tilted pictures depends on where they are looked at. Those of a RANSAC for similarities gather where
@@ -173,7 +172,7 @@ def honesty_rows(task: Task, negatives: int) -> Iterator[Row]:
             first, second = (np.where(picture > 40, 255, picture).astype(np.uint8) for picture in (first, second))
         elif what == "featureless":
             second = np.clip(128 + 2.0 * rng.standard_normal(second.shape), 0, 255).astype(np.uint8)
-        found = own.registered(first, second, 0)
+        found = registered(first, second, 0)
         head = {"section": "honesty", "method": "polar", "kind": what, "pair": number, "size": _size(first)}
         yield head | {"ground": kind, "valid": False, "tie_points": len(found.points0)} | _of_polar(found)
 
