@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lightglue_training.blocks import Pair, block_pairs
-from lightglue_training.data import pictures as pictures_of
-from lightglue_training.data import read_block, read_groups, write_block, write_groups
-from lightglue_training.validation import LIKE_DEG, LIKE_OCTAVES, Found, answered, judged, recalls, together
-from training_blocks import render
-from training_runs import check_recipe
+from trainings.blocks import render
+from trainings.lightglue.blocks import Pair, block_pairs
+from trainings.lightglue.data import pictures as pictures_of
+from trainings.lightglue.data import read_block, read_groups, write_block, write_groups
+from trainings.lightglue.validation import LIKE_DEG, LIKE_OCTAVES, Found, answered, judged, recalls, together
+from trainings.runs import check_recipe
 
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue import LightGlue
