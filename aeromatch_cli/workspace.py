@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from aeromatch_cli.errors import ConfigError, WorkspaceError
-from aeromatch_cli.formats import readable
+from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.strategies import Strategy
 
 FORMAT_VERSION = 1

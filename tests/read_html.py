@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
+from xml.etree import ElementTree
 
 VOID = {"meta", "input", "link", "br", "hr", "img"}
 
@@ -44,3 +46,16 @@ class Structure(HTMLParser):
 
     def words(self) -> str:
         return " ".join(" ".join(self.text).split())
+
+
+def shapes(svg: str, css: str) -> list[tuple[str, list[float]]]:
+    """(tooltip, coordinates) of every path, and of every use of a marker, in the groups of one CSS class."""
+    found = []
+    for group in ElementTree.fromstring(svg).iter("g"):
+        if group.get("class") == css:
+            markers = {path for defs in group.iter("defs") for path in defs.iter("path")}
+            for shape in (s for s in group.iter() if s.tag in ("path", "use") and s not in markers):
+                text = shape.get("d") or f"{shape.attrib['x']} {shape.attrib['y']}"
+                numbers = [float(number) for number in re.findall(r"-?\d+\.?\d*", text)]
+                found.append((shape.findtext("title") or "", numbers))
+    return found

@@ -1,4 +1,4 @@
-"""Pairs that ask the network together: the same matches as one by one, and nothing lost where something fails."""
+"""Pairs that run the network together: the same matches as one by one, and nothing lost where something fails."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from make_lightglue import SIFT, features, seeded_tensors, write
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats import read_match_row, write_features
+from aeromatch_cli.formats.features import write_features
+from aeromatch_cli.formats.rows import read_match_row
 from aeromatch_cli.nets import lightglue_batch
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
-from aeromatch_cli.strategies.matchers.lightglue import inference
-from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue, inference
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
@@ -47,7 +47,7 @@ PAIRS = [task(name) for name in ("same", "moved", "many", "few")]
 
 
 def sides(pair: PairTask) -> tuple[Features, Features]:
-    """`many` is settled by the ratio test; the others ask."""
+    """`many` has enough matches by the ratio test; the others use the network."""
     if pair.image_id1 == "many":
         return features(400), features(400)
     if pair.image_id1 == "few":
@@ -67,7 +67,7 @@ def test_together_they_find_what_each_finds_alone(
 ) -> None:
     monkeypatch.setattr(batches, "_BATCH_PAIRS", most)
     asked: list[int] = []
-    plain = LightGlue.answers
+    plain = LightGlue.run_network
 
     def spy(self: LightGlue, questions: Sequence[Any]) -> Any:
         asked.append(len(questions))
@@ -144,7 +144,7 @@ def test_batches_on_a_gpu_answer_in_the_order_of_the_questions(
 
 
 def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: Path) -> None:
-    """A row of the match stage, its pairs asked together and one by one, is the same file."""
+    """A row of the match stage, its pairs run together and one by one, is the same file."""
     names = ("a", *(pair.image_id1 for pair in PAIRS))
     rows = []
     for kind in (matcher, LightGlue(**{**matcher.model_dump(), "name": "lightglue"})):

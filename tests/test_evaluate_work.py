@@ -19,7 +19,8 @@ from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
 from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.evaluate.work import Evaluation
-from aeromatch_cli.formats import read_features, read_verified_row, write_features, write_verified_row
+from aeromatch_cli.formats.features import read_features, write_features
+from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
 
 
 @pytest.fixture(scope="module")

@@ -15,28 +15,27 @@ from make_features import random_features
 
 from aeromatch_cli.data import Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.formats import (
+from aeromatch_cli.formats.features import features_fingerprint, read_features, read_keypoints, write_features
+from aeromatch_cli.formats.rows import (
     MatchEntry,
     VerifiedEntry,
+    read_match_row,
+    read_verified_row,
+    row_fingerprints,
+    write_match_row,
+    write_verified_row,
+)
+from aeromatch_cli.formats.tables import (
     cameras_text,
     csv_text,
-    features_fingerprint,
     images_text,
     pairs_text,
     poses_text,
     read_cameras,
     read_csv,
-    read_features,
     read_images,
-    read_keypoints,
-    read_match_row,
     read_pairs,
     read_poses,
-    read_verified_row,
-    row_fingerprints,
-    write_features,
-    write_match_row,
-    write_verified_row,
 )
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)

@@ -9,7 +9,7 @@ from conftest import QUICK, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config.text import default_yaml
-from aeromatch_cli.formats import read_features
+from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.workspace import read_json
 
 BESIDE = ("--set", "enhance=clahe", "--set", "enhance.keep_source=true")

@@ -262,14 +262,14 @@ def test_what_the_network_is_given(weights: str, monkeypatch: pytest.MonkeyPatch
     assert (first.places.dtype, first.descriptors.dtype) == (torch.float32, torch.float32)
 
 
-@pytest.mark.parametrize(("count", "asked"), [(400, False), (200, True)])
-def test_the_network_is_asked_where_the_ratio_test_leaves_few(
-    weights: str, monkeypatch: pytest.MonkeyPatch, count: int, comparison: bool
+@pytest.mark.parametrize(("count", "runs"), [(400, False), (200, True)])
+def test_the_network_runs_where_the_ratio_test_leaves_few(
+    weights: str, monkeypatch: pytest.MonkeyPatch, count: int, runs: bool
 ) -> None:
     recorder = Answers()
     stand_in(monkeypatch, recorder)
     matches = LightGlue(weights=weights)(features(count), noisy(features(count), 2.0), GEOMETRY)
-    assert bool(recorder.given) == comparison
+    assert bool(recorder.given) == runs
     # The ratio test's stay where the network finds nothing.
     assert len(matches.indices) == pytest.approx(count, rel=0.05)
 

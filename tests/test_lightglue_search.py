@@ -16,9 +16,9 @@ from aeromatch_cli.nets.lightglue import LightGlue as Network
 from aeromatch_cli.nets.lightglue import Side, log_assignment, mutual_best
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined
 from aeromatch_cli.strategies.matchers.descriptors.search import finished
-from aeromatch_cli.strategies.matchers.lightglue import matcher as lightglue
 from aeromatch_cli.strategies.matchers.lightglue.inference import FRAME_PX
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
+from aeromatch_cli.strategies.matchers.lightglue.matcher import matcher as lightglue
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
@@ -39,7 +39,7 @@ def test_what_is_left_of_a_view_gets_a_frame_of_its_own(monkeypatch: pytest.Monk
     network, comparison = Answers((0.9, 0.8)), asked_of()
     stand_in(monkeypatch, network)
     shown = comparison.features0.keypoints_px[:, 0] > 400, np.ones(40, bool)
-    found = finished(LightGlue().by_network(comparison, shown), LightGlue().answers)
+    found = finished(LightGlue().by_network(comparison, shown), LightGlue().run_network)
     side0, side1, _ = network.given[0]
     rows = np.flatnonzero(shown[0])
     assert 5 < len(rows) < 35
@@ -55,7 +55,7 @@ def test_what_is_left_of_a_view_gets_a_frame_of_its_own(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("overlap", [True, False])
-def test_only_the_overlap_goes_in_where_asked(monkeypatch: pytest.MonkeyPatch, overlap: bool) -> None:
+def test_only_the_overlap_goes_in_where_wanted(monkeypatch: pytest.MonkeyPatch, overlap: bool) -> None:
     network, comparison = Answers(), asked_of()
     stand_in(monkeypatch, network)
     half = np.arange(40) < 20

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from conftest import invoke
 
-from aeromatch_cli import formats
+from aeromatch_cli.formats.rows import read_verified_row
+from aeromatch_cli.formats.tables import read_pairs
 from aeromatch_cli.synthetic import render_block
 
 MAX_IMAGE_ID = 2147483647
@@ -39,10 +40,10 @@ def test_every_pair_that_shares_enough_is_verified(work: Path, grass: Path) -> N
     assert figures["correctness"] > 0.995
     assert figures["median_error_px"] < 0.15
     assert figures["coverage"] > 0.8
-    pairs = {(pair.image_id0, pair.image_id1): pair.overlap for pair in formats.read_pairs(work / "pairs.csv")}
+    pairs = {(pair.image_id0, pair.image_id1): pair.overlap for pair in read_pairs(work / "pairs.csv")}
     states = {}
     for path in (work / "verified").iterdir():
-        for image_id1, entry in formats.read_verified_row(path).items():
+        for image_id1, entry in read_verified_row(path).items():
             states[path.stem, image_id1] = entry.verdict
             assert entry.matches.sigmas_px is not None
             assert ((entry.matches.sigmas_px > 0.0) & (entry.matches.sigmas_px <= 0.5)).all()

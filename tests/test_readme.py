@@ -1,18 +1,21 @@
-"""The README names every command, exit code and dependency that there is."""
+"""The pages name every command, exit code and dependency that there is; the README stays short."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 import typer
+from read_pages import PAGES, ROOT, text_of
 
 from aeromatch_cli.cli import app, weights_app
+from aeromatch_cli.cli.output import EXIT_INTERRUPTED, EXIT_SOME_FAILED
+from aeromatch_cli.errors import AeromatchError, ConfigError
 
-ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = text_of(ROOT / "README.md")
+ROWS = [line for page in PAGES for line in text_of(page).splitlines() if line.startswith("|")]
+MOST_LINES, MOST_LINES_OF_A_PARAGRAPH = 200, 5
 
 
 def commands(application: typer.Typer) -> list[str]:
@@ -22,19 +25,32 @@ def commands(application: typer.Typer) -> list[str]:
 
 
 @pytest.mark.parametrize("name", [*commands(app), *commands(weights_app)])
-def test_every_command_stands_in_the_table(name: str) -> None:
-    table = [line for line in README.splitlines() if line.startswith("| `aeromatch")]
+def test_every_command_stands_in_a_table(name: str) -> None:
+    table = [line for line in ROWS if line.startswith("| `aeromatch")]
     assert any(re.search(rf"[` ]{name}\b", line) for line in table)
+
+
+@pytest.mark.parametrize(
+    "code", [0, EXIT_SOME_FAILED, ConfigError.exit_code, AeromatchError.exit_code, EXIT_INTERRUPTED]
+)
+def test_every_exit_code_stands_in_a_table(code: int) -> None:
+    assert any(re.match(rf"\| {code} \| \w", line) for line in ROWS)
 
 
 def test_every_dependency_has_its_reason() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {re.match(r"[A-Za-z0-9_-]+", text)[0].lower() for text in project["dependencies"]}  # type: ignore[index]
-    reasons = README.partition("## Dependencies")[2].lower()
-    assert names == {name for name in names if re.search(rf"\b{re.escape(name)}\b", reasons)}
+    section = README.partition("## Dependencies")[2].partition("\n## ")[0].lower()
+    reasons = dict(re.findall(r"(?m)^\| ([^|]+) \| ([^|]+) \|$", section))
+    named = {name.strip() for cell in reasons for name in cell.split(",")} - {"package"}
+    assert names == named
+    assert all(len(reason.split()) > 1 for cell, reason in reasons.items() if cell not in ("package", "numpy"))
 
 
-def test_links_lead_to_files() -> None:
-    targets = re.findall(r"\]\(([^)#]+)\)", README)
-    assert targets
-    assert [target for target in targets if not (ROOT / target).exists()] == []
+def test_the_readme_is_short() -> None:
+    lines = README.splitlines()
+    assert len(lines) <= MOST_LINES
+    # Tables, code and headings are no paragraphs.
+    prose = ["" if re.match(r"\||#| {4}|!\[", line) else line for line in lines]
+    paragraphs = re.split(r"\n\s*\n", "\n".join(prose))
+    assert max(len(part.strip().splitlines()) for part in paragraphs) <= MOST_LINES_OF_A_PARAGRAPH

@@ -12,7 +12,7 @@ from conftest import IMAGES, WIDTH
 from aeromatch_cli.config import validate
 from aeromatch_cli.data import Block, Camera, Features, FloatArray, Image
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import read_features
+from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract, ground
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import Workspace

@@ -5,21 +5,24 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from markupsafe import escape
 from PIL import Image as PilImage
-from read_html import Structure
+from read_html import Structure, shapes
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import MatchEntry, VerifiedEntry, write_features, write_match_row, write_verified_row
-from aeromatch_cli.stages import report
+from aeromatch_cli.formats.features import write_features
+from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
+from aeromatch_cli.report import page as report
+from aeromatch_cli.report.previews import chosen_previews
+from aeromatch_cli.report.rows import ImageRow, PairRow, gather, stage_rows
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.report_rows import ImageRow, PairRow, gather, stage_rows
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace, write_atomically, write_json
 
@@ -212,11 +215,32 @@ def test_page_escapes_names_and_needs_no_network(full):
     assert NASTY in structure.words()
     assert "<img" not in page
     assert "onerror=alert(1)>" not in page
-    assert not re.search(r"https?://", page.replace("http://www.w3.org/2000/svg", ""))
+    assert not re.search(r"https?://|url\((?!#)|@import", page)
     for _, key, value in structure.attributes:
         assert not key.startswith("on")
-        if key in ("src", "href"):
+        if key in ("src", "srcset", "data", "action") or key.endswith("href"):
             assert value.startswith(("data:image/jpeg;base64,", "#", "../../images/"))
+
+
+def test_every_figure_of_the_page_is_well_formed_and_the_map_shows_the_poses(full):
+    figures = re.findall(r"<svg.*?</svg>", page_of(full), re.S)
+    for svg in figures:
+        assert ElementTree.fromstring(svg).get("viewBox")
+    (block_map,) = (svg for svg in figures if 'aria-label="Block map"' in svg)
+    cameras = [shape for kind in ("fine", "weak", "ignored") for shape in shapes(block_map, kind)]
+    assert [title for title, _ in cameras] == [
+        "a.png: 60 verified matches in 1 of 3 pairs, z 100.0 m",
+        "b.jpg: 80 verified matches in 2 of 2 pairs, z 100.0 m",
+        "sub/d.png: 0 verified matches in 0 of 2 pairs, z 100.0 m",
+        f"{NASTY}: 20 verified matches in 1 of 3 pairs, z 100.0 m",
+    ]
+    a, b, d, c = np.array([place for _, place in cameras])
+    # 40 m to the east and 10 m to the north from each camera to the next.
+    np.testing.assert_allclose([c - b, d - c], [b - a] * 2, atol=0.11)
+    assert -(d - a)[1] == pytest.approx((d - a)[0] / 4, abs=0.1)
+    ((title, line),) = shapes(block_map, "rejected")
+    assert title == f"a.png – {NASTY}: rejected: 8 inliers of 12 matches"
+    np.testing.assert_allclose(np.reshape(line, (2, 2)), [a, c], atol=0.11)
 
 
 def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):
@@ -237,7 +261,7 @@ def test_previews_are_best_worst_and_rejected_and_missing_files_are_noted(full):
 
 def test_preview_of_many_pairs_takes_the_median():
     rows = [pair_row(i, "verified", matches=10 * i) for i in range(1, 10)]
-    chosen = report.chosen_previews(rows)
+    chosen = chosen_previews(rows)
     assert [(heading, row.verified) for heading, row in chosen] == [
         ("Best verified pair", 90),
         ("Median verified pair", 50),
@@ -279,7 +303,8 @@ def test_page_of_positions_only_and_of_one_image(tmp_path):
     alone = replace(alone, block=replace(alone.block, images=alone.block.images[:1]))
     page = page_of(alone)
     Structure.of(page)
-    assert page.count('<circle class="weak"') == 2  # the camera and the legend
+    (block_map,) = re.findall(r'<svg[^>]*aria-label="Block map".*?</svg>', page, re.S)
+    assert len(shapes(block_map, "weak")) == 1
 
 
 def test_shards_are_summed_per_stage(tmp_path):

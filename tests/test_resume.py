@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site, contents, heed_interrupts
 
-from aeromatch_cli.formats import row_fingerprints
+from aeromatch_cli.formats.rows import row_fingerprints
 from aeromatch_cli.workspace import Workspace
 
 PAIRS = IMAGES * (IMAGES - 1) // 2

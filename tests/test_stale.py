@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site, invoke
 
-from aeromatch_cli.formats import read_pairs
+from aeromatch_cli.formats.tables import read_pairs
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import context
 from aeromatch_cli.workspace import Workspace, read_json

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aeromatch_cli.data import Camera, Matches, Pair, Verdict
-from aeromatch_cli.formats import VerifiedEntry
+from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.stages.tracks import MatchedPair, tracks_of
 
 CAMERA = Camera("PINHOLE", 1000, 1000, (1000.0, 1000.0, 499.5, 499.5))

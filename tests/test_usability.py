@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import IMAGES
 from make_images import write_image
+from read_html import shapes
 from read_inputs import read_inputs
 
 from aeromatch_cli import __version__
@@ -24,7 +25,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.nets.files import shipped_path
-from aeromatch_cli.stages import report_map
+from aeromatch_cli.report import map as report_map
 from aeromatch_cli.strategies.extractors.sift import Sift
 
 # --- log file -----------------------------------------------------------------------------------------------------
@@ -227,9 +228,9 @@ def placed(footprint_m: float) -> float:
     stations = [report_map.Station(str(k), str(k), "", 20.0 * k, 20.0 * k) for k in range(6)]
     square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * footprint_m
     svg = report_map.block_map(stations, [square + np.array([s.x_m, s.y_m]) for s in stations], []).svg
-    frame = re.search(r'<rect x="[\d.]+" y="[\d.]+" width="[\d.]+" height="([\d.]+)"', svg)
+    frame = re.search(r'<clipPath.*?<rect[^>]* height="([\d.]+)"', svg, re.S)
     assert frame is not None
-    ys = [float(y) for y in re.findall(r'cy="([\d.]+)"', svg)]
+    ys = [place[1] for _, place in shapes(svg, "fine")]
     return (max(ys) - min(ys)) / float(frame[1])
 
 
@@ -240,11 +241,12 @@ def test_map_shows_whole_footprints_up_to_five_times_the_cameras():
 
 
 def test_labels_on_the_map_do_not_cover_each_other():
-    stations = [report_map.Station(str(k), f"label{k}", "", 0.001 * k, 0.0, weak=k == 3) for k in range(5)]
+    stations = [
+        report_map.Station(str(k), f"label{k}", "", 0.001 * k, 0.0, "weak" if k == 3 else "fine") for k in range(5)
+    ]
     stations.append(report_map.Station("far", "far", "", 100.0, 100.0))
     svg = report_map.block_map(stations, [], []).svg
-    texts = svg.split('<g class="stations">')[1].split("</g>")[0]
-    assert re.findall(r">([^<]+)</text>", texts) == ["label3", "far"]
+    assert re.findall(r'<g class="label">\s*<text[^>]*>([^<]+)</text>', svg) == ["label3", "far"]
 
 
 def test_memory_estimate_counts_the_largest_view(site):

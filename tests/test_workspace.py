@@ -20,7 +20,7 @@ from pydantic import Field
 from aeromatch_cli.config import FAMILIES
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import BrokenFileError, ConfigError, WorkspaceError
-from aeromatch_cli.formats import write_features
+from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import (
     FORMAT_VERSION,

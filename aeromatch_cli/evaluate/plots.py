@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,36 +9,19 @@ import numpy as np
 
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.evaluate.totals import PairRow, by_condition
+from aeromatch_cli.report.figures import COLOURS, new_axes, png
 
-_SIZE_INCHES, _DPI = (6.4, 3.8), 110
-_BLUE, _ORANGE, _GRAY = "#2b6ca3", "#d9822b", "#8a8f98"
+_BLUE, _ORANGE, _GRAY = COLOURS["accent"], COLOURS["second"], COLOURS["soft"]
 _ERROR_RANGE_PX = (0.01, 1000.0)
 
 
-def _figure() -> tuple[Any, Any]:
-    """A figure without a window, and its axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_SIZE_INCHES, dpi=_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(visible=True, color="#e4e6ea", linewidth=0.8)
-    axes.set_axisbelow(True)
-    return figure, axes
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    # No date and no version inside: equal evaluations give equal files.
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+def _axes() -> Any:
+    return new_axes(6.4, 3.8, dpi=110)
 
 
 def draw_errors(rows: Sequence[PairRow]) -> bytes:
     """Histogram of the errors of all kept matches and their cumulative share, over a logarithmic axis."""
-    figure, axes = _figure()
+    axes = _axes()
     errors = np.concatenate([np.zeros(0), *(row.score.errors_px for row in rows)])
     kept, known = len(errors), np.sort(errors[np.isfinite(errors)])
     low, high = _ERROR_RANGE_PX
@@ -52,13 +34,15 @@ def draw_errors(rows: Sequence[PairRow]) -> bytes:
         share.step(np.clip(known, low, high), 100.0 * np.arange(1, len(known) + 1) / kept, where="post", color=_ORANGE)
     share.set(ylim=(0.0, 102.0), ylabel="share of kept matches, %")
     share.spines["top"].set_visible(False)
+    share.tick_params(colors=_GRAY)
+    share.yaxis.label.set_color(_GRAY)
     axes.set_title(f"Error of {kept} kept matches (dashed: {CORRECT_PX:g} px, the limit of a correct one)", fontsize=10)
-    return _png(figure)
+    return png(axes.figure)
 
 
 def draw_view_angles(rows: Sequence[PairRow]) -> bytes:
     """Correctness and recall by class of view angle."""
-    figure, axes = _figure()
+    axes = _axes()
     classes = [(name, figures) for condition, name, figures in by_condition(rows) if condition == "view angle"]
     places = np.arange(len(classes))
     for shift, metric, colour in ((-0.2, "correctness", _BLUE), (0.2, "recall", _ORANGE)):
@@ -72,12 +56,12 @@ def draw_view_angles(rows: Sequence[PairRow]) -> bytes:
     axes.set(ylim=(0.0, 109.0), xlabel="view angle, degrees", ylabel="%")
     axes.grid(visible=False, axis="x")
     axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-    return _png(figure)
+    return png(axes.figure)
 
 
 def draw_coverage(rows: Sequence[PairRow]) -> bytes:
     """Coverage by correct matches against the overlap, a dot per pair."""
-    figure, axes = _figure()
+    axes = _axes()
     hard = np.array([row.conditions.hard for row in rows], dtype=bool)
     overlap = 100.0 * np.array([row.conditions.overlap for row in rows])
     covered = 100.0 * np.array([row.score.coverage for row in rows])
@@ -85,7 +69,7 @@ def draw_coverage(rows: Sequence[PairRow]) -> bytes:
         axes.scatter(overlap[kind], covered[kind], s=16, color=colour, label=f"{label}: {kind.sum()} pairs", alpha=0.8)
     axes.set(xlim=(0.0, 102.0), ylim=(-2.0, 102.0), xlabel="overlap, %", ylabel="coverage by correct matches, %")
     axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-    return _png(figure)
+    return png(axes.figure)
 
 
 PLOTS: Mapping[str, Callable[[Sequence[PairRow]], bytes]] = {

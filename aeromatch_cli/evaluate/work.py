@@ -18,7 +18,9 @@ from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
-from aeromatch_cli.formats import VerifiedEntry, read_images, read_keypoints, read_pairs, read_verified_row
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
+from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.workspace import Workspace, file_digest
 

@@ -12,7 +12,8 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import MatchEntry, read_keypoints, read_match_row
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import outdated_pairs, pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Features, Image
-from aeromatch_cli.formats import features_fingerprint, write_features
+from aeromatch_cli.formats.features import features_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.stages import enhance, simulate

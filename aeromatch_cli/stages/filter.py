@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
-from aeromatch_cli.formats import (
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import (
     MatchEntry,
     VerifiedEntry,
-    read_keypoints,
     read_match_row,
     read_verified_row,
     row_fingerprints,

@@ -8,7 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
-from aeromatch_cli.formats import MatchEntry, read_features, read_match_row, row_fingerprints, write_match_row
+from aeromatch_cli.formats.features import read_features
+from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import extract, rows

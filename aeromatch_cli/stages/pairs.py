@@ -13,7 +13,7 @@ from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats import cameras_text, images_text, pairs_text, poses_text, read_pairs
+from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.stages.attitudes import without_ignored_attitudes
 from aeromatch_cli.stages.block import BlockRead, read_block
 from aeromatch_cli.stages.context import Context

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, IntArray, Matches, Pair
-from aeromatch_cli.formats import VerifiedEntry
+from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import fundamental, sampson_distance_px
 

@@ -22,6 +22,7 @@ TABLE: Mapping[str, tuple[str, str]] = {
     "rectification": ("benchmarks.rectification", "scale and rotation that remain between views of oblique pairs"),
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),
     "scenes": ("benchmarks.contact_sheet", "one picture of every rendered scene: .assets/scenes.jpg"),
+    "picture": ("benchmarks.picture", "the README's picture: one hard pair, SIFT beside a preset, by exact truth"),
     "pages": ("benchmarks.pages", "brings the first lines of docs/results up to date with the tables' stamps"),
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
 }

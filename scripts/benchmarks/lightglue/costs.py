@@ -16,7 +16,7 @@ from lightglue_training.batches import as_side
 from lightglue_training.blocks import Pair, prepared
 
 from aeromatch_cli.data import Features, PairGeometry
-from aeromatch_cli.formats import read_features
+from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_batch import match_batch
 from aeromatch_cli.nets.lightglue_file import load_lightglue

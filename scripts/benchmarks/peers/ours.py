@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Features, FloatArray, Pair
-from aeromatch_cli.formats import read_features
+from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.strategies.filters import apply_chain

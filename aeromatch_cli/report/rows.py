@@ -1,11 +1,16 @@
-"""Rows of the report's tables: one per pair, per image and per stage, gathered in one pass over the workspace."""
+"""What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
+
+Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
+`summary` and `warnings` of pairs and `rotation_contradicts_pose` of filter (page.py).
+"""
 
 from __future__ import annotations
 
+import base64
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +21,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.formats import VerifiedEntry, read_csv, read_keypoints
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import VerifiedEntry
+from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points, verified_pairs
 from aeromatch_cli.workspace import Workspace, read_json
@@ -85,6 +92,18 @@ class StageRow:
     skipped: int
     failed: int
     facts: str
+
+
+@dataclass(frozen=True)
+class EvaluationFigures:
+    """What `aeromatch evaluate` found. summary: (name, value). pictures: (name, data URI of a PNG).
+
+    outdated: matches were verified since.
+    """
+
+    summary: Sequence[tuple[str, str]]
+    pictures: Sequence[tuple[str, str]]
+    outdated: bool
 
 
 class _Coverage:
@@ -209,12 +228,9 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         report = read_json(path)
         groups.setdefault((str(report["stage"]), sharded), []).append(report)
 
-    def place(key: tuple[str, bool]) -> tuple[int, str, bool]:
-        name = key[0]
-        return (_STAGE_ORDER.index(name) if name in _STAGE_ORDER else len(_STAGE_ORDER), *key)
-
+    order = {name: place for place, name in enumerate(_STAGE_ORDER)}
     rows = []
-    for name, sharded in sorted(groups, key=place):
+    for name, sharded in sorted(groups, key=lambda key: (order.get(key[0], len(order)), key)):
         # The report stage is running now: what is on file of it is about an earlier page.
         if name == "report":
             continue
@@ -230,8 +246,8 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
 
 
 def _facts_words(facts: Mapping[str, Any]) -> str:
-    """The plain numbers and words among a stage's facts; what is nested has its own place on the page."""
-    plain = {key: value for key, value in facts.items() if isinstance(value, int | float | str)}
+    """The plain numbers and words among a stage's facts, without checksums; what is nested has its own place."""
+    plain = {k: value for k, value in facts.items() if isinstance(value, int | float | str) and "sha256" not in k}
     return ", ".join(f"{key.replace('_', ' ')} {_number(value)}" for key, value in plain.items())
 
 
@@ -248,3 +264,18 @@ def failure_rows(context: Context) -> list[dict[str, str]]:
         if all(image_id in images for image_id in ids):
             row["item"] = " – ".join(images[image_id].name for image_id in ids)
     return rows
+
+
+def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
+    """None where the workspace was never evaluated."""
+    stated = workspace.evaluation / "evaluation.json"
+    if not stated.is_file():
+        return None
+    pictures = []
+    for path in sorted(workspace.evaluation.glob("*.png")):
+        coded = base64.b64encode(path.read_bytes()).decode("ascii")
+        pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
+    filtered = workspace.stage_report("filter")
+    outdated = filtered.is_file() and filtered.stat().st_mtime > stated.stat().st_mtime
+    summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
+    return EvaluationFigures(summary, pictures, outdated)

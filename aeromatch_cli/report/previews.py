@@ -1,13 +1,12 @@
-"""Histograms and match previews of the report as inline SVG. Arrays in, markup out; no disk.
+"""Match previews of the report: two images side by side with their matches, as inline SVG upon JPEG.
 
-Colours are CSS classes of the page (e0-e3: small to large error). Every text that comes from outside is escaped here.
+Colours are CSS classes of the page (e0-e3: small to large error, e9: none known).
 """
 
 from __future__ import annotations
 
 import base64
 import io
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -17,78 +16,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.errors import ItemError, WorkspaceError
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.images.depth import to_gray8
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink
+from aeromatch_cli.report.figures import evenly_chosen
+from aeromatch_cli.report.rows import PairRow
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import match_points
 
+MAX_REJECTED_PREVIEWS = 2
 MAX_PREVIEW_LINES = 150
 MAX_PREVIEW_POINTS = 2000
 ERROR_LIMITS_PX = (0.5, 1.0, 2.0)
 
 _PREVIEW_SIDE_PX = 442
 _PREVIEW_GAP_PX = 12
-# (transpose, mirror x, mirror y) that turn the stored raster upright, by EXIF Orientation (TIFF 6.0, tag 274).
-_TURNS = {
-    1: (False, False, False),
-    2: (False, True, False),
-    3: (False, True, True),
-    4: (False, False, True),
-    5: (True, False, False),
-    6: (True, True, False),
-    7: (True, True, True),
-    8: (True, False, True),
-}
 
 
-def nice_step(span: float, count: int) -> float:
-    """The 1, 2 or 5 times a power of ten that divides `span` into about `count` parts."""
-    raw = max(span, 1e-9) / max(count, 1)
-    power = 10.0 ** math.floor(math.log10(raw))
-    return next((m * power for m in (1.0, 2.0, 5.0) if m * power >= raw * 0.999), 10.0 * power)
+@dataclass(frozen=True)
+class Preview:
+    """A pair as a picture, with its caption. svg: "" where it could not be made, then `note` says why."""
+
+    heading: str
+    pair: PairRow
+    svg: str
+    note: str
 
 
-def evenly_chosen(count: int, limit: int) -> IntArray:
-    """At most `limit` of the indices 0 .. count-1, evenly spaced, ends included."""
-    if count <= limit:
-        return np.arange(count)
-    return np.unique(np.rint(np.linspace(0, count - 1, limit)).astype(np.int64))
+def chosen_previews(pairs: Sequence[PairRow]) -> list[tuple[str, PairRow]]:
+    """Best, median and worst verified pair by matches, and the rejected pairs that had most matches."""
+    verified = sorted((row for row in pairs if row.state == "verified"), key=lambda row: row.verified)
+    chosen: dict[int, str] = {}
+    if verified:
+        for index, words in ((len(verified) - 1, "Best"), (len(verified) // 2, "Median"), (0, "Worst")):
+            chosen.setdefault(index, f"{words} verified pair")
+    result = [(heading, verified[index]) for index, heading in chosen.items()]
+    rejected = sorted((row for row in pairs if row.state == "rejected"), key=lambda row: -row.matches_in)
+    return result + [("Rejected pair", row) for row in rejected[:MAX_REJECTED_PREVIEWS]]
 
 
-# --- histograms -------------------------------------------------------------------------------------------------
+def previews(context: Context, pairs: Sequence[PairRow]) -> list[Preview]:
+    """Pictures of the chosen pairs."""
+    found = []
+    for heading, row in chosen_previews(pairs):
+        try:
+            svg, note = _preview(context, row), ""
+        except (ItemError, WorkspaceError) as error:
+            svg, note = "", f"no preview: {error}"
+        found.append(Preview(heading, row, svg, note))
+    return found
 
 
-def histogram(values: Sequence[float], label: str, unit: str) -> str:
-    """Bars over about 24 equal classes with a rounded width. values: counts, at least one of them."""
-    width, height, left, right, bottom, top = 540.0, 210.0, 44.0, 26.0, 40.0, 12.0
-    step = max(1.0, nice_step(max(max(values), 1.0), 24))
-    bins = int(max(values) // step) + 1
-    counts = np.bincount((np.asarray(values, dtype=np.float64) // step).astype(int), minlength=bins)
-    inner_width, inner_height = width - left - right, height - bottom - top
-    peak, bar = float(counts.max()), inner_width / bins
-    parts = [f'<svg class="histogram" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(label)}">']
-    y_step = max(1.0, nice_step(peak, 4))
-    for k in range(int(peak // y_step) + 1):
-        y = top + inner_height * (1 - k * y_step / peak)
-        parts.append(f'<path class="grid" d="M{left} {y:.1f}H{width - right:.1f}"/>')
-        parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{k * y_step:,.0f}</text>')
-    for index, count in enumerate(counts):
-        if count:
-            tall = inner_height * count / peak
-            words = f"{index * step:,.0f} to {(index + 1) * step - 1:,.0f}: {count:,} {unit}"
-            parts.append(
-                f'<rect class="bar" x="{left + index * bar + 0.5:.1f}" y="{top + inner_height - tall:.1f}" '
-                f'width="{max(bar - 1, 0.8):.1f}" height="{tall:.1f}"><title>{escape(words)}</title></rect>'
-            )
-    x_step = step * max(1, round(nice_step(bins * step, 6) / step))
-    for k in range(int(bins * step // x_step) + 1):
-        x = left + k * x_step / step * bar
-        parts.append(f'<text x="{x:.1f}" y="{height - 24:.0f}" text-anchor="middle">{k * x_step:,.0f}</text>')
-    parts.append(
-        f'<text x="{left + inner_width / 2:.0f}" y="{height - 6:.0f}" text-anchor="middle">{escape(label)}</text>'
-    )
-    return "".join([*parts, "</svg>"])
-
-
-# --- previews ---------------------------------------------------------------------------------------------------
+def _preview(context: Context, row: PairRow) -> str:
+    """Verified matches with their errors, or, of a rejected pair, the matches before verification."""
+    workspace, ids = context.workspace, (row.image_id0, row.image_id1)
+    entry: VerifiedEntry | MatchEntry | None
+    if row.state == "verified":
+        path = workspace.verified(ids[0])
+        entry = judged = read_verified_row(path).get(ids[1])
+        errors = judged.verdict.errors_px if judged else None
+    else:
+        path = workspace.matches(ids[0])
+        entry, errors = read_match_row(path).get(ids[1]), None
+    if entry is None:
+        raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
+    points = match_points(entry.matches, *(read_keypoints(workspace.features(i))[0] for i in ids))
+    sides = []
+    for image_id, points_px in zip(ids, points, strict=True):
+        image = context.image_by_id[image_id]
+        pixels = read_pixels(context.image_path(image), colour=True)
+        sides.append(Side(pixels, image.exif_orientation, points_px))
+    return preview(sides[0], sides[1], errors, f"Matches of {row.name0} and {row.name1}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +101,14 @@ class Side:
     points_px: FloatArray
 
 
+def _turn(exif_orientation: int) -> tuple[bool, bool, bool]:
+    """Transpose, mirror x, mirror y: what turns the stored raster upright (EXIF Orientation: TIFF 6.0, tag 274)."""
+    return exif_orientation in (5, 6, 7, 8), exif_orientation in (2, 3, 6, 7), exif_orientation in (3, 4, 7, 8)
+
+
 def turned(pixels: NDArray[Any], exif_orientation: int) -> NDArray[Any]:
     """The stored raster as a viewer shows it."""
-    transpose, mirror_x, mirror_y = _TURNS.get(exif_orientation, _TURNS[1])
+    transpose, mirror_x, mirror_y = _turn(exif_orientation)
     if transpose:
         pixels = np.swapaxes(pixels, 0, 1)
     return pixels[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]
@@ -110,7 +116,7 @@ def turned(pixels: NDArray[Any], exif_orientation: int) -> NDArray[Any]:
 
 def turned_points(points_px: FloatArray, width_px: int, height_px: int, exif_orientation: int) -> FloatArray:
     """Where stored pixels (N, 2) of a width_px x height_px raster lie after `turned`."""
-    transpose, mirror_x, mirror_y = _TURNS.get(exif_orientation, _TURNS[1])
+    transpose, mirror_x, mirror_y = _turn(exif_orientation)
     x, y = np.asarray(points_px, dtype=np.float64).T
     if transpose:
         x, y, width_px, height_px = y, x, height_px, width_px
@@ -124,7 +130,8 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
     offset = size0[0] + _PREVIEW_GAP_PX
     width, height = offset + size1[0], max(size0[1], size1[1])
     points1 = points1 + np.array([float(offset), 0.0])
-    classes = _error_classes(errors_px, len(points0))
+    errors = np.full(len(points0), np.nan) if errors_px is None else errors_px
+    classes = np.where(np.isnan(errors), 9, np.searchsorted(ERROR_LIMITS_PX, errors))
     chosen = _spread(points0, MAX_PREVIEW_LINES)
     dots = _spread(points0, MAX_PREVIEW_POINTS)
     parts = [
@@ -133,21 +140,15 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
         f'<image href="{uri0}" x="0" y="0" width="{size0[0]}" height="{size0[1]}"/>',
         f'<image href="{uri1}" x="{offset}" y="0" width="{size1[0]}" height="{size1[1]}"/>',
     ]
-    for name in sorted(set(classes)):
-        lines = "".join(f"M{_xy(points0[i])}L{_xy(points1[i])}" for i in chosen if classes[i] == name)
-        spots = "".join(f"M{_xy(points0[i])}h0M{_xy(points1[i])}h0" for i in dots if classes[i] == name)
-        parts.append(f'<path class="tie {name}" d="{lines}"/><path class="spot {name}" d="{spots}"/>')
+    for k in np.unique(classes):
+        lines = "".join(f"M{_xy(points0[i])}L{_xy(points1[i])}" for i in chosen if classes[i] == k)
+        spots = "".join(f"M{_xy(points0[i])}h0M{_xy(points1[i])}h0" for i in dots if classes[i] == k)
+        parts.append(f'<path class="tie e{k}" d="{lines}"/><path class="spot e{k}" d="{spots}"/>')
     return "".join([*parts, "</svg>"])
 
 
 def _xy(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
-
-
-def _error_classes(errors_px: FloatArray | None, count: int) -> list[str]:
-    if errors_px is None:
-        return ["e9"] * count
-    return ["e9" if math.isnan(e) else f"e{sum(e > limit for limit in ERROR_LIMITS_PX)}" for e in errors_px]
 
 
 def _upright(side: Side) -> tuple[str, tuple[int, int], FloatArray]:

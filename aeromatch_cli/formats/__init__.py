@@ -1,0 +1,156 @@
+r"""# The workspace
+
+Every file of a workspace, format version 1. Text is UTF-8. CSV files have a header row and comma separators; an empty
+cell means unknown. Numbers are written with full float64 precision. `.npz` files are uncompressed NumPy archives
+without
+Python objects.
+
+- Pixels are (x, y); (0, 0) is the centre of the top-left pixel of the stored raster, whatever its EXIF Orientation.
+- Metres are in the world frame: the CRS of `block.json` minus its `origin_m`. x is east, y north, z up.
+- Poses are `cam_from_world`: the camera has x right, y down, z forward.
+- Files appear under their name complete or not at all. A fingerprint is a SHA-256 of all settings and inputs that a
+  result depends on; a result is up to date where it is present with an equal fingerprint.
+
+## The block
+
+### config.yaml
+
+The resolved configuration, every default included. `aeromatch run WORK/config.yaml` repeats the run.
+
+### block.json
+
+- `format_version`: 1.
+- `crs`: code of the CRS, or `local`. `origin_m`: [x, y, z] that is subtracted from it.
+- `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
+- `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
+- `ground_fingerprint`: of the settings that ground and GSD come from. `basis`: fingerprint of every image at that time.
+
+### images.csv
+
+One line per image: `image_id` (unique slug of the relative path), `name` (relative path), `width_px`, `height_px`,
+`camera_id`, `exif_orientation`, `time` (ISO 8601), `fingerprint` of the file.
+
+### cameras.csv
+
+`camera_id`, `model` (COLMAP's name), `width_px`, `height_px`, `params`: separated by spaces, in COLMAP's order. cx and
+cy are in this workspace's pixel frame (COLMAP's minus 0.5).
+
+### poses.csv
+
+`image_id`; `x`, `y`, `z` of the projection centre, metres; `qw`, `qx`, `qy`, `qz` (`cam_from_world`, empty where the
+attitude is unknown or ignored); `sigma_position_m`, `sigma_angle_deg`: standard deviations.
+
+### pairs.csv
+
+`image_id0`, `image_id1` (id0 < id1), `overlap` (share of the smaller footprint, 0-1), `view_angle_deg`, `reason` (the
+rule that chose the pair).
+
+### ignored_attitudes.json
+
+Images whose attitude is not used because their matches contradict it.
+
+- `fingerprint`: of all that the judgement rests on. `settings`: fingerprint of the strategies.
+- `images`: image_id -> `angle_deg` (given attitude against the matches) and `facts` (fingerprint of the image and its
+  pose).
+- `isolated`: image_id -> facts, of images without verified pairs although poses predict overlap. They and the images
+  that they are paired with are also matched as source images.
+
+## Pictures
+
+### enhanced/<id>.png, <id>.mask.png, <id>.json
+
+The enhanced picture (kept by the single stage and with `--keep-images`); the mask (255 = treated); `fingerprint`,
+`picture` (whether the picture is kept) and the strategy's own facts. Images that are not enhanced have none.
+
+### simulated/<id>/views.json, <view>.png
+
+- `fingerprint`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views were made
+  of.
+- `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
+  Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
+  With `scale` < 1 the camera is the one resized by it.
+- `<view>.png`: gray picture of the view (kept by the single stage and with `--keep-images`).
+
+## Features and matches
+
+### features/<id>.npz
+
+K keypoints, D descriptors, V views. A keypoint may have several descriptors.
+
+- `fingerprint` () str
+- `keypoints_px` (K, 2) float32: stored raster, merged over views. `sizes_px` (K,) float32: diameter. `responses` (K,)
+  float32.
+- `descriptors` (D, C) uint8 (RootSIFT x 512, or the network's) or float32. `descriptor_keypoint_idx` (D,) int32.
+- `view_idx` (D,) int32. `view_keypoints_px` (D, 2) float32, `view_size_px` (D,) float32 and `view_orientation_deg` (D,)
+  float32: place, diameter and direction in the view's own frame.
+- `view_sizes_px` (V, 2) int32: width, height. `view_angles_deg` (V,) float32: angle to the optical axis.
+- `view_directions` (V, 3) float32: unit vectors in the world frame; `view_gsd_m` (V,) float32; NaN where unknown.
+- `view_enhanced` (V,) bool: whether the view shows the enhanced picture.
+- `colours` (K, 3) uint8: RGB around each keypoint; only with `extract.colours`.
+
+### matches/<id0>.npz
+
+One row: all P pairs of id0, concatenated. Pair p owns the entries `offsets[p]` to `offsets[p + 1]` of M matches.
+
+- `image_id1` (P,) str. `fingerprint` (P,) str. `offsets` (P + 1,) int64. `strategy` (P,) str: the matcher.
+- `indices` (M, 2) int32 into both keypoint lists; -1 for a point that was measured without a keypoint.
+- `scores` (M,) float32 in 0-1, larger is better. `view_pairs` (M, 2) int16: the views that were compared.
+- `points0_px`, `points1_px` (M, 2) float64: measured places; only where some index is -1.
+- `sigmas_px` (M,) float32: standard deviation of a measured place; only where a matcher states it.
+- `remark` (P,) str: why a matcher that registers pairs as a whole found nothing; only where one did.
+
+### verified/<id0>.npz
+
+The same row layout with the kept matches: `image_id1`, `fingerprint`, `offsets`, `indices`, `scores` and, where there
+are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
+
+- `errors_px` (M,) float32: error to the model, undistorted pixels; NaN where unknown.
+- `state` (P,) str: `verified`, `rejected` or `not verifiable`. `reason` (P,) str.
+- `model_kind` (P,) str: E, F, H or empty. `models` (P, 3, 3) float64: E on normalised rays, F and H on undistorted
+  pixels.
+- `rotations` (P, 3, 3) float64: cam1_from_cam0 of the model, NaN where it has none.
+- `matches_in` (P,) int64: matches before filtering. `rejected` (P,) str: JSON object, filter -> matches it dropped.
+
+## Reports and results
+
+### reports/<stage>.json, <stage>.i-of-n.json
+
+- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`.
+- `failures`: [[item, reason], ...].
+- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `ignored_attitudes`, `pairs_sha256`.
+- `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
+  `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
+  `images_without_keypoints`.
+- `facts` of match: `matches`. Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
+  `weakly_tied` (images with few verified matches), `rotation_contradicts_pose` (image_id -> degrees).
+- `facts` of export: exporter -> files and counts.
+
+### failures.csv
+
+`stage`, `item`, `reason`: every image or pair that failed.
+
+### report/index.html
+
+The page that a person looks at; one file that needs no network.
+
+### evaluation/
+
+Written by `aeromatch evaluate`: `evaluation.json` (`format_version`, `workspace`, `truth`, `truth_kind`, `images`,
+`left_out`, `min_overlap`, `totals`, `conditions`, `summary`, `consumer`, `seconds`; null where unknown), `pairs.csv`
+(one
+line per pair), `conditions.csv`, plots as PNG.
+
+### export/colmap/
+
+`database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
+0.5). `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin.
+"""
+
+
+def page() -> str:
+    """docs/workspace.md: this specification as Markdown."""
+    heading, _, rest = (__doc__ or "").partition("\n\n")
+    made = (
+        "This page is made from the specification in the code: `python -m aeromatch_cli.formats > docs/workspace.md`."
+    )
+    return f"{heading}\n\n{made}\n\n{rest}"

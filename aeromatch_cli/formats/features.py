@@ -1,0 +1,65 @@
+"""The workspace's feature files."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import (
+    Features,
+    FloatArray,
+)
+from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.formats.reading import readable
+
+_FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
+
+# What numpy and zipfile raise on contents that are no sound archive, or not the arrays that it should hold.
+ARCHIVE_FAULTS = (
+    KeyError,
+    IndexError,
+    ValueError,
+    TypeError,
+    EOFError,
+    RuntimeError,
+    struct.error,
+    zipfile.BadZipFile,
+)
+
+
+def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> None:
+    arrays: dict[str, Any] = {name: getattr(features, name) for name in _FEATURE_ARRAYS}
+    if features.colours is not None:
+        arrays["colours"] = features.colours
+    np.savez(stream, fingerprint=np.array(fingerprint), **arrays)
+
+
+def read_features(path: Path) -> Features:
+    """All arrays. Raises BrokenFileError when the file is missing or broken."""
+    return Features(**load_arrays(path, _FEATURE_ARRAYS, ("colours",)))
+
+
+def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8] | None]:
+    """keypoints_px (K, 2), sizes_px (K,) and colours (K, 3) or None; the rest stays on disk."""
+    arrays = load_arrays(path, ("keypoints_px", "sizes_px"), ("colours",))
+    return arrays["keypoints_px"], arrays["sizes_px"], arrays.get("colours")
+
+
+def features_fingerprint(path: Path) -> str | None:
+    """Fingerprint recorded in a feature file, None when the file is absent or broken."""
+    try:
+        return str(load_arrays(path, ("fingerprint",))["fingerprint"])
+    except BrokenFileError:
+        return None
+
+
+def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    with readable(path, *ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}

@@ -1,0 +1,24 @@
+"""What reading a file of the workspace may raise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from aeromatch_cli.errors import BrokenFileError, WorkspaceError
+
+
+@contextmanager
+def readable(path: Path, *faults: type[Exception]) -> Iterator[None]:
+    """Turn what reading a file of the workspace raises into BrokenFileError, or into WorkspaceError where the file
+    itself may be sound (permissions, a failing disk). faults: what broken contents raise.
+    """
+    try:
+        yield
+    except faults as error:
+        raise BrokenFileError(str(path), str(error) or type(error).__name__) from None
+    except FileNotFoundError as error:
+        raise BrokenFileError(str(path), error.strerror or "no such file") from None
+    except OSError as error:
+        raise WorkspaceError(f"cannot read {path}: {error.strerror or error}; check its permissions and disk") from None

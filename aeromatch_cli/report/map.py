@@ -1,0 +1,222 @@
+"""Block map of the report: footprints, pairs coloured by verified matches, cameras; with tooltips. No disk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.report.figures import COLOURS, evenly_chosen, new_axes, svg
+
+MAP_CLASSES = 6
+# Above this many pairs their lines lose the tooltips and are joined into one path per colour; above the second they are
+# thinned evenly, so that a block of any size stays a page that a browser can draw.
+MAX_TITLED_LINES = 3000
+MAX_LINES = 20000
+MAX_FOOTPRINTS = 3000
+MAX_LABELS = 60
+
+_WIDTH, _LEGEND_WIDTH, _AXES_HEIGHTS = 1000.0, 190.0, (330.0, 860.0)
+# Side of the frame over the extent of the cameras, and over the extent of what it shows.
+_LARGEST_FRAME = 5.0
+_AIR = 1.08
+_REJECTED: dict[str, Any] = {"color": COLOURS["bad"], "linewidth": 0.8, "linestyle": (0, (5, 4)), "alpha": 0.7}
+_UNJUDGED: dict[str, Any] = {"color": COLOURS["soft"], "linewidth": 0.8, "linestyle": (0, (1.5, 3)), "alpha": 0.7}
+_CAMERAS = {
+    "fine": ("image", {"facecolor": COLOURS["ink"], "edgecolor": COLOURS["panel"], "linewidth": 0.8}),
+    "weak": ("weakly tied image", {"facecolor": COLOURS["panel"], "edgecolor": COLOURS["bad"], "linewidth": 2.0}),
+    "ignored": ("ignored attitude", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
+}
+
+
+@dataclass(frozen=True)
+class Station:
+    """One camera on the map. title: tooltip. kind: fine, weak (few verified matches) or ignored (ignored attitude)."""
+
+    image_id: str
+    label: str
+    title: str
+    x_m: float
+    y_m: float
+    kind: str = "fine"
+
+
+@dataclass(frozen=True)
+class Link:
+    """One pair on the map. state: as in a Verdict, or "not judged"."""
+
+    image_id0: str
+    image_id1: str
+    state: str
+    verified: int
+    title: str
+
+
+@dataclass(frozen=True)
+class MapFigure:
+    """The map's SVG, and remarks on what is left out."""
+
+    svg: str
+    remarks: tuple[str, ...]
+
+
+def match_classes(counts: Iterable[int]) -> tuple[int, ...]:
+    """Lower limits of up to six classes of verified matches, geometrically spaced and rounded to 1, 2, 5 x 10^n."""
+    positive = [count for count in counts if count > 0]
+    if not positive:
+        return ()
+    low, high = min(positive), max(positive)
+    limits = {low}
+    for part in range(1, MAP_CLASSES):
+        value = low * (high / low) ** (part / MAP_CLASSES)
+        power = 10.0 ** math.floor(math.log10(value))
+        limits.add(round(min((1.0, 2.0, 5.0, 10.0), key=lambda m: abs(math.log(m * power / value))) * power))
+    return tuple(sorted(limit for limit in limits if low <= limit <= high))
+
+
+def class_of(count: int, limits: Sequence[int]) -> int:
+    """Colour class 0-5 of a count; with fewer than six classes they are spread over the whole scale."""
+    index = sum(count >= limit for limit in limits) - 1
+    return round(max(index, 0) * (MAP_CLASSES - 1) / max(len(limits) - 1, 1))
+
+
+def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], links: Sequence[Link]) -> MapFigure:
+    """Footprints, pairs and cameras in world metres. footprints: polygons (N, 2). At least one station."""
+    place = {s.image_id: (s.x_m, s.y_m) for s in stations}
+    placed = [link for link in links if link.image_id0 in place and link.image_id1 in place]
+    drawn = [placed[i] for i in evenly_chosen(len(placed), MAX_LINES)]
+    outlines = [footprints[i] for i in evenly_chosen(len(footprints), MAX_FOOTPRINTS)]
+    remarks = [
+        f"{len(shown):,} of {len(known):,} {words} are drawn, evenly chosen."
+        for shown, known, words in ((drawn, placed, "pair lines"), (outlines, footprints, "footprints"))
+        if len(shown) < len(known)
+    ]
+    if missing := len(links) - len(placed):
+        words = "1 pair has an image" if missing == 1 else f"{missing:,} pairs have images"
+        remarks.append(f"Not drawn: {words} without position.")
+    axes = _frame(stations, footprints)
+    _draw_footprints(axes, outlines)
+    limits = match_classes(link.verified for link in placed if link.state == "verified")
+    titles, handles = _draw_links(axes, place, drawn, limits)
+    diameter = 6.4 if len(stations) <= 200 else 3.6 if len(stations) <= 2000 else 2.1
+    for kind, (words, style) in _CAMERAS.items():
+        if members := [s for s in stations if s.kind == kind]:
+            places = np.array([place[s.image_id] for s in members])
+            area = diameter**2 * (1.0 if kind == "fine" else 2.0)
+            handles.append(axes.scatter(*places.T, area, label=words, gid=kind, zorder=4, **style))
+            titles[kind] = [s.title for s in members]
+    axes.figure.legend(
+        handles=handles, loc="outside right upper", alignment="left", frameon=False, title="Verified matches per pair"
+    )
+    _scale_equally(axes)
+    if len(stations) <= MAX_LABELS:
+        _draw_labels(axes, stations)
+    return MapFigure(svg(axes.figure, "Block map", "map", titles), tuple(remarks))
+
+
+def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any:
+    """Axes that show all cameras, and of the footprints what does not shrink the cameras to a dot, as views of the
+    horizon would."""
+    centers = np.array([[s.x_m, s.y_m] for s in stations])
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    if footprints:
+        corners = np.concatenate(list(footprints))
+        sizes = [float(np.ptp(polygon, axis=0).max()) for polygon in footprints]
+        # Of cameras close together, or only one, the footprints alone tell a size.
+        most = max((_LARGEST_FRAME / _AIR - 1.0) / 2.0 * float((high - low).max()), 0.15 * float(np.median(sizes)))
+        low = np.maximum(np.minimum(low, corners.min(axis=0)), low - most)
+        high = np.minimum(np.maximum(high, corners.max(axis=0)), high + most)
+    half = np.maximum(high - low, max(float((high - low).max()) * 0.02, 1.0)) * _AIR / 2
+    middle = (low + high) / 2
+    height = float(np.clip((_WIDTH - _LEGEND_WIDTH) * half[1] / half[0], *_AXES_HEIGHTS))
+    axes = new_axes(_WIDTH / 72, height / 72)
+    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
+    _show(axes, middle, half)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    arrow = {"arrowstyle": "-|>", "color": COLOURS["ink"]}
+    where = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "color": COLOURS["ink"]}
+    axes.annotate("N", (0.975, 0.985), (0.0, -38.0), arrowprops=arrow, zorder=5, **where)
+    return axes
+
+
+def _show(axes: Any, middle: FloatArray, half: FloatArray) -> None:
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+
+
+def _scale_equally(axes: Any) -> None:
+    """Settle where the axes stand, then let what is left of their width or height show more ground."""
+    axes.figure.draw_without_rendering()
+    axes.figure.set_layout_engine("none")
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
+
+
+def _draw_footprints(axes: Any, polygons: Sequence[FloatArray]) -> None:
+    """What is covered at all, and every outline."""
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    if polygons:
+        paths = Path.make_compound_path(*(Path(np.vstack([p, p[:1]]), closed=True) for p in polygons))
+        width, opacity = (0.8, 0.45) if len(polygons) <= 200 else (0.5, 0.16)
+        face, edge = to_rgba(COLOURS["accent"], 0.06), to_rgba(COLOURS["soft"], opacity)
+        axes.add_artist(PathPatch(paths, gid="footprints", facecolor=face, edgecolor=edge, linewidth=width, zorder=1))
+
+
+def _draw_links(
+    axes: Any, place: dict[str, tuple[float, float]], links: Sequence[Link], limits: Sequence[int]
+) -> tuple[dict[str, list[str]], list[Any]]:
+    """Pair lines, rejected ones lowest, then from many matches to few: thin lines stay visible upon thick ones.
+
+    Returns their tooltips by gid, and handles of the legend.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.lines import Line2D
+
+    # Many lines are drawn thinner, so that a dense block does not become one blot.
+    factor = max(0.3, min(1.0, math.sqrt(400 / max(len(links), 1))))
+    classes: dict[str, tuple[str, dict[str, Any]]] = {}
+    for index, limit in enumerate(limits):
+        words = f"{limit:,}–{limits[index + 1] - 1:,}" if index + 1 < len(limits) else f"{limit:,} or more"
+        k = class_of(limit, limits)
+        classes[f"k{k}"] = words, {"color": COLOURS[f"k{k}"], "linewidth": 0.9 + 0.36 * k}
+    classes |= {"rejected": ("rejected", _REJECTED), "unjudged": ("not verifiable or not judged", _UNJUDGED)}
+    members: dict[str, list[Link]] = {gid: [] for gid in classes}
+    for link in links:
+        other = "rejected" if link.state == "rejected" else "unjudged"
+        members[f"k{class_of(link.verified, limits)}" if link.state == "verified" else other].append(link)
+    titles: dict[str, list[str]] = {}
+    handles: list[Any] = []
+    for order, (gid, (words, style)) in enumerate(reversed(classes.items())):
+        lines = np.array([[place[k.image_id0], place[k.image_id1]] for k in members[gid]]).reshape(-1, 2, 2)
+        if not len(lines):
+            continue
+        thinned = style | {"linewidth": factor * style["linewidth"], "gid": gid, "zorder": 2 + 0.1 * order}
+        if len(links) <= MAX_TITLED_LINES:
+            axes.add_artist(LineCollection(list(lines), **thinned))
+            titles[gid] = [link.title for link in members[gid]]
+        else:
+            joined = np.insert(lines, 2, np.nan, axis=1).reshape(-1, 2)
+            axes.plot(*joined.T, **thinned)
+        handles.insert(0, Line2D([], [], label=words, **style))
+    return titles, handles
+
+
+def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
+    """Labels that lie on no earlier one and on no other camera; the tooltips name all. Weak and ignored come first."""
+    taken: list[Any] = []
+    places = axes.transData.transform([(s.x_m, s.y_m) for s in stations])
+    for station in sorted(stations, key=lambda s: s.kind, reverse=True):
+        where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}
+        text = axes.annotate(station.label, (station.x_m, station.y_m), gid="label", color=COLOURS["ink"], **where)
+        box = text.get_window_extent()
+        hides = station.kind == "fine" and box.count_contains(places)
+        if hides or any(box.overlaps(other) for other in taken):
+            text.remove()
+        else:
+            taken.append(box)

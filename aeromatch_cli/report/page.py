@@ -1,0 +1,260 @@
+"""report: the HTML page, from the rows, figures and settings of a workspace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli import __version__
+from aeromatch_cli.config import dump
+from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.report.figures import COLOURS, histogram
+from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
+from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
+from aeromatch_cli.report.rows import (
+    NOT_JUDGED,
+    ImageRow,
+    PairRow,
+    evaluation_figures,
+    failure_rows,
+    gather,
+    stage_rows,
+)
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import WEAK_MATCHES, components, summarise
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.workspace import fingerprint, read_json, write_text
+
+# Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
+MAX_TABLE_ROWS = 2000
+MAX_FAILURE_ROWS = 300
+MAX_LISTED = 30
+_STATE_RANK = {"rejected": 0, "not verifiable": 1, NOT_JUDGED: 2}
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something a person must see. level: "bad" or "warn". items: names, MAX_LISTED of them shown."""
+
+    level: str
+    title: str
+    text: str
+    items: tuple[str, ...] = ()
+
+
+def run(context: Context) -> StageReport:
+    """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
+    report = StageReport("report", items=1)
+    pairs, images = gather(context)
+    page = render(context, pairs, images)
+    write_text(context.workspace.report, page)
+    report.done = 1
+    report.fingerprint = fingerprint([vars(row) for row in pairs], [vars(row) for row in images])
+    report.facts = {"page": "report/index.html", "bytes": len(page.encode("utf-8"))}
+    return report.write(context.workspace)
+
+
+def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow]) -> str:
+    """The page as text."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["number"] = number
+    source = resources.files("aeromatch_cli.report") / "page.html.jinja"
+    template = environment.from_string(source.read_text(encoding="utf-8"))
+    facts = summarise(context, components(context))
+    ignored = {i: float(angle) for i, angle in _facts(context, "filter").get("rotation_contradicts_pose", {}).items()}
+    input_facts = _facts(context, "pairs")
+    failures = failure_rows(context)
+    stages = stage_rows(context.workspace)
+    return template.render(
+        version=__version__,
+        colours=COLOURS,
+        made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        title=PurePosixPath(context.workspace.root.as_posix()).name,
+        headline=_headline(images, pairs, facts, failures),
+        notices=notices(images, pairs, facts, ignored, input_facts.get("warnings", [])),
+        max_listed=MAX_LISTED,
+        failures=failures[:MAX_FAILURE_ROWS],
+        failure_count=len(failures),
+        summary=input_facts.get("summary", []),
+        block=_block_facts(context),
+        map=_map(context, images, pairs, ignored),
+        histograms=[
+            histogram(counts, f"verified matches per {words}", unit)
+            for counts, words, unit in (
+                ([row.verified for row in pairs if row.state == "verified"], "verified pair", "pairs"),
+                ([row.verified_matches for row in images], "image", "images"),
+            )
+            if any(counts)
+        ],
+        evaluation=evaluation_figures(context.workspace),
+        previews=previews(context, pairs),
+        error_limits_px=ERROR_LIMITS_PX,
+        pairs=_worst_pairs(pairs),
+        pair_count=len(pairs),
+        images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
+        image_count=len(images),
+        weak_matches=WEAK_MATCHES,
+        ignored=ignored,
+        stages=stages,
+        settings=_settings_text(context),
+    )
+
+
+def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:
+    """Thousands separated by commas; an empty cell where unknown."""
+    return "" if value is None or math.isnan(value) else f"{value * factor:,.{digits}f}"
+
+
+def _headline(
+    images: Sequence[ImageRow], pairs: Sequence[PairRow], facts: Mapping[str, Any], failures: Sequence[Any]
+) -> list[tuple[str, str, str]]:
+    """(number, words, level) of each tile; level "" or "bad"."""
+    posed = sum(row.pose != "none" for row in images)
+    full = sum(row.pose == "full" for row in images)
+    verified = sum(row.state == "verified" for row in pairs)
+    matches, parts, weak = facts["verified_matches"], len(facts["components"]), len(facts["weakly_tied"])
+    tiles = [
+        (_counted(len(images), "image", "images"), False),
+        (f"{posed:,} with position, {full:,} with attitude", False),
+        (_counted(len(pairs), "pair compared", "pairs compared"), False),
+        (_counted(verified, "verified pair", "verified pairs"), not verified),
+        (_counted(matches, "verified match", "verified matches"), not matches),
+        (_counted(parts, "connected group", "unconnected groups"), parts > 1),
+        (_counted(weak, "weakly tied image", "weakly tied images") + f" (< {WEAK_MATCHES} matches)", weak > 0),
+        (_counted(len(failures), "failure", "failures"), bool(failures)),
+    ]
+    parted = [(text.partition(" "), bad) for text, bad in tiles]
+    return [(count, words, "bad" if bad else "") for (count, _, words), bad in parted]
+
+
+def notices(
+    images: Sequence[ImageRow],
+    pairs: Sequence[PairRow],
+    facts: Mapping[str, Any],
+    ignored: Mapping[str, float],
+    warnings: Sequence[str],
+) -> list[Notice]:
+    """What needs a person's eye, the gravest first."""
+    found = []
+    names = {row.image_id: row.name for row in images}
+    if not facts["verified_matches"]:
+        found.append(Notice("bad", "No pair is verified", "The block has no tie points; the pair table says why."))
+    elif len(facts["components"]) > 1:
+        sizes, alone = facts["components"], sum(size == 1 for size in facts["components"])
+        shown = ", ".join(f"{size:,}" for size in sizes[:12] if size > 1)
+        text = f"Sizes of the groups with more than one image: {shown}. Images tied to no other: {alone:,}."
+        found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
+    if ignored:
+        text = "The matches contradict the attitude by the angle given; only the position is used."
+        items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in ignored.items())
+        title = _counted(len(items), "ignored attitude", "ignored attitudes")
+        found.append(Notice("bad", title, text, items))
+    if facts["weakly_tied"] and facts["verified_matches"]:
+        ties = {row.image_id: row for row in images}
+        items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in facts["weakly_tied"])
+        text = f"Fewer than {WEAK_MATCHES} verified matches in all pairs together (number in brackets)."
+        title = _counted(len(items), "image is weakly tied", "images are weakly tied")
+        found.append(Notice("bad", title, text, items))
+    for pose, lacks, text in (
+        ("none", "no position", "Paired by name or time, and not on the map."),
+        ("position", "no usable attitude", "Paired by position, and drawn without footprint."),
+    ):
+        items = tuple(row.name for row in images if row.pose == pose and row.image_id not in ignored)
+        if items:
+            title = _counted(len(items), f"image has {lacks}", f"images have {lacks}")
+            found.append(Notice("warn", title, text, items))
+    lost = sum(row.state == NOT_JUDGED for row in pairs)
+    if lost:
+        text = "No matches on file: the match stage failed there or has not run."
+        found.append(Notice("warn", _counted(lost, "pair was not judged", "pairs were not judged"), text))
+    found += [Notice("warn", "Note on the input", warning) for warning in warnings]
+    return found
+
+
+def _counted(count: int, one: str, several: str) -> str:
+    return f"{count:,} {one if count == 1 else several}"
+
+
+def _facts(context: Context, stage: str) -> dict[str, Any]:
+    """What a stage left in its report."""
+    path = context.workspace.stage_report(stage)
+    return dict(read_json(path)["facts"]) if path.is_file() else {}
+
+
+def _block_facts(context: Context) -> list[tuple[str, str]]:
+    block = context.block
+    cameras = []
+    for camera_id, camera in sorted(block.cameras.items()):
+        params = ", ".join(f"{value:g}" for value in camera.params)
+        cameras.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
+    more = [f"and {len(cameras) - 10} more"] if len(cameras) > 10 else []
+    return [
+        ("World frame", f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"),
+        ("Ground", block.ground_source),
+        ("Ground sampling distance", "unknown" if block.gsd_m is None else f"{block.gsd_m:.3g} m"),
+        ("Cameras", "\n".join(cameras[:10] + more)),
+        ("Images in", context.settings.block.images),
+    ]
+
+
+def _settings_text(context: Context) -> str:
+    path = context.workspace.config
+    return path.read_text(encoding="utf-8") if path.is_file() else dump(context.settings)
+
+
+def _map(
+    context: Context, images: Sequence[ImageRow], pairs: Sequence[PairRow], ignored: Mapping[str, float]
+) -> MapFigure | None:
+    """None where no image has a position."""
+    stations = []
+    for row, label in zip(images, _labels([row.name for row in images]), strict=True):
+        pose = context.pose(row.image_id)
+        if pose is None or not np.isfinite(pose.center_m).all():
+            continue
+        x, y, z = (float(value) for value in pose.center_m)
+        ties = _counted(row.verified_matches, "verified match", "verified matches")
+        title = f"{row.name}: {ties} in {row.verified_pairs} of {_counted(row.pairs, 'pair', 'pairs')}, z {z:.1f} m"
+        weak = "weak" if row.verified_matches < WEAK_MATCHES else "fine"
+        stations.append(Station(row.image_id, label, title, x, y, "ignored" if row.image_id in ignored else weak))
+    if not stations:
+        return None
+    footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
+    return block_map(stations, footprints, [_link(row) for row in pairs])
+
+
+def _link(row: PairRow) -> Link:
+    verified = _counted(row.verified, "verified match", "verified matches")
+    words = verified if row.state == "verified" else f"{row.state}: {row.reason}"
+    return Link(row.image_id0, row.image_id1, row.state, row.verified, f"{row.name0} – {row.name1}: {words}")
+
+
+def _labels(names: Sequence[str]) -> list[str]:
+    """Short names for the map: without suffix and without what all names begin with, up to their last separator."""
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    common = 0
+    if len(stems) > 1:
+        first, last = min(stems), max(stems)
+        while common < min(len(first), len(last)) and first[common] == last[common]:
+            common += 1
+        common = max(first.rfind(mark, 0, common) for mark in "_-/ .") + 1
+    return [stem[common:] or stem for stem in stems]
+
+
+def _worst_pairs(pairs: Sequence[PairRow]) -> list[PairRow]:
+    """At most MAX_TABLE_ROWS: other pairs from large overlap down, then verified ones from few matches up."""
+    others = [row for row in pairs if row.state != "verified"]
+    verified = sorted((row for row in pairs if row.state == "verified"), key=lambda row: row.verified)
+    others.sort(key=lambda row: (_STATE_RANK[row.state], -np.nan_to_num(row.overlap)))
+    shown = others[: max(MAX_TABLE_ROWS // 2, MAX_TABLE_ROWS - len(verified))]
+    return shown + verified[: MAX_TABLE_ROWS - len(shown)]
