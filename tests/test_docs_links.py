@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import typer
+from conftest import invoke
 from read_pages import PAGES, ROOT, anchors, commands, inline_code, links, text_of
 
 from aeromatch_cli.cli import app
@@ -157,3 +158,13 @@ def script_words(text: str) -> list[list[str]]:
     """First words behind `scripts/`, of commands in code blocks and of code in the text."""
     written = [*commands(text, "scripts/[a-z_]+"), *inline_code(text)]
     return [code.removeprefix("scripts/").split() for code in written if re.match(r"scripts/\w", code)]
+
+
+@pytest.mark.parametrize("name", [*STAGES, "evaluate", "synth", "weights list", "weights verify", "weights add"])
+def test_help_shows_examples_that_are_understood(name: str) -> None:
+    shown = invoke(*name.split(), "--help").stdout.partition("Examples:")[2]
+    examples = [line.strip() for line in shown.splitlines() if line.strip()]
+    assert examples
+    for example in examples:
+        assert example.startswith(f"aeromatch {name}")
+        understood(shlex.split(example)[1:], whole=True)

@@ -11,8 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
-from aeromatch_cli.cli.commands import WEIGHTS, evaluate, synth
-from aeromatch_cli.cli.output import ARGUMENTS
+from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, synth
+from aeromatch_cli.cli.output import ARGUMENTS, as_epilog
 from aeromatch_cli.cli.stage_commands import STAGES, stage_command
 from aeromatch_cli.errors import ConfigError
 
@@ -51,17 +51,22 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Verified, evenly spread tie points for aerial image blocks.",
-    epilog="CONFIG|PRESET is a YAML file or the name of a preset; every command names its options with --help.",
+    epilog=as_epilog(
+        (
+            "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
+            "aeromatch run --help",
+        )
+    ),
 )
 weights_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="List, verify and add network weights.")
 app.add_typer(weights_app, name="weights")
 
-for _name, _help in STAGES.items():
-    app.command(_name, help=_help)(stage_command(_name))
-app.command()(evaluate)
-app.command()(synth)
+for _name, (_help, _examples) in STAGES.items():
+    app.command(_name, help=_help, epilog=as_epilog(_examples))(stage_command(_name))
+app.command(epilog=as_epilog(EXAMPLES["evaluate"]))(evaluate)
+app.command(epilog=as_epilog(EXAMPLES["synth"]))(synth)
 for _name, (_help, _command) in WEIGHTS.items():
-    weights_app.command(_name, help=_help)(_command)
+    weights_app.command(_name, help=_help, epilog=as_epilog(EXAMPLES[f"weights {_name}"]))(_command)
 
 
 @app.callback(invoke_without_command=True)

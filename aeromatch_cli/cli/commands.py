@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +17,19 @@ from aeromatch_cli.errors import ConfigError
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
 
+EXAMPLES: Mapping[str, Sequence[str]] = {
+    "evaluate": (
+        "aeromatch evaluate WORK --truth BLOCK",
+        "aeromatch evaluate WORK --truth REFERENCE --no-mapping --json",
+    ),
+    "synth": (
+        "aeromatch synth OUT --preset suburb --images 12 --seed 0",
+        "aeromatch synth OUT --preset city --flight two-flights --size 1000x750 --images 24",
+    ),
+    "weights list": ("aeromatch weights list",),
+    "weights verify": ("aeromatch weights verify --json",),
+    "weights add": ("aeromatch weights add sift_lightglue.pth",),
+}
 # Written out: the modules that know them are too heavy for --help. A test compares.
 _SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"
 _FLIGHTS = "nadir, oblique, sweep, orbit, two-flights, mixed"
@@ -24,14 +37,19 @@ _FLIGHTS = "nadir, oblique, sweep, orbit, two-flights, mixed"
 
 def evaluate(
     context: typer.Context,
-    work: Annotated[Path, typer.Argument(metavar="WORK", help="Workspace that `run` wrote.")],
-    truth: Annotated[Path, typer.Option("--truth", metavar="DIR", help="Rendered block, or reference solution.")],
-    mapping: Annotated[bool, typer.Option(help="Also count the images that pycolmap's mapping registers.")] = True,
+    work: Annotated[Path, typer.Argument(metavar="WORK", help="Workspace that `aeromatch run` wrote.")],
+    truth: Annotated[
+        Path,
+        typer.Option(
+            "--truth", metavar="DIR", help="Rendered block, or folder with poses.csv and block.json of a reference."
+        ),
+    ],
+    mapping: Annotated[bool, typer.Option(help="Also count the images that pycolmap registers (default yes).")] = True,
     log_file: LogFile = None,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Judge the matches of a workspace against rendered truth or reference poses."""
+    """Evaluate the matches of a workspace against rendered truth or reference poses."""
 
     def call() -> Result:
         from aeromatch_cli.evaluate import evaluate_workspace
@@ -50,28 +68,32 @@ def synth(
     context: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the rendered block.")],
     preset: Annotated[str, typer.Option("--preset", metavar="NAME", help=f"Scene: {_SCENES}.")] = "city",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed gives another scene.")] = 0,
-    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Image size in pixels.")] = "1000x750",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the scene (default 0).")] = 0,
+    size: Annotated[str, typer.Option("--size", metavar="WxH", help="Image size, pixels.")] = "1000x750",
     images: Annotated[int, typer.Option("--images", min=1, help="Number of images.")] = 12,
-    flight: Annotated[str, typer.Option("--flight", metavar="NAME", help=f"{_FLIGHTS}.")] = "nadir",
+    flight: Annotated[str, typer.Option("--flight", metavar="NAME", help=f"Flight: {_FLIGHTS}.")] = "nadir",
     height: Annotated[
-        float | None, typer.Option("--height", metavar="METRES", help="Flying height; each scene has its own.")
+        float | None,
+        typer.Option(
+            "--height", metavar="METRES", help="Flying height above ground, metres (default: that of the scene)."
+        ),
     ] = None,
     lens: Annotated[
-        str, typer.Option("--lens", metavar="MODEL", help="Camera model, COLMAP's name: PINHOLE, RADIAL, OPENCV ...")
+        str, typer.Option("--lens", metavar="MODEL", help="Camera model by COLMAP's name: PINHOLE, RADIAL, OPENCV ...")
     ] = "SIMPLE_RADIAL",
     sun: Annotated[
-        str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first sortie, degrees.")
+        str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first flight, degrees.")
     ] = None,
     texture: Annotated[
-        Path | None, typer.Option("--texture", metavar="DIR", help="Pictures to lay over the ground.")
+        Path | None,
+        typer.Option("--texture", metavar="DIR", help="Folder of pictures that become the ground's texture."),
     ] = None,
     jobs: Jobs = None,
     log_file: LogFile = None,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a block with exact truth."""
+    """Render a block of images with exact truth."""
 
     def call() -> Result:
         from aeromatch_cli.stages.run import Result
@@ -114,7 +136,7 @@ def _verify_weights(json_: Json = False, quiet: Quiet = False) -> None:
 
 
 def _add_weights(
-    path: Annotated[str, typer.Argument(metavar="PATH", help="Checkpoint file.")],
+    path: Annotated[str, typer.Argument(metavar="PATH", help="Weights file: .safetensors, .pth or .pt.")],
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -123,9 +145,9 @@ def _add_weights(
 
 # `aeromatch weights NAME`: its help and its command.
 WEIGHTS: Mapping[str, tuple[str, Callable[..., None]]] = {
-    "list": ("Weights that strategies find by name.", _list_weights),
-    "verify": ("Compare every file with its recorded SHA-256.", _verify_weights),
-    "add": ("Check a checkpoint strictly and copy it into the weights folder.", _add_weights),
+    "list": ("List the network weights of the package and of the weights folder.", _list_weights),
+    "verify": ("Compare every weights file with its recorded SHA-256.", _verify_weights),
+    "add": ("Check a LightGlue weights file and copy it into the weights folder.", _add_weights),
 }
 
 

@@ -7,40 +7,59 @@ from typing import Annotated
 
 import typer
 
-Config = Annotated[str, typer.Argument(metavar="CONFIG|PRESET", help="YAML file or preset name.")]
-
-Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Folder of images.")]
-
-Poses = Annotated[str | None, typer.Option("--poses", metavar="FILE|exif|none", help="Pose list, or EXIF/XMP.")]
-
-Cameras = Annotated[str | None, typer.Option("--cameras", metavar="FILE|exif|folder", help="Cameras, or grouping.")]
-
-Crs = Annotated[str | None, typer.Option("--crs", metavar="CODE", help="World frame, EPSG:32633 or local.")]
-
-Ground = Annotated[str | None, typer.Option("--ground", metavar="METRES|DEM|auto", help="Ground height.")]
-
-Masks = Annotated[Path | None, typer.Option("--masks", metavar="DIR|FILE", help="Masks in COLMAP naming.")]
-
-WorkspaceDir = Annotated[Path | None, typer.Option("--workspace", metavar="DIR", help="Folder for every result.")]
-
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a setting; repeatable.")]
-
-MaxSize = Annotated[int | None, typer.Option("--max-size", min=1, metavar="PX", help="Reduce larger images to this.")]
-
-Jobs = Annotated[int | None, typer.Option("--jobs", min=0, help="Worker processes; 0 = one per core.")]
-
-ExecutorName = Annotated[
-    str | None, typer.Option("--executor", metavar="serial|processes|dask", help="Where tasks run.")
+Config = Annotated[
+    str, typer.Argument(metavar="CONFIG|PRESET", help="Preset (baseline, fusion, polar, oblique), or a YAML file.")
 ]
-
-ShardText = Annotated[str | None, typer.Option("--shard", metavar="I/N", help="Only part I of N of the items.")]
-
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Do everything again, whatever is up to date.")]
-
-KeepImages = Annotated[bool, typer.Option("--keep-images", help="Keep enhanced and simulated pictures.")]
-
-LogFile = Annotated[Path | None, typer.Option("--log-file", metavar="FILE", help="Append every message to this file.")]
-
-Json = Annotated[bool, typer.Option("--json", help="Last line of stdout is a JSON object.")]
-
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors on stderr, no summary.")]
+Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Folder of images, searched recursively.")]
+Poses = Annotated[
+    str | None,
+    typer.Option(
+        "--poses", metavar="FILE|exif|none", help="Pose list (CSV, TXT), or GPS and XMP angles (default exif)."
+    ),
+]
+Cameras = Annotated[
+    str | None,
+    typer.Option(
+        "--cameras", metavar="FILE|exif|folder", help="Camera file, EXIF (default), or one camera per folder."
+    ),
+]
+Crs = Annotated[
+    str | None,
+    typer.Option("--crs", metavar="CODE", help="World frame: EPSG:32633, local, or auto (UTM zone; default)."),
+]
+Ground = Annotated[
+    str | None,
+    typer.Option("--ground", metavar="METRES|DEM|auto", help="Ground height, DEM file, or auto (default)."),
+]
+Masks = Annotated[
+    Path | None, typer.Option("--masks", metavar="DIR|FILE", help="Masks in COLMAP naming, 0 = ignore; or one mask.")
+]
+WorkspaceDir = Annotated[
+    Path | None,
+    typer.Option("--workspace", metavar="DIR", help="Folder for every result (default aeromatch-work)."),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, as extract.keypoints=8000; repeatable."),
+]
+MaxSize = Annotated[
+    int | None,
+    typer.Option("--max-size", min=1, metavar="PX", help="Reduce larger images to this longer side, pixels."),
+]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=0, help="Worker processes (default 0: one per core).")]
+ExecutorName = Annotated[
+    str | None,
+    typer.Option("--executor", metavar="serial|processes|dask", help="Where tasks run (default processes)."),
+]
+ShardText = Annotated[
+    str | None, typer.Option("--shard", metavar="I/N", help="Only part I of N of the images and pairs, 1 <= I <= N.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Make every result again, even if it is up to date.")]
+KeepImages = Annotated[
+    bool, typer.Option("--keep-images", help="Keep enhanced and simulated pictures in the workspace.")
+]
+LogFile = Annotated[
+    Path | None, typer.Option("--log-file", metavar="FILE", help="Append every message, with time, to this file.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print a JSON object as the last line of stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors, no summary and no progress.")]

@@ -111,3 +111,8 @@ def _terminated_like_interrupt() -> Iterator[None]:
 def as_texts(values: dict[str, Any]) -> dict[str, Any]:
     """Given options only, paths as text."""
     return {key: str(v) if isinstance(v, Path) else v for key, v in values.items() if v is not None}
+
+
+def as_epilog(examples: Sequence[str]) -> str:
+    """Examples below a command's help, each on a line of its own: \b keeps click from filling the paragraph."""
+    return "\b\nExamples:\n" + "\n".join(f"  {example}" for example in examples)

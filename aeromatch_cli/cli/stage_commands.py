@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,17 +34,50 @@ from aeromatch_cli.cli.progress import progress_shown
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
 
-STAGES = {
-    "run": "Everything, over all overlapping pairs: pairs to report.",
-    "pairs": "Read the block and choose the pairs.",
-    "enhance": "Write enhanced pictures; none of images that need none.",
-    "simulate": "Write simulated views.",
-    "extract": "Find features in every image.",
-    "match": "Match every pair; features that are missing are made first.",
-    "filter": "Verify the matches of every pair.",
-    "export": "Write the files of other programs.",
-    "report": "Write the HTML report.",
-    "check": "Dry run: images readable, poses plausible, weights present, pairs, memory, disk, time. Writes nothing.",
+# Name: what the command does, and examples.
+STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
+    "run": (
+        "Do everything, over all overlapping pairs: from the pairs to the report.",
+        (
+            "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
+            "aeromatch run fusion --images IMGS --poses poses.csv --crs EPSG:32633",
+            "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=8000",
+        ),
+    ),
+    "pairs": (
+        "Read the block and choose the pairs of images.",
+        ("aeromatch pairs baseline --images IMGS --poses poses.csv --set pairs.min_overlap=0.2",),
+    ),
+    "enhance": (
+        "Write the enhanced picture of every image that is enhanced.",
+        ("aeromatch enhance fusion --images IMGS --poses poses.csv --workspace WORK",),
+    ),
+    "simulate": (
+        "Write the simulated views of every image.",
+        ("aeromatch simulate baseline --images IMGS --poses poses.csv --workspace WORK",),
+    ),
+    "extract": (
+        "Find keypoints and descriptors in every image.",
+        ("aeromatch extract baseline --images IMGS --poses poses.csv --shard 1/4",),
+    ),
+    "match": (
+        "Match every pair; features that are missing are made first.",
+        ("aeromatch match baseline --images IMGS --poses poses.csv --shard 1/4",),
+    ),
+    "filter": (
+        "Verify the matches of every pair.",
+        ("aeromatch filter baseline --images IMGS --poses poses.csv --set filter=poselib+graph",),
+    ),
+    "export": (
+        "Write the verified matches for other programs.",
+        ("aeromatch export baseline --images IMGS --poses poses.csv --workspace WORK",),
+    ),
+    "report": ("Write the HTML report.", ("aeromatch report baseline --images IMGS --poses poses.csv",)),
+    "check": (
+        "Dry run that writes nothing: are images readable, poses plausible, weights present; estimates of pairs, time, "
+        "memory and disk.",
+        ("aeromatch check fusion --images IMGS --poses poses.csv",),
+    ),
 }
 
 
