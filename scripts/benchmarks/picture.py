@@ -3,7 +3,7 @@
 Both sides have the same number of descriptors per image. The pair is seen from directions 54 degrees apart, under two
 suns. Every match is judged by the exact geometry of the render: correct within 3 px in both directions (green), else
 wrong (red). SIFT is OpenCV's on the images as they were taken, with mutual nearest neighbours and the ratio test; the
-count after RANSAC for a fundamental matrix is printed too. The preset runs over the whole block with its noisy poses.
+count after verification by a fundamental matrix is printed too. The preset runs over the whole block with its noisy poses.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from benchmarks.peers.opencv import OpenCvSift
 from benchmarks.scenes import EXACT_POSES, NOISY_POSES, render_once
 from benchmarks.stamps import REPOSITORY
 
-RANSAC_PX, RANSAC_SEED = 3.0, 0
 GREEN, RED = "#2fd04f", "#ff2d2d"
 WIDTH_IN, GAP, JPEG_QUALITY, DPI = 11.0, 0.03, 72, 100
 
@@ -92,22 +91,15 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
 
 def _sift(block: Path, truth: RenderedTruth, name0: str, name1: str, keypoints: int) -> Side:
     """The peer `opencv-sift`: mutual nearest neighbours that pass the ratio test, before any geometric check."""
-    import cv2
-
     scene = Scene(block.name, block / "images", block / EXACT_POSES, block / "block.json", truth.cameras, ())
     peer = OpenCvSift(scene, Options(keypoints, "image", 1, 0, None))
     first, second = peer.features(name0), peer.features(name1)
     rows, columns, scores = mutual_nearest(first.descriptors, second.descriptors, RATIO)
     points = first.places_px[rows], second.places_px[columns]
     places = [first.places_px, second.places_px]
-    side = _judged("SIFT, ratio test, source images", truth, (name0, name1), places, points, scores)
-    cv2.setRNGSeed(RANSAC_SEED)
-    if len(side.correct) >= 8:
-        _, mask = cv2.findFundamentalMat(side.points0_px, side.points1_px, cv2.FM_RANSAC, RANSAC_PX, 0.999, 10000)
-        inlier = np.zeros(len(side.correct), bool) if mask is None else mask.ravel() > 0
-        right, wrong = int((inlier & side.correct).sum()), int((inlier & ~side.correct).sum())
-        print(f"SIFT after RANSAC for a fundamental matrix: {right} correct, {wrong} wrong")
-    return side
+    verified = peer.match(name0, name1, first, second)
+    print(f"SIFT verified by a fundamental matrix (MAGSAC++, 15 inliers at least): {len(verified.points0_px)} matches")
+    return _judged("SIFT, ratio test, source images", truth, (name0, name1), places, points, scores)
 
 
 def _preset(work: Path, truth: RenderedTruth, name0: str, name1: str, preset: str) -> Side:
