@@ -3,7 +3,7 @@
 Both sides have the same number of descriptors per image. The pair is seen from directions 54 degrees apart, under two
 suns. Every match is judged by the exact geometry of the render: correct within 3 px in both directions (green), else
 wrong (red). SIFT is OpenCV's on the images as they were taken, with mutual nearest neighbours and the ratio test; the
-count after verification by a fundamental matrix is printed too. The preset runs over the whole block with its noisy poses.
+count after verification by a fundamental matrix is printed too. The preset runs over the whole block, noisy poses.
 """
 
 from __future__ import annotations
