@@ -3,13 +3,12 @@
 Both sides have the same number of descriptors per image. The pair is seen from directions 54 degrees apart, under two
 suns. Every match is judged by the exact geometry of the render: correct within 3 px in both directions (green), else
 wrong (red). SIFT is OpenCV's on the images as they were taken, with mutual nearest neighbours and the ratio test; the
-count after RANSAC for a fundamental matrix is printed too. The preset runs over the whole block with its noisy poses.
+count after verification by a fundamental matrix is printed too. The preset runs over the whole block, noisy poses.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,12 +25,15 @@ from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute
-from aeromatch_cli.synthetic import load_truth, render_block
+from aeromatch_cli.synthetic import load_truth
 from aeromatch_cli.workspace import Workspace
+from benchmarks import options
+from benchmarks.peers.base import Options, Scene
+from benchmarks.peers.matching import RATIO, mutual_nearest
+from benchmarks.peers.opencv import OpenCvSift
+from benchmarks.scenes import EXACT_POSES, NOISY_POSES, render_once
+from benchmarks.stamps import REPOSITORY
 
-RATIO, RANSAC_PX, RANSAC_SEED = 0.8, 3.0, 0
-# As the benchmarks' peer: low enough that weak texture reaches the budget too.
-CONTRAST_THRESHOLD = 0.01
 GREEN, RED = "#2fd04f", "#ff2d2d"
 WIDTH_IN, GAP, JPEG_QUALITY, DPI = 11.0, 0.03, 72, 100
 
@@ -50,76 +52,54 @@ class Side:
         return f"{int(self.correct.sum())} correct, {int((~self.correct).sum())} wrong"
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> None:
     """Render the block, match it both ways, write the JPEG, print the counts."""
-    given = _parser().parse_args(arguments)
-    block, work = given.out / "block", given.out / "work"
-    # A block that is finished is left as it is.
-    render_block(
-        block, given.scene, seed=given.seed, images=given.images, flight=given.flight, width_px=1000, height_px=750
-    )
+    given = _options(arguments)
+    size = {"width_px": 1000, "height_px": 750, "images": given.images}
+    block = render_once(given.out, given.scene, seed=given.seed, flight=given.flight, **size)
+    work = given.out / f"work-{block.name}"
     inputs = {
-        "images": str(block / "images"),
-        "poses": str(block / "poses_noisy.csv"),
-        "cameras": str(block / "block.json"),
-    }
+        "images": str(block / "images"), "poses": str(block / NOISY_POSES), "cameras": str(block / "block.json"),
+    }  # fmt: skip
     settings = load(given.preset, [f"extract.keypoints={given.keypoints}"], inputs, workspace=str(work.absolute()))
     execute("run", settings)
     truth = RenderedTruth(load_truth(block), block / "images")
-    name0, name1 = given.pair.split(",")
+    name0, name1 = given.pair
     angle = truth.conditions(name0, name1).view_angle_deg
     sides = [_sift(block, truth, name0, name1, given.keypoints), _preset(work, truth, name0, name1, given.preset)]
-    pictures = [read_pixels(block / "images" / name, colour=True) for name in (name0, name1)]
-    _draw(given.picture, pictures, sides)
+    _draw(given.picture, [read_pixels(block / "images" / name, colour=True) for name in given.pair], sides)
     print(f"{name0} and {name1}, {angle:.0f} degrees apart, {given.keypoints} descriptors per image")
     for side in sides:
         print(f"{side.title}: {side.counts}")
     print(f"written to {given.picture} ({given.picture.stat().st_size / 1e3:.0f} kB)")
-    return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="scripts/bench picture", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the block and its workspace")
-    parser.add_argument("--picture", type=Path, default=Path(".assets/pair.jpg"), metavar="FILE", help="the JPEG")
-    parser.add_argument("--scene", default="city")
-    parser.add_argument("--flight", default="mixed")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--images", type=int, default=16)
-    parser.add_argument("--pair", default="city_0004.jpg,city_0010.jpg", metavar="NAME,NAME")
-    parser.add_argument("--preset", default="oblique")
-    parser.add_argument("--keypoints", type=int, default=4000, help="descriptors per image, of either side")
-    return parser
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = options.make_parser("picture", __doc__)
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder of the block and its workspace")
+    add("--picture", type=Path, default=REPOSITORY / ".assets" / "pair.jpg", metavar="FILE", help="the JPEG")
+    add("--scene", default="city")
+    add("--flight", default="mixed")
+    add("--seed", type=int, default=1)
+    add("--images", type=options.positive, default=16)
+    add("--pair", type=options.names, default="city_0004.jpg,city_0010.jpg", metavar="NAME,NAME")
+    add("--preset", default="oblique")
+    add("--keypoints", type=options.positive, default=4000, help="descriptors per image, of either side")
+    return options.parse(parser, arguments)
 
 
 def _sift(block: Path, truth: RenderedTruth, name0: str, name1: str, keypoints: int) -> Side:
-    """Mutual nearest neighbours that pass the ratio test, before any geometric check."""
-    import cv2
-
-    detector: Any = cv2.SIFT.create(
-        nfeatures=keypoints, contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True
-    )
-    found = [detector.detectAndCompute(read_pixels(block / "images" / n, colour=False), None) for n in (name0, name1)]
-    all_px = [np.array([k.pt for k in points], dtype=np.float64).reshape(-1, 2) for points, _ in found]
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    (_, first), (_, second) = found
-    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(second, first, k=1)}
-    kept = [
-        (best.queryIdx, best.trainIdx, 1.0 - best.distance / max(other.distance, 1e-9))
-        for best, other in matcher.knnMatch(first, second, k=2)
-        if best.distance < RATIO * other.distance and back[best.trainIdx] == best.queryIdx
-    ]
-    points0, points1 = (all_px[side][[row[side] for row in kept]].reshape(-1, 2) for side in (0, 1))
-    side = _judged(
-        "SIFT, ratio test, source images", truth, (name0, name1), all_px, (points0, points1), [r[2] for r in kept]
-    )
-    cv2.setRNGSeed(RANSAC_SEED)
-    if len(side.correct) >= 8:
-        _, mask = cv2.findFundamentalMat(side.points0_px, side.points1_px, cv2.FM_RANSAC, RANSAC_PX, 0.999, 10000)
-        inlier = np.zeros(len(side.correct), bool) if mask is None else mask.ravel() > 0
-        right, wrong = int((inlier & side.correct).sum()), int((inlier & ~side.correct).sum())
-        print(f"SIFT after RANSAC for a fundamental matrix: {right} correct, {wrong} wrong")
-    return side
+    """The peer `opencv-sift`: mutual nearest neighbours that pass the ratio test, before any geometric check."""
+    scene = Scene(block.name, block / "images", block / EXACT_POSES, block / "block.json", truth.cameras, ())
+    peer = OpenCvSift(scene, Options(keypoints, "image", 1, 0, None))
+    first, second = peer.features(name0), peer.features(name1)
+    rows, columns, scores = mutual_nearest(first.descriptors, second.descriptors, RATIO)
+    points = first.places_px[rows], second.places_px[columns]
+    places = [first.places_px, second.places_px]
+    verified = peer.match(name0, name1, first, second)
+    print(f"SIFT verified by a fundamental matrix (MAGSAC++, 15 inliers at least): {len(verified.points0_px)} matches")
+    return _judged("SIFT, ratio test, source images", truth, (name0, name1), places, points, scores)
 
 
 def _preset(work: Path, truth: RenderedTruth, name0: str, name1: str, preset: str) -> Side:
@@ -175,7 +155,3 @@ def _draw(path: Path, pictures: Sequence[Any], sides: Sequence[Side]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=DPI, pil_kwargs={"quality": JPEG_QUALITY, "optimize": True, "progressive": True})
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
