@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from benchmarks.polar.sides import Shot
 from numpy.typing import NDArray
-from polar_bench.own import Shot
 
 from aeromatch_cli.data import FloatArray
 

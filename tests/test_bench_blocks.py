@@ -1,49 +1,42 @@
-"""scripts/bench_blocks: pairs across series, matches counted by hand, a small run of its sections."""
+"""scripts/bench blocks: pairs across series, matches counted by hand, a small run of its sections."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import sqlite3
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import __main__
+from benchmarks.blocks import cases, tables
+from benchmarks.peers.table import check_method
 
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
 # 100 m above ground this camera sees 100 m x 80 m.
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 NADIR = from_omega_phi_kappa(0.0, 0.0, 0.0)
 
 
-@pytest.fixture(autouse=True)
-def _scripts_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(SCRIPTS)
-
-
 def test_series_are_cut_at_the_largest_factor() -> None:
-    series = importlib.import_module("realblocks.series")
     levels = {"a": 110.0, "b": 60.0, "c": 150.0, "d": 52.0, "e": 0.0}
-    assert series.two_series({k: v for k, v in levels.items() if k != "e"}) == ({"b", "d"}, {"a", "c"})
-    assert series.two_series(levels)[0] == {"e"}  # a black frame is a series of its own
+    assert cases.two_series({k: v for k, v in levels.items() if k != "e"}) == ({"b", "d"}, {"a", "c"})
+    assert cases.two_series(levels)[0] == {"e"}  # a black frame is a series of its own
 
 
 def test_pairs_across_share_a_fifth_of_the_smaller_footprint() -> None:
-    series = importlib.import_module("realblocks.series")
     places = {"dark0": 0.0, "dark1": 10.0, "lit0": 79.0, "lit1": 81.0, "lit2": 95.0}
     images = tuple(Image(name, f"{name}.jpg", 1000, 800, "cam") for name in sorted(places))
     poses = {name: Pose(np.array([x, 0.0, 100.0]), NADIR, 1.0, 1.0) for name, x in places.items()}
     block = Block(images, {"cam": CAMERA}, poses, "local", (0.0, 0.0, 0.0), ConstantGround(0.0), "given", 0.1)
     two = ({"dark0.jpg", "dark1.jpg"}, {"lit0.jpg", "lit1.jpg", "lit2.jpg"})
     # 79 m apart share 21 m of 100 m, 81 m only 19 m; dark1 is 10 m farther, so 71 m and 85 m; pairs within a series go.
-    assert series.pairs_across(block, two) == [
+    assert cases.pairs_across(block, two) == [
         ("dark0.jpg", "lit0.jpg"), ("dark1.jpg", "lit0.jpg"), ("dark1.jpg", "lit1.jpg"),
     ]  # fmt: skip
 
@@ -76,7 +69,6 @@ def write_database(path: Path, keypoints0: Any, keypoints1: Any, matches: Any) -
 
 
 def test_matches_are_counted_within_3_and_5_px_once_a_place_and_thinned(tmp_path: Path) -> None:
-    counts = importlib.import_module("realblocks.counts")
     write_reference(tmp_path / "reference")
     x = 500.0 + 20.0 * np.arange(20)
     places0 = np.column_stack([x, np.full(20, 300.0)])
@@ -86,17 +78,16 @@ def test_matches_are_counted_within_3_and_5_px_once_a_place_and_thinned(tmp_path
     places0, places1 = np.vstack([places0, places0[19:] + 1.0]), np.vstack([places1, places1[19:] + 1.0])
     matches = [(i, i) for i in range(21)] + [(0, 0)]  # the last place is 1.4 px from another, the first comes twice
     write_database(tmp_path / "database.db", places0, places1, matches)
-    found = counts.count_matches(tmp_path / "database.db", tmp_path / "reference")
+    found = cases.count_matches(tmp_path / "database.db", tmp_path / "reference")
     assert (found["pairs"], found["matches"], found["unique_matches"]) == (1, 22, 21)
     assert (found["within_3px"], found["within_5px"]) == (14, 19)
     assert (found["thinned"], found["thinned_3px"], found["thinned_5px"]) == (20, 13, 18)
     assert (found["keypoints_mean"], found["keypoints_max"]) == (21.0, 21)
-    none = counts.count_matches(tmp_path / "database.db", tmp_path / "reference", {("a.jpg", "c.jpg")})
+    none = cases.count_matches(tmp_path / "database.db", tmp_path / "reference", {("a.jpg", "c.jpg")})
     assert none["pairs"] == none["matches"] == 0
 
 
 def test_factors_are_against_the_first_method_of_a_block() -> None:
-    tables = importlib.import_module("realblocks.tables")
     counted = {"pairs": 3, "matches": 500, "within_3px": 300, "within_5px": 400, "thinned": 200, "thinned_3px": 100}
     first = counted | {"block": "x", "method": "pycolmap", "asked_pairs": 4, "unique_matches": 400, "seconds": None}
     first |= {"thinned_5px": 150}
@@ -109,24 +100,20 @@ def test_factors_are_against_the_first_method_of_a_block() -> None:
     assert lines[3].endswith("| 8.0 |")
 
 
-def test_methods_are_checked_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cases = importlib.import_module("realblocks.cases")
+def test_methods_are_checked_before_anything_runs(tmp_path: Path) -> None:
     for spec in ("pycolmap-uncut-guided", "baseline[match.ratio=0.7]"):
-        cases.check_method(spec)
+        check_method(spec, cases.COLMAP)
     for wrong in ("colmap", "pycolmap-twice", "baseline[match.ratoi=0.7]"):
         with pytest.raises(ConfigError):
-            cases.check_method(wrong)
-    with pytest.raises(SystemExit) as stopped:
-        bench(tmp_path, "easy", "opencv-surf", monkeypatch)
-    assert stopped.value.code == 2
+            check_method(wrong, cases.COLMAP)
+    assert bench(tmp_path, "easy", "opencv-surf") == 2
 
 
-def bench(data: Path, section: str, methods: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def bench(data: Path, section: str, methods: str) -> int:
     """In this process; the steps have their own."""
-    command = ["bench_blocks.py", section, "--data", str(data), "--blocks", "small", "--thin", "1", "--quick"]
-    command += ["--keypoints", "300", "--jobs", "1", "--no-mapping", "--methods", methods, "--out", str(data / "out")]
-    monkeypatch.setattr(sys, "argv", command)
-    importlib.import_module("bench_blocks").main()
+    asked = ["blocks", section, "--data", str(data), "--blocks", "small", "--thin", "1", "--quick"]
+    asked += ["--keypoints", "300", "--jobs", "1", "--no-mapping", "--methods", methods, "--out", str(data / "out")]
+    return __main__.main(asked)
 
 
 def test_a_small_block_runs_and_is_not_run_again(
@@ -137,7 +124,7 @@ def test_a_small_block_runs_and_is_not_run_again(
     for name in ("poses.csv", "block.json"):
         (tmp_path / "small" / "reference" / name).symlink_to(rendered / name)
     methods = "all=baseline[pairs=exhaustive],pycolmap-guided"
-    bench(tmp_path, "blocks", methods, monkeypatch)
+    assert bench(tmp_path, "blocks", methods) == 0
     rows = json.loads((tmp_path / "out" / "blocks.json").read_text(encoding="utf-8"))
     assert [row["method"] for row in rows] == ["all", "pycolmap-guided"]
     for row in rows:
@@ -148,6 +135,6 @@ def test_a_small_block_runs_and_is_not_run_again(
         assert row["keypoints_max"] <= 300
     first = capsys.readouterr().out
     assert f"| small | 1 | `all` | {rows[0]['keypoints_mean']:.0f} |" in first
-    monkeypatch.setattr("realblocks.cases.run_step", None)  # nothing is left to run
-    bench(tmp_path, "blocks", methods, monkeypatch)
+    monkeypatch.setattr("benchmarks.blocks.cases.run_step", None)  # nothing is left to run
+    assert bench(tmp_path, "blocks", methods) == 0
     assert capsys.readouterr().out == first

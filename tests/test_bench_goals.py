@@ -1,24 +1,18 @@
-"""scripts/bench_methods: labels, and the goals of hand-made rows."""
+"""scripts/bench methods: labels, and the goals of hand-made rows."""
 
 from __future__ import annotations
 
-import importlib
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
+from benchmarks.methods import goals, results
+from benchmarks.peers import table
 
 from aeromatch_cli.errors import ConfigError
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
 PLAIN, MORE = "baseline[simulate=none]", "baseline"
 Row = dict[str, Any]
-
-
-@pytest.fixture(autouse=True)
-def _scripts_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(SCRIPTS)
 
 
 def row(method: str, pair: str, correct: int, **more: Any) -> Row:
@@ -43,7 +37,6 @@ def three_methods() -> list[Row]:
 
 
 def test_labels_stand_for_one_method() -> None:
-    table = importlib.import_module("methods.table")
     text = "SIFT=opencv-sift, plain=baseline[simulate=none,match.ratio=0.9],pycolmap"
     assert [(name.label, name.spec) for name in table.named_methods(text)] == [
         ("SIFT", "opencv-sift"), ("plain", "baseline[simulate=none,match.ratio=0.9]"), ("pycolmap", "pycolmap"),
@@ -61,7 +54,6 @@ def test_labels_stand_for_one_method() -> None:
 
 
 def test_compared_methods_must_be_among_those_that_run() -> None:
-    goals, table = (importlib.import_module(f"methods.{name}") for name in ("goals", "table"))
     names = table.named_methods(f"SIFT=opencv-sift,plain={PLAIN},baseline")
     assert goals.Comparison.among(names, None, None) == goals.Comparison("SIFT", None)
     assert goals.Comparison.among(names, "SIFT", PLAIN) == goals.Comparison("SIFT", "plain")
@@ -70,7 +62,6 @@ def test_compared_methods_must_be_among_those_that_run() -> None:
 
 
 def test_goals_worked_by_hand() -> None:
-    goals = importlib.import_module("methods.goals")
     found = goals.goals(three_methods(), MORE, goals.Comparison("opencv-sift", PLAIN))
     assert (found.hard, found.weak, found.easy) == (3, 2, 1)  # the real pair has no possible matches to compare with
     assert found.weak_correct == 60
@@ -83,7 +74,6 @@ def test_goals_worked_by_hand() -> None:
 
 
 def test_goals_without_pairs_or_comparison_are_unknown() -> None:
-    goals = importlib.import_module("methods.goals")
     rows = [row("baseline", "a", 5)]
     found = goals.goals(rows, "baseline", goals.Comparison())
     assert found.weak == 0
@@ -93,7 +83,6 @@ def test_goals_without_pairs_or_comparison_are_unknown() -> None:
 
 
 def test_noise_is_counted_over_the_pairs_of_both() -> None:
-    goals = importlib.import_module("methods.goals")
     exact = [row("baseline", pair, 50) for pair in "abc"]
     noisy = [row("baseline (noisy poses)", pair, 40, poses="noisy", spec="baseline") for pair in "ab"]
     found = goals.noise([*exact, *noisy], "baseline", "hard")
@@ -103,7 +92,6 @@ def test_noise_is_counted_over_the_pairs_of_both() -> None:
 
 
 def test_shadow_is_summed_over_pairs_that_have_it() -> None:
-    goals = importlib.import_module("methods.goals")
     lit = {"correct_in_shadow": 100, "wrong_at_border": 100}
     plain = {"shadow_share": 0.3, "kept_in_shadow": 12, "correct_in_shadow": 10, "wrong_at_border": 4}
     more = plain | {"correct_in_shadow": 25, "wrong_at_border": 3}
@@ -115,14 +103,12 @@ def test_shadow_is_summed_over_pairs_that_have_it() -> None:
 
 
 def test_mean_error_weighs_matches_and_leaves_out_what_has_none() -> None:
-    goals = importlib.import_module("methods.goals")
     rows = [row("baseline", "a", 0, kept=10, unseen=4, mean_error_px=1.0), row("baseline", "b", 0, kept=2, unseen=2)]
     rows += [row("baseline", "c", 0, kept=2, mean_error_px=9.0)]
     assert goals.mean_error_px(rows) == pytest.approx((6 * 1.0 + 2 * 9.0) / 8)
 
 
 def test_tables_say_what_is_compared() -> None:
-    goals, results = (importlib.import_module(f"methods.{name}") for name in ("goals", "results"))
     facts = {"asked_keypoints": 2048, "budget": "image", "seed": 1, "threads": 2}
     rows = [one | facts for one in three_methods()]
     comparison = goals.Comparison("opencv-sift", PLAIN)

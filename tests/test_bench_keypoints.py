@@ -1,8 +1,7 @@
-"""What scripts/bench_detector and scripts/bench_descriptors are made of: truth of keypoints, and figures by hand."""
+"""What scripts/bench keypoints is made of: truth of keypoints, and figures by hand."""
 
 from __future__ import annotations
 
-import importlib
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,22 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.keypoints import correspondence, descriptors, detectors, figures, orientations, tables
+from benchmarks.peers import base
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import RenderedTruth, open_truth
-
-SCRIPTS = Path(__file__).parent.parent / "scripts"
-Module = Any
-
-
-@pytest.fixture(autouse=True)
-def _scripts_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(SCRIPTS)
-
-
-def module(name: str) -> Module:
-    return importlib.import_module(f"keypoint_bench.{name}")
 
 
 def names_of(block: Path) -> list[str]:
@@ -33,10 +22,9 @@ def names_of(block: Path) -> list[str]:
 
 
 def pictures_of(block: Path, work: Path) -> Any:
-    base = importlib.import_module("methods.base")
     files = block / "images", block / "poses.csv", block / "block.json"
     scene = base.Scene("suburb", *files, open_truth(block).cameras, ())
-    return module("pictures").Pictures(scene, work)
+    return correspondence.Pictures(scene, work)
 
 
 def both(block: Path, work: Path, frame: str) -> Any:
@@ -46,12 +34,12 @@ def both(block: Path, work: Path, frame: str) -> Any:
 
 def test_the_smallest_error_goes_first_and_every_keypoint_once() -> None:
     pairs = np.array([[0, 0], [0, 1], [1, 0], [2, 2]])
-    chosen = module("correspondence").one_to_one(pairs, np.array([1.0, 0.5, 2.0, 0.1]))
+    chosen = correspondence.one_to_one(pairs, np.array([1.0, 0.5, 2.0, 0.1]))
     assert sorted(map(tuple, pairs[chosen].tolist())) == [(0, 1), (1, 0), (2, 2)]
 
 
 def test_true_places_are_partners_and_shifted_ones_as_far_off_as_they_were_shifted(rendered: Path) -> None:
-    correspondence, truth = module("correspondence"), open_truth(rendered)
+    truth = open_truth(rendered)
     assert isinstance(truth, RenderedTruth)
     name0, name1 = names_of(rendered)
     x, y = np.meshgrid(np.arange(10.0, 310.0, 23.0), np.arange(10.0, 230.0, 19.0))
@@ -70,8 +58,7 @@ def test_true_places_are_partners_and_shifted_ones_as_far_off_as_they_were_shift
 
 
 def test_places_go_to_stored_pixels_and_back(rendered: Path, tmp_path: Path) -> None:
-    pictures = module("pictures")
-    ground, _ = both(rendered, tmp_path, pictures.GROUND)
+    ground, _ = both(rendered, tmp_path, correspondence.GROUND)
     assert ground.view is not None
     height, width = ground.seen.shape
     points = np.array([[0.5 * width, 0.5 * height], [0.4 * width, 0.6 * height]])
@@ -90,13 +77,12 @@ def flat_truth(matrix: FloatArray, camera: Camera) -> tuple[Any, Any]:
         return there, np.zeros(len(there), bool)
 
     blank = np.zeros((10, 10), np.uint8)
-    picture = module("pictures").Picture("a", blank, blank, blank == 0, camera, None)
+    picture = correspondence.Picture("a", camera, None, blank, blank, blank == 0)
     return SimpleNamespace(truth=SimpleNamespace(transfer=transfer)), picture
 
 
 @pytest.mark.parametrize("turn_deg", [-120.0, 0.0, 35.0])
 def test_turn_and_scale_are_those_of_the_nearest_rotation(rendered: Path, turn_deg: float) -> None:
-    correspondence = module("correspondence")
     cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     truth, picture = flat_truth(rotation @ np.diag([2.0, 0.5]), next(iter(open_truth(rendered).cameras.values())))
@@ -111,7 +97,6 @@ def test_turn_and_scale_are_those_of_the_nearest_rotation(rendered: Path, turn_d
 
 
 def test_angles_of_one_place_disagree_by_what_the_turn_leaves() -> None:
-    orientations = module("orientations")
     angles0 = np.array([[10.0, np.nan], [350.0, 90.0], [0.0, np.nan]])
     angles1 = np.array([[45.0, np.nan], [10.0, np.nan], [200.0, 5.0]])
     apart = orientations.disagreement_deg(angles0, angles1, np.array([30.0, 15.0, 0.0]))
@@ -124,15 +109,12 @@ def test_angles_of_one_place_disagree_by_what_the_turn_leaves() -> None:
 
 @pytest.mark.parametrize("frame", ["source", "ground"])
 def test_sift_is_found_again_and_its_angles_agree(rendered: Path, tmp_path: Path, frame: str) -> None:
-    bench, detectors, orientations = (
-        importlib.import_module("bench_detector"), module("detectors"), module("orientations"),
-    )  # fmt: skip
     truth, pictures = open_truth(rendered), both(rendered, tmp_path, frame)
     detector = detectors.Sift(None)
     sides = tuple(detector(picture, 5000) for picture in pictures)
     for side in sides:
         assert len(np.unique(side.points_px, axis=0)) == len(side.points_px)
-    row = bench.detector_row(truth, sides, pictures, 150)
+    row = detectors.detector_row(truth, sides, pictures, 150)
     assert (row["keypoints0"], row["keypoints1"]) == (150, 150)
     assert 0.3 < row["repeated_3px"] / 150 <= 1.0
     assert 0.2 < row["repeated_1px"] / row["repeated_3px"] < 1.0
@@ -147,26 +129,24 @@ def test_sift_is_found_again_and_its_angles_agree(rendered: Path, tmp_path: Path
 
 
 def test_figures_of_descriptors_worked_by_hand() -> None:
-    metrics = module("metrics")
     same, other = np.arange(1.0, 21.0), np.array([5.0, 18.9, 19.0, 19.1, 30.0])
-    assert metrics.false_positive_rate(same, other) == pytest.approx(3 / 5)  # 19 of 20 accepted at 19
-    assert math.isnan(metrics.false_positive_rate(same[:0], other))
+    assert descriptors.false_positive_rate(same, other) == pytest.approx(3 / 5)  # 19 of 20 accepted at 19
+    assert math.isnan(descriptors.false_positive_rate(same[:0], other))
     scores, correct = np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, False, True, False])
-    assert metrics.average_precision(scores, correct, 4) == pytest.approx((1 / 1 + 2 / 3) / 4)
-    assert metrics.average_precision(np.ones(4), correct, 2) == pytest.approx(0.5)  # ties come at once
-    assert math.isnan(metrics.average_precision(scores, correct, 0))
+    assert descriptors.average_precision(scores, correct, 4) == pytest.approx((1 / 1 + 2 / 3) / 4)
+    assert descriptors.average_precision(np.ones(4), correct, 2) == pytest.approx(0.5)  # ties come at once
+    assert math.isnan(descriptors.average_precision(scores, correct, 0))
     first, second = np.random.default_rng(0).normal(size=(2, 30, 8)).astype(np.float32)
     wanted = np.linalg.norm(first[:, None] - second[None], axis=2)
-    np.testing.assert_allclose(metrics.distances(first, second), wanted, atol=1e-4)
+    np.testing.assert_allclose(descriptors.distances(first, second), wanted, atol=1e-4)
 
 
 def test_nearest_neighbours_are_right_within_three_pixels_of_the_partner() -> None:
-    metrics = module("metrics")
     places = np.array([[0.0, 0.0], [2.0, 0.0], [50.0, 0.0]])
     # Partner itself; another keypoint of its place; elsewhere; without partner; not asked.
     apart = np.array([[1, 5, 9], [3, 9, 9], [9, 9, 1], [2, 3, 9], [1, 9, 9]], np.float32)
     partner, asked = np.array([0, 1, 0, -1, 0]), np.array([True, True, True, True, False])
-    found = metrics.nearest_neighbours(apart, partner, places, asked)
+    found = descriptors.nearest_neighbours(apart, partner, places, asked)
     assert found.right == pytest.approx(2 / 3)
     # By ratio: wrong 1/9, right 1/5, right 3/9, without partner 2/3.
     assert found.by_ratio == pytest.approx((1 / 2 + 2 / 3) / 3)
@@ -175,17 +155,14 @@ def test_nearest_neighbours_are_right_within_three_pixels_of_the_partner() -> No
 
 
 def test_sift_tells_places_apart_and_noise_does_not(rendered: Path, tmp_path: Path) -> None:
-    bench, descriptors = importlib.import_module("bench_descriptors"), module("descriptors")
     truth = open_truth(rendered)
-    pictures = pictures_of(rendered, tmp_path)
-    pair = SimpleNamespace(images=tuple(names_of(rendered)))
-    task = bench.make_task(truth, pictures, pair, 300, np.random.default_rng(0), upright=True)
+    task = descriptors.make_task(truth, both(rendered, tmp_path, "ground"), 300, np.random.default_rng(0), upright=True)
     assert (task.partner >= 0).sum() > 30
     for side in task.sides:
         assert side.patches.shape == (len(side.own), 32, 32)
-    row = bench.descriptor_row(descriptors.Sift(None, root=True), task)
+    row = descriptors.descriptor_row(descriptors.Sift(None, root=True), task)
     rng = np.random.default_rng(1)
-    noise = bench.descriptor_row(lambda side: rng.normal(size=(len(side.own), 128)).astype(np.float32), task)
+    noise = descriptors.descriptor_row(lambda side: rng.normal(size=(len(side.own), 128)).astype(np.float32), task)
     assert row["corresponding"] == noise["corresponding"]
     assert row["map_by_ratio"] > 0.5 > 0.1 > noise["map_by_ratio"]
     assert row["fpr95"] < 0.2 < noise["fpr95"]
@@ -193,20 +170,18 @@ def test_sift_tells_places_apart_and_noise_does_not(rendered: Path, tmp_path: Pa
 
 
 def test_names_may_have_labels_and_weights(tmp_path: Path) -> None:
-    named = module("named")
-    found = named.named("sift, mine=ours, new=ours:a/b=c.safetensors", {"sift": None, "ours": None})
+    found = figures.named("sift, mine=ours, new=ours:a/b=c.safetensors", {"sift": None, "ours": None})
     assert [(one.label, one.name) for one in found] == [("sift", "sift"), ("mine", "ours"), ("new", "ours")]
     assert found[2].weights == Path("a/b=c.safetensors")
-    assert named.without_paths("sift,new=ours:a/b.safetensors,tfeat") == "sift,new=ours:FILE,tfeat"
+    assert figures.without_paths("sift,new=ours:a/b.safetensors,tfeat") == "sift,new=ours:FILE,tfeat"
     for wrong, said in (("surf", "none of"), ("ours,ours:x", "two methods")):
         with pytest.raises(ConfigError, match=said):
-            named.named(wrong, {"sift": None, "ours": None})
+            figures.named(wrong, {"sift": None, "ours": None})
     with pytest.raises(ConfigError, match="not found"):
-        named.make({"ours": lambda _options, weights: weights}, found[2], None)
+        figures.make({"ours": lambda _options, weights: weights}, found[2], None)
 
 
 def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
-    figures, named = module("figures"), module("named")
     judged = SimpleNamespace(key="k", scene=SimpleNamespace(name="city"))
     pair = SimpleNamespace(images=("a", "b"), conditions=SimpleNamespace(view_angle_deg=41.0, overlap=0.5))
     made = []
@@ -216,7 +191,7 @@ def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
         return {"figure": len(made)}
 
     def row(settings: int, method: str) -> Any:
-        one = named.Named(method, method, None)
+        one = figures.Named(method, method, None)
         return figures.Store(tmp_path, settings).row(judged, pair, "detector", "ground", one, make)
 
     first = row(1, "sift")
@@ -226,8 +201,7 @@ def test_figures_are_made_once_for_what_they_depend_on(tmp_path: Path) -> None:
 
 
 def test_tables_sum_pairs_and_put_large_angles_together() -> None:
-    tables = module("tables")
-    common = {"section": "detector", "method": "sift", "frame": "ground", "keypoints0": 100, "keypoints1": 80}
+    common = {"section": "detectors", "method": "sift", "frame": "ground", "keypoints0": 100, "keypoints1": 80}
     rows = [
         common | {"view_angle_deg": angle, "repeated_3px": repeated, "repeated_1px": 4, "error_px": error}
         for angle, repeated, error in ((45.0, 40, 1.0), (70.0, 20, 2.0))
@@ -236,5 +210,5 @@ def test_tables_sum_pairs_and_put_large_angles_together() -> None:
     assert "| 40-60 | ground | `sift` | 1 | 90 | 50.0 % | 5.0 % | 1.00 |" in text
     assert "| >40 | ground | `sift` | 2 | 90 | 37.5 % | 5.0 % | 1.50 |" in text
     figures = {"corresponding": 10, "fpr95": 0.1, "map_by_ratio": None, "map_by_distance": 0.5, "right": 0.6}
-    line = {"section": "descriptor", "method": "ours", "suns": "two", "view_angle_deg": 50.0, **figures}
+    line = {"section": "descriptors", "method": "ours", "suns": "two", "view_angle_deg": 50.0, **figures}
     assert "| >40 | two | `ours` | 1 | 10 | 10.00 % | - | 50.0 % | 60.0 % |" in tables.descriptor_table([line])

@@ -1,8 +1,7 @@
-"""scripts/bench_methods: --quick runs, its rows agree with one another, resume and repeat; pairs and tables by hand."""
+"""scripts/bench methods: --quick runs, its rows agree with one another, resume and repeat; pairs and tables by hand."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
@@ -11,6 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import scenes
+from benchmarks.methods import results
+from benchmarks.peers import matching, table
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import Conditions
@@ -26,15 +28,10 @@ KEYPOINTS, PAIRS = 512, 4
 Row = dict[str, Any]
 
 
-@pytest.fixture(autouse=True)
-def _scripts_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(SCRIPTS)
-
-
 def bench(out: Path, methods: tuple[str, ...], *more: str) -> subprocess.CompletedProcess[str]:
     quick = ["--quick", "--scenes", "grass", "--images", "8", "--seed", "1", "--out", str(out)]
-    command = [sys.executable, str(SCRIPTS / "bench_methods.py"), *quick, "--methods", ",".join(methods), *more]
-    return subprocess.run(command, check=False, capture_output=True, text=True)
+    command = [sys.executable, "-m", "benchmarks", "methods", *quick, "--methods", ",".join(methods), *more]
+    return subprocess.run(command, check=False, capture_output=True, text=True, cwd=SCRIPTS)
 
 
 def rows_of(out: Path) -> list[Row]:
@@ -119,7 +116,6 @@ def test_unknown_names_are_refused_with_the_choices(tmp_path: Path) -> None:
 
 
 def test_methods_are_split_outside_brackets_and_checked() -> None:
-    table = importlib.import_module("methods.table")
     text = "opencv-sift, baseline[match.ratio=0.7,extract.edge_threshold=8],pycolmap"
     names = table.split_methods(text)
     assert names == ["opencv-sift", "baseline[match.ratio=0.7,extract.edge_threshold=8]", "pycolmap"]
@@ -133,7 +129,6 @@ def test_methods_are_split_outside_brackets_and_checked() -> None:
 
 def candidates(hard: int, easy: int) -> list[Any]:
     """Pairs whose angles run through all classes: hard ones from 30 degrees on, easy ones below."""
-    scenes = importlib.import_module("methods.scenes")
     angles = [("hard", 30.0 + 50.0 * i / hard) for i in range(hard)] + [("easy", 29.0 * i / easy) for i in range(easy)]
     return [
         scenes.JudgedPair((f"{i:03}", "x"), kind, Conditions(angle, 0.5, 0.0, 0.1))
@@ -145,7 +140,6 @@ def candidates(hard: int, easy: int) -> list[Any]:
     ("hard", "easy", "expected"), [(60, 60, (6, 6)), (60, 2, (10, 2)), (3, 60, (3, 9)), (2, 2, (2, 2))]
 )
 def test_pairs_are_spread_and_filled_up(hard: int, easy: int, expected: tuple[int, int]) -> None:
-    scenes = importlib.import_module("methods.scenes")
     selection = scenes.Selection("all", 12, 0)
     pool = candidates(hard, easy)
     pairs = scenes.chosen(pool, selection, np.random.default_rng(0))
@@ -161,7 +155,6 @@ def test_pairs_are_spread_and_filled_up(hard: int, easy: int, expected: tuple[in
 
 
 def test_a_summary_worked_by_hand() -> None:
-    results = importlib.import_module("methods.results")
     common = {"possible": 100, "coverage": 0.5, "peak_mb": 100.0}
     good = {**common, "correct": 40, "kept": 50, "median_error_px": 0.5, "seconds": 1.0}
     none = {**common, "correct": 0, "kept": 0, "median_error_px": None, "seconds": 3.0}
@@ -171,11 +164,10 @@ def test_a_summary_worked_by_hand() -> None:
     auc5, auc10 = (2.5 * 0.5 / 2 + 2.5 * 0.5) / 5, (2.5 * 0.5 / 2 + 7.5 * 0.5) / 10
     expected = ["2", "40", "50", "80.0 %", "20.0 %", "50 %", "0.50", "0.500"]
     expected += [f"{auc5:.2f}", f"{auc10:.2f}", "2.00", "100"]
-    assert results.summary([good, none]) == expected
+    assert [str(cell([good, none])) for _, cell in results.COLUMNS] == expected
 
 
 def test_nearest_neighbours_of_the_peers_are_exact() -> None:
-    matching = importlib.import_module("methods.matching")
     rng = np.random.default_rng(0)
     first = rng.integers(0, 40, (600, 8)).astype(np.float32)
     second = (first[rng.permutation(600)[:500]] + rng.integers(-4, 5, (500, 8))).astype(np.float32)

@@ -1,36 +1,29 @@
-"""scripts/bench_oblique: peers on rectified views, pairs by view angle, and the goals of hand-made rows."""
+"""scripts/bench oblique: peers on rectified views, pairs by view angle, and the goals of hand-made rows."""
 
 from __future__ import annotations
 
-import importlib
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks import scenes
+from benchmarks.methods import oblique
+from benchmarks.peers import base, ground, table
 from conftest import HEIGHT, WIDTH, Site
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import Conditions, open_truth
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
 Row = dict[str, Any]
 
 
-@pytest.fixture(autouse=True)
-def _scripts_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(SCRIPTS)
-
-
 def pair(view_angle_deg: float, number: int) -> Any:
-    scenes = importlib.import_module("methods.scenes")
     condition = "hard" if view_angle_deg >= 30 else "easy"
     return scenes.JudgedPair((f"{number:03}", "x"), condition, Conditions(view_angle_deg, 0.5, 0.0, 0.1))
 
 
 def test_pairs_are_chosen_by_view_angle_and_large_angles_fill_up() -> None:
-    scenes = importlib.import_module("methods.scenes")
     angles = [5.0] * 10 + [25.0] + [50.0] * 10 + [70.0] * 10
     pool = [pair(angle, number) for number, angle in enumerate(angles)]
     found = scenes.chosen(pool, scenes.Selection("angles", 12, 0), np.random.default_rng(0))
@@ -39,7 +32,6 @@ def test_pairs_are_chosen_by_view_angle_and_large_angles_fill_up() -> None:
 
 
 def test_unseen_parts_are_filled_from_beside_and_draw_no_keypoints() -> None:
-    ground = importlib.import_module("methods.ground")
     picture = np.zeros((6, 8, 3), np.uint8)
     picture[:, :4] = [10, 20, 30]
     picture[0, 3] = [200, 0, 0]
@@ -55,14 +47,12 @@ def test_unseen_parts_are_filled_from_beside_and_draw_no_keypoints() -> None:
 
 
 def scene_of(site: Site) -> Any:
-    base = importlib.import_module("methods.base")
     cameras = open_truth(site.root).cameras
     names = tuple(sorted(cameras))
     return base.Scene("suburb", site.images, site.poses, site.root / "block.json", cameras, (names[:2],))
 
 
 def test_peers_on_rectified_views_answer_in_stored_pixels(site: Site) -> None:
-    base, table = importlib.import_module("methods.base"), importlib.import_module("methods.table")
     scene, options = scene_of(site), base.Options(150, "image", 1, 0, None)
     truth = open_truth(site.root)
     method = table.method("opencv-sift@ground")(scene, options)
@@ -90,7 +80,6 @@ def row(method: str, spec: str, at: str, correct: int, **more: Any) -> Row:
 
 
 def test_oblique_goals_worked_by_hand() -> None:
-    oblique = importlib.import_module("methods.oblique")
     rows = [
         row("SIFT", "opencv-sift", "a", 10, median_error_px=0.5),
         row("SIFT", "opencv-sift", "b", 0, kept=0, median_error_px=None),
@@ -118,7 +107,6 @@ def test_oblique_goals_worked_by_hand() -> None:
 
 
 def test_goals_that_are_missed_are_named_and_unknown_ones_are_not() -> None:
-    oblique = importlib.import_module("methods.oblique")
     real = {"possible": None, "scene": "lewis"}
     rows = [row("SIFT", "opencv-sift", "a", 30, **real), row("fusion", "fusion", "a", 40, kept=80, **real)]
     found = oblique.oblique_goals(rows, "fusion")

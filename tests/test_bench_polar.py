@@ -1,12 +1,12 @@
-"""What scripts/bench_polar is made of: pairs cut out of a ground, errors against their truth, tables of the rows."""
+"""What scripts/bench polar is made of: pairs cut out of a ground, errors against their truth, tables of the rows."""
 
 import cv2
 import numpy as np
 import pytest
+from benchmarks.polar.grounds import errors, known_pair
+from benchmarks.polar.sides import SiftPair
+from benchmarks.polar.tables import tables
 from make_ground import ground
-from polar_bench.grounds import errors, known_pair
-from polar_bench.sift import SiftPair
-from polar_bench.tables import tables
 
 from aeromatch_cli.geometry.frames import apply_homography
 

@@ -2,39 +2,30 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from benchmarks.peers import base, superpoint, table
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
-
-
-@pytest.fixture
-def superpoint(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(SCRIPTS)
-    return importlib.import_module("methods.superpoint")
-
 
 def options_of(weights: Path | None, keypoints: int = 200) -> Any:
-    return importlib.import_module("methods.base").Options(keypoints, "image", 1, 0, weights)
+    return base.Options(keypoints, "image", 1, 0, weights)
 
 
 def scene_of(folder: Path) -> Any:
     cameras = {name: Camera("PINHOLE", 300, 236, (300.0, 300.0, 150.0, 118.0)) for name in ("a.png", "b.png")}
     pairs = (("a.png", "b.png"),)
-    return importlib.import_module("methods.base").Scene("s", folder, folder, folder, cameras, pairs)
+    return base.Scene("s", folder, folder, folder, cameras, pairs)
 
 
-def test_a_score_lies_at_its_pixel_of_its_cell(superpoint: ModuleType) -> None:
+def test_a_score_lies_at_its_pixel_of_its_cell() -> None:
     logits = torch.zeros(65, 4, 5)
     logits[64] = 12.0  # nothing anywhere, but
     for (row, column), channel in {(1, 2): 8 * 3 + 5, (2, 3): 8 * 7 + 0, (0, 1): 8 * 2 + 4}.items():
@@ -45,7 +36,7 @@ def test_a_score_lies_at_its_pixel_of_its_cell(superpoint: ModuleType) -> None:
     assert strong == {(16 + 5, 8 + 3), (24 + 0, 16 + 7)}  # the third lies within 4 px of the border
 
 
-def test_of_two_scores_within_four_pixels_the_larger_stays(superpoint: ModuleType) -> None:
+def test_of_two_scores_within_four_pixels_the_larger_stays() -> None:
     logits = torch.full((65, 3, 3), -20.0)
     logits[64] = 0.0
     logits[8 * 4 + 3, 1, 1], logits[8 * 4 + 6, 1, 1] = 2.0, 1.0
@@ -54,7 +45,7 @@ def test_of_two_scores_within_four_pixels_the_larger_stays(superpoint: ModuleTyp
     assert [8 + 6, 8 + 4] not in places.tolist()
 
 
-def test_descriptors_are_read_between_the_centres_of_cells(superpoint: ModuleType) -> None:
+def test_descriptors_are_read_between_the_centres_of_cells() -> None:
     columns = torch.arange(6.0)
     coarse = torch.stack([columns.expand(4, 6), torch.ones(4, 6)])  # tangent of the direction: the column
     places = torch.tensor([[20, 12], [24, 12], [31, 20]])
@@ -64,14 +55,13 @@ def test_descriptors_are_read_between_the_centres_of_cells(superpoint: ModuleTyp
     torch.testing.assert_close(found.norm(dim=1), torch.ones(3))
 
 
-def test_weights_are_read_by_path_and_what_does_not_fit_is_named(superpoint: ModuleType, tmp_path: Path) -> None:
+def test_weights_are_read_by_path_and_what_does_not_fit_is_named(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     picture = cv2.GaussianBlur(rng.integers(0, 255, (240, 310), dtype=np.uint8), (0, 0), 1.5)
     picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
     # Neither side is a multiple of 8; b shows what a does, 8 pixels further left.
     for name, left in (("a.png", 0), ("b.png", 8)):
         cv2.imwrite(str(tmp_path / name), picture[:236, left : left + 300])
-    table = importlib.import_module("methods.table")
     with pytest.raises(ConfigError, match="not found in"):
         table.method("superpoint")(scene_of(tmp_path), options_of(tmp_path))
     torch.save({"conv1a.weight": torch.zeros(1)}, tmp_path / "superpoint_v1.pth")

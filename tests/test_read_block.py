@@ -218,7 +218,7 @@ def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:
     found = {image.name: inputs.poses[image.image_id].center_m[0] for image in inputs.images}
     assert found == {"a/1.jpg": 1.0, "b/1.jpg": 2.0, "b/2.JPG": 3.0, "c/3.jpg": 6.0}
     text = "\n".join(inputs.warnings)
-    assert "names 1 images that are not in the folder: lost.jpg" in text
+    assert "names 1 image that is not in the folder: lost.jpg" in text
     assert "names that several images have (1.jpg)" in text
 
     partial = read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,,,\n"))

@@ -234,7 +234,8 @@ def _matched(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[di
         )
     remarks = []
     if absent:
-        remarks.append(f"{source} names {len(absent)} images that are not in the folder: {listed(absent)}")
+        what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
+        remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
     if ambiguous:
         remarks.append(
             f"{source} gives {len(ambiguous)} names that several images have ({listed(ambiguous)}): their lines are "

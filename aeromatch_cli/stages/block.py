@@ -66,7 +66,9 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         ground, source, remarks = find_ground(settings, inputs, executor)
         warnings += remarks
     if source.startswith(UNKNOWN) and inputs.poses:
-        warnings.append(f"the ground height is {source}; no ground views, no overlap; give --ground METRES or a DEM")
+        attitudes = any(pose.world_rotation is not None for pose in inputs.poses.values())
+        remedy = "give --ground METRES or a DEM" if attitudes else "give attitudes with --poses"
+        warnings.append(f"the ground height is {source}; no ground views, no overlap; {remedy}")
     if kept and not same:
         ground, source = _nearly_stored(before, ground, source, inputs)
     block = Block(

@@ -140,7 +140,7 @@ def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], C
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
             reports.append(report.run(context))
-            raise InputError(f"no pair could be verified; {context.workspace.report} and failures.csv say why")
+            raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
         reports.append(export.run(context))
         reports.append(_current_page(context) or report.run(context))
     return reports, context
@@ -181,7 +181,9 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
             f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
             f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
         )
-        lines += _filter_lines(stage) if stage.stage == "filter" else _picture_lines(stage)
+        lines += (
+            _filter_lines(stage, part=context.shard is not None) if stage.stage == "filter" else _picture_lines(stage)
+        )
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -230,10 +232,13 @@ def _picture_lines(stage: StageReport) -> list[str]:
     return [f"          {'; '.join(words)}"] if words else []
 
 
-def _filter_lines(stage: StageReport) -> list[str]:
+def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
+    """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
     facts = stage.facts
     states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
     lines = [f"          pairs: {states}; {facts['verified_matches']} verified matches"]
+    if part:
+        return lines
     components = facts["components"]
     if len(components) > 1:
         shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")

@@ -141,8 +141,8 @@ def table(describe: Describe, pairs: Sequence[Pair]) -> dict[str, dict[str, floa
 
 def tfeat(weights: Any) -> Describe:
     """TFeat or HardTFeat (kornia) with these weights, lengths normalised."""
+    from benchmarks.peers.kornia_peers import in_tfeat_words
     from kornia.feature import TFeat
-    from methods.keynet import in_tfeat_words
 
     network: Any = TFeat(pretrained=False)
     network.load_state_dict(in_tfeat_words(weights))

@@ -1,0 +1,244 @@
+"""The answer of one method on one block: a COLMAP database, seconds, and what mapping makes of it, kept on disk; its
+verified matches against reference poses; and the pairs across the two series of a block that was flown twice."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.config import load, parse_method
+from aeromatch_cli.data import Block, FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.evaluate.mapping import map_database
+from aeromatch_cli.evaluate.metrics import GRID_CELLS, thin
+from aeromatch_cli.evaluate.reference import load_reference
+from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX
+from aeromatch_cli.strategies.pairings import PAIRINGS
+from aeromatch_cli.workspace import fingerprint, read_json, write_json, write_text
+from benchmarks.blocks import steps
+from benchmarks.blocks.steps import run_step
+from benchmarks.peers.base import MIN_INLIERS, prepared
+from benchmarks.peers.table import Named
+from benchmarks.scenes import MIN_OVERLAP, brightness_of
+from benchmarks.sources import OUR_CODE, code_digest, library_versions
+
+COLMAP = ("pycolmap", "pycolmap-guided", "pycolmap-uncut", "pycolmap-uncut-guided")
+_STEPS = ("benchmarks/blocks/steps.py", "benchmarks/peers/colmap.py")
+Answer = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """images: folder. pairs: image names, or None for a method's own choice (COLMAP: all). command: by `aeromatch run`,
+    start-up, export and report included, instead of stage by stage. keypoints: descriptors per image."""
+
+    images: Path
+    reference: Path
+    pairs: tuple[tuple[str, str], ...] | None
+    keypoints: int
+    jobs: int
+    command: bool = False
+    mapping: bool = True
+
+    @property
+    def pictures(self) -> list[tuple[str, int]]:
+        """Names and bytes: what tells these pictures from others."""
+        return [(path.name, path.stat().st_size) for path in sorted(self.images.iterdir())]
+
+
+def chosen_images(source: Path, every: int, limit: int, folder: Path) -> Path:
+    """Folder of links to every k-th image by name; with a limit, so many of these evenly from first to last."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    paths = sorted(source.iterdir())[::every]
+    if 0 < limit < len(paths):
+        paths = [paths[i * (len(paths) - 1) // max(1, limit - 1)] for i in range(limit)]
+    for path in paths:
+        (folder / path.name).symlink_to(path.resolve())
+    return folder
+
+
+def cross_pairs(images: Path, reference: Path) -> tuple[tuple[str, str], ...]:
+    """The pairs across a block's darker and brighter series. Raises ConfigError where there is none."""
+    found = pairs_across(read_block(images, reference), two_series(brightness_of(images)))
+    if not found:
+        raise ConfigError(f"{images} has no pair across two series: --blocks takes one that was flown twice")
+    return tuple(found)
+
+
+def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
+    """Figures and database of one method; made unless `store` has them."""
+    ours = None if name.spec in COLMAP else load(*parse_method(name.spec)).model_dump(mode="json")
+    code = (*_STEPS, *(OUR_CODE if ours else ()))
+    basis = [name.spec, ours, case.pictures, case.pairs, case.keypoints, case.jobs, case.command and bool(ours)]
+    folder = store / fingerprint(basis, code_digest(*code), library_versions())[:16]
+    folder.mkdir(parents=True, exist_ok=True)
+    database, facts, mapped = folder / "database.db", folder / "answer.json", folder / "mapping.json"
+    if not facts.is_file():
+        made = _colmap(case, name.spec, folder, store) if ours is None else _preset(case, name.spec, folder)
+        shutil.move(made.pop("database"), database)
+        write_json(facts, made)  # last: it says that the rest is there
+        shutil.rmtree(folder / "workspace", ignore_errors=True)
+    found: Answer = read_json(facts)
+    if case.mapping:
+        if not mapped.is_file():
+            write_json(mapped, map_database(database, case.images))
+        found |= read_json(mapped)
+    return found, database
+
+
+def _preset(case: Case, spec: str, folder: Path) -> Answer:
+    preset, settings = parse_method(spec)
+    if case.command:
+        return _run_command(case, preset, settings, folder)
+    pairs = _pair_list(case, folder, ",")
+    return run_step(
+        steps.preset, preset, settings, case.images, case.reference, folder, case.keypoints, case.jobs, pairs
+    )
+
+
+def _run_command(case: Case, preset: str, settings: list[str], folder: Path) -> Answer:
+    """Wall clock and processor seconds of `aeromatch run` from a fresh workspace."""
+    work = folder / "workspace"
+    shutil.rmtree(work, ignore_errors=True)
+    command = [sys.executable, "-c", "from aeromatch_cli.cli import main; main()", "run", preset]
+    command += ["--images", str(case.images), "--poses", str(case.reference / "poses.csv")]
+    command += ["--cameras", str(case.reference / "block.json"), "--workspace", str(work), "--jobs", str(case.jobs)]
+    command += ["--quiet", f"--set=extract.keypoints={case.keypoints}", *(f"--set={text}" for text in settings)]
+    before, started = _processor_seconds(), time.perf_counter()
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    seconds, processor = time.perf_counter() - started, _processor_seconds() - before
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command[3:])} failed with exit code {done.returncode}:\n{done.stderr[-2000:]}")
+    database = work / "export" / "colmap" / "database.db"
+    return {"database": str(database), "seconds": seconds, "processor_seconds": processor}
+
+
+def _processor_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _colmap(case: Case, spec: str, folder: Path, store: Path) -> Answer:
+    """Features are made once for guided and unguided matching; their seconds count for both."""
+    cut = "uncut" not in spec
+    basis = [case.pictures, case.keypoints, case.jobs, cut, code_digest(*_STEPS), library_versions()]
+    shared = store / f"features-{fingerprint(basis)[:16]}"
+    shared.mkdir(parents=True, exist_ok=True)
+    facts, features = shared / "answer.json", shared / "database.db"
+    if not facts.is_file():
+        features.unlink(missing_ok=True)
+        asked = case.images, case.reference, features, case.keypoints, case.jobs, cut
+        found = run_step(steps.colmap_extract, *asked)
+        write_json(facts, found)
+    extracted = read_json(facts)["seconds"]
+    database = folder / "matching.db"
+    shutil.copy(features, database)
+    pairs, guided = _pair_list(case, folder, " "), spec.endswith("-guided")
+    found = run_step(steps.colmap_match, database, case.jobs, guided, pairs)
+    stages = {"extract": extracted, "match+verify": found["seconds"]}
+    return {"database": str(database), "seconds": sum(stages.values()), "stages": stages}
+
+
+def _pair_list(case: Case, folder: Path, separator: str) -> Path | None:
+    if case.pairs is None:
+        return None
+    path = (folder / "pairs.txt").resolve()
+    write_text(path, "".join(f"{a}{separator}{b}\n" for a, b in case.pairs))
+    return path
+
+
+def two_series(brightness: Mapping[str, float]) -> tuple[set[str], set[str]]:
+    """Names of the darker and of the brighter series: cut where brightness rises by the largest factor."""
+    names = sorted(brightness, key=lambda name: brightness[name])
+    levels = np.maximum([brightness[name] for name in names], 1.0)
+    cut = 1 + int(np.argmax(levels[1:] / levels[:-1]))
+    return set(names[:cut]), set(names[cut:])
+
+
+def pairs_across(block: Block, series: tuple[set[str], set[str]]) -> list[tuple[str, str]]:
+    """Image names of the pairs across both series whose footprints share a fifth of the smaller one, whatever the angle
+    between both views; sorted.
+    """
+    everything = {"min_overlap": MIN_OVERLAP, "max_view_angle_deg": 180.0, "max_neighbours": max(1, len(block.images))}
+    names = {image.image_id: image.name for image in block.images}
+    found = []
+    for pair in PAIRINGS["overlap"](**everything)(block):
+        first, second = sorted((names[pair.image_id0], names[pair.image_id1]))
+        if pair.overlap >= MIN_OVERLAP and (first in series[0]) != (second in series[0]):
+            found.append((first, second))
+    return sorted(found)
+
+
+def read_block(images: Path, reference: Path) -> Block:
+    """A block with its reference poses, cameras and ground height."""
+    with tempfile.TemporaryDirectory() as scratch:
+        places = images, reference / "poses.csv", reference / "block.json", Path(scratch)
+        return prepared("baseline", ["pairs=exhaustive"], *places, dry=True).block
+
+
+MAX_IMAGE_ID = 2147483647  # COLMAP's pair_id = id1 * MAX_IMAGE_ID + id2
+NamePair = tuple[str, str]
+
+
+def count_matches(database: Path, reference: Path, only: Collection[NamePair] | None = None) -> dict[str, Any]:
+    """Sums over the pairs with at least 15 verified matches; only: those of these image names, sorted within a pair.
+
+    matches: rows. unique_matches: each pair of places once (COLMAP counts a place with two orientations twice).
+    within_3px, within_5px: unique ones by symmetric epipolar distance from the reference poses, on undistorted pixels.
+    thinned*: of the unique ones, those left one-to-one at 2 px spacing in both images, as in every other table.
+    filled_cells: share of the 16 x 16 cells of all images that hold one within 3 px.
+    """
+    truth = load_reference(reference)
+    sums = dict.fromkeys(
+        ("pairs", "matches", "unique_matches", "within_3px", "within_5px", "thinned", "thinned_3px", "thinned_5px"), 0
+    )
+    filled = {name: np.zeros((GRID_CELLS, GRID_CELLS), bool) for name in truth.cameras}
+    with sqlite3.connect(database) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        points_px = {image_id: _stored_px(*rest) for image_id, *rest in connection.execute(_KEYPOINTS)}
+        query = "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows >= ?"
+        for pair_id, rows, data in connection.execute(query, (MIN_INLIERS,)):
+            id0, id1 = divmod(pair_id, MAX_IMAGE_ID)
+            pair = names[id0], names[id1]
+            if only is not None and tuple(sorted(pair)) not in only:
+                continue
+            idx = np.frombuffer(data, np.uint32).reshape(rows, 2)
+            sides = points_px[id0][idx[:, 0]], points_px[id1][idx[:, 1]]
+            places = np.unique(np.hstack(sides), axis=0)
+            errors_px = np.nan_to_num(truth.errors(*pair, places[:, :2], places[:, 2:]), nan=np.inf)
+            for name, side in zip(pair, (places[:, :2], places[:, 2:]), strict=True):
+                camera = truth.cameras[name]
+                cells = (side[errors_px <= CORRECT_PX] + 0.5) / [camera.width_px, camera.height_px] * GRID_CELLS
+                filled[name][tuple(np.clip(cells.astype(int), 0, GRID_CELLS - 1).T)] = True
+            kept = errors_px[thin(places[:, :2], places[:, 2:], np.zeros(len(places)))]
+            found = (1, rows, len(places), *_within(errors_px), len(kept), *_within(kept))
+            sums = {key: total + value for (key, total), value in zip(sums.items(), found, strict=True)}
+    counts = [len(places_px) for places_px in points_px.values()]
+    shares = [filled[name].mean() for name in names.values()]
+    return sums | {
+        "keypoints_mean": float(np.mean(counts)), "keypoints_max": max(counts), "filled_cells": float(np.mean(shares)),
+    }  # fmt: skip
+
+
+_KEYPOINTS = "SELECT image_id, rows, cols, data FROM keypoints"
+
+
+def _stored_px(rows: int, columns: int, data: bytes | None) -> FloatArray:
+    """Places (K, 2) of COLMAP's keypoints; its origin is the corner."""
+    return np.frombuffer(data or b"", np.float32).reshape(rows, columns)[:, :2].astype(np.float64) - 0.5
+
+
+def _within(errors_px: FloatArray) -> tuple[int, int]:
+    return int((errors_px <= CORRECT_PX).sum()), int((errors_px <= WITHIN_PX).sum())

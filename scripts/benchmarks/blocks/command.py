@@ -1,0 +1,129 @@
+"""Real blocks: this project's presets beside pycolmap's own SIFT, same images, budget and thresholds.
+
+DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}; a block that it lacks is rendered, nadir,
+where it is the name of a preset of synth. A method is a preset, with settings in
+brackets as in `--set` and a label before it where the name gets long ('plain=fusion[enhance=none]'), or COLMAP's CPU
+SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
+
+  blocks    every k-th image (--thin); extraction, matching and verification are timed, start-up and export are not;
+            then pycolmap's incremental mapping from each database. COLMAP matches all pairs, a preset those it chooses
+  thinned   the same where ordinary matching falls apart
+  cross     only pairs across a block's darker and brighter series that share a fifth of the smaller footprint
+  easy      wall clock of `aeromatch run`, everything included, against the first method
+
+Every step runs in a process of its own. The budget is exact for all, in COLMAP's sense of a keypoint (a place with two
+orientations counts twice). pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. It is
+therefore cut to the budget after extraction, untimed, largest scales first as its own rule would; pycolmap-uncut is
+not. Verified matches are those of pairs with at least 15, each pair of places once (COLMAP counts a place with two
+orientations twice); within 3 and 5 px: by symmetric epipolar distance from the reference poses.
+Writes OUT/SECTION.json and OUT/SECTION.md; OUT/answers keeps what every method answered: a killed run goes on there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.synthetic.presets import PRESETS
+from benchmarks import options, stamps
+from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, count_matches, cross_pairs
+from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
+from benchmarks.peers.table import Named, check_method, named_methods, settings_of
+from benchmarks.scenes import render_once
+from benchmarks.tables import Row, write_rows
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a section does where an option is not given."""
+
+    blocks: str
+    thin: str
+    keypoints: int
+    methods: str
+    table: Callable[[Sequence[Row]], str]
+    mapping: bool
+
+
+EXHAUSTIVE = "baseline[pairs=exhaustive]"
+SECTIONS = {
+    "blocks": Section("sheffield,ochota,brighton", "1", 4000, f"{EXHAUSTIVE},pycolmap", blocks_table, True),
+    "thinned": Section("ochota,lewis,seneca,caliterra", "2,3", 3000, "pycolmap-uncut,baseline", blocks_table, True),
+    "cross": Section("ochota", "1", 4500, "pycolmap-uncut-guided,baseline", cross_table, False),
+    "easy": Section("sheffield,brighton", "1", 4000, "baseline", easy_table, False),
+}
+QUICK_IMAGES, QUICK = 8, {"keypoints": 1000}
+RENDERED = {"seed": 3_000_001, "images": 20, "width_px": 1600, "height_px": 1200}
+
+
+def rows_of(args: argparse.Namespace, section: str, methods: Sequence[Named]) -> Iterator[Row]:
+    """Rows in the order of the table."""
+    for block in args.blocks:
+        source, reference = block_folders(args, block)
+        for every in args.thin:
+            limit = QUICK_IMAGES if args.quick else 0
+            folder = args.out / "images" / f"{block}-{every}-{limit or 'all'}"
+            images = chosen_images(source / "images", every, limit, folder)
+            pairs = cross_pairs(images, reference) if section == "cross" else None
+            mapping = SECTIONS[section].mapping and not args.no_mapping
+            case = Case(images, reference, pairs, args.keypoints, args.jobs, section == "easy", mapping)
+            for name in methods:
+                found, database = answer(case, name, args.out / "answers")
+                only = None if pairs is None else set(pairs)
+                head = {"block": block, "every": every, "method": name.label, "spec": name.spec}
+                head |= {"images": len(case.pictures), "asked_keypoints": args.keypoints, "cores": args.jobs}
+                asked = {} if pairs is None else {"asked_pairs": len(pairs)}
+                yield head | asked | found | count_matches(database, reference, only)
+
+
+def block_folders(args: argparse.Namespace, block: str) -> tuple[Path, Path]:
+    """Folders of a block, with a folder images, and of its reference poses. One that DATA lacks is rendered where it
+    is the name of a preset of synth.
+    """
+    source = args.data / block
+    if (source / "reference" / "block.json").is_file():
+        return source, source / "reference"
+    if block not in PRESETS or source.exists():
+        raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
+    folder = render_once(args.out / "rendered", block, jobs=args.jobs, **RENDERED)
+    return folder, folder
+
+
+def make_options(section: str) -> argparse.ArgumentParser:
+    default = SECTIONS[section]
+    parser = options.make_parser(f"blocks {section}", __doc__)
+    add = parser.add_argument
+    add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
+    add("--blocks", type=options.names, default=default.blocks, help="names, comma-separated")
+    add("--thin", type=options.numbers, default=default.thin, help="keep every k-th image; several k comma-separated")
+    add("--keypoints", type=options.positive, default=default.keypoints, help="descriptors per image")
+    add("--methods", default=default.methods, help="comma-separated; the first is what others are compared with")
+    add("--jobs", type=options.positive, default=2)
+    add("--no-mapping", action="store_true", help="leave out pycolmap's mapping")
+    options.add_output(parser)
+    return parser
+
+
+def main(arguments: Sequence[str]) -> None:
+    first = options.make_parser("blocks", __doc__)
+    first.add_argument("section", choices=tuple(SECTIONS))
+    section = first.parse_args(arguments[:1]).section
+    parser = make_options(section)
+    args = options.parse(parser, arguments[1:], QUICK)
+    methods = named_methods(args.methods)
+    for name in methods:
+        check_method(name.spec, COLMAP)
+    rows: list[Row] = []
+    for row in rows_of(args, section, methods):
+        rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+        write_rows(args.out / f"{section}.json", rows)
+    options.publish(
+        args, SECTIONS[section].table(rows) + "\n", args.out / f"{section}.md", table=f"bench_{section}",
+        command=options.command_line(parser, args), versions=stamps.of_settings(*settings_of(methods)),
+    )  # fmt: skip

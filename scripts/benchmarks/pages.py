@@ -1,0 +1,121 @@
+"""The results pages of docs/results: benchmarks write their tables there, each with a stamp of what it rests on.
+
+    <!-- table NAME: start -->
+    <!-- stamp {"command": ..., "commit": ..., "date": ..., "machine": ..., "trained_on": [...], "versions": {...}} -->
+
+        scripts/bench ...
+
+    Commit ..., DATE; MACHINE; networks trained on ....
+
+    | ... |
+    <!-- table NAME: end -->
+
+`versions` holds every number that the table depends on: FAMILY.STRATEGY, "pipeline", "filter.chain" and
+"weights.NETWORK" (SHA-256, 12 digits); null is unknown. The first line of a page names the tables that are older than
+the code: `# Title (older than the code: NAME, NAME)`. `scripts/bench pages` brings these lines up to date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from aeromatch_cli.workspace import write_text
+from benchmarks.stamps import REPOSITORY, Stamp, Versions, changed, present_versions, said
+
+FOLDER = REPOSITORY / "docs" / "results"
+# Table -> page.
+PAGES: Mapping[str, str] = {
+    "bench_methods": "methods.md",
+    "bench_blocks": "methods.md",
+    "bench_thinned": "methods.md",
+    "bench_fusion": "fusion.md",
+    "bench_fusion_per_view": "fusion.md",
+    "bench_shadow": "fusion.md",
+    "bench_filters": "fusion.md",
+    "bench_filters_oblique": "fusion.md",
+    "bench_cross": "fusion.md",
+    "bench_easy": "fusion.md",
+    "bench_lightglue": "lightglue.md",
+    "bench_lightglue_speed": "lightglue.md",
+    "bench_lightglue_speed_float32": "lightglue.md",
+    "bench_polar-1840x1350": "polar.md",
+    "bench_polar-7360x5400": "polar.md",
+    "bench_polar_blocks": "polar.md",
+    "bench_oblique": "oblique.md",
+    "bench_oblique_poor": "oblique.md",
+    "bench_oblique_real": "oblique.md",
+    "bench_oblique_blocks": "oblique.md",
+    "bench_rectification": "oblique.md",
+    "bench_detector": "extraction.md",
+    "bench_descriptors": "extraction.md",
+    "bench_extraction": "extraction.md",
+    "bench_extraction_float32": "extraction.md",
+}
+_TABLE = re.compile(r"<!-- table (\S+): start -->\n(.*?)<!-- table \1: end -->", re.DOTALL)
+_STAMP = re.compile(r"<!-- stamp (\{.*\}) -->\n")
+_HEAD = re.compile(_STAMP.pattern + r"\n    \S.*\n\nCommit .*\n")
+_OLDER = re.compile(r" \(older than the code: [^)]*\)$")
+
+
+def write_table(page: Path, name: str, text: str, stamp: Stamp) -> None:
+    """Replace what stands between the page's markers of this name, and bring its first line up to date.
+
+    Raises SystemExit where the markers are missing.
+    """
+    old = page.read_text(encoding="utf-8") if page.is_file() else ""
+    if not any(match[1] == name for match in _TABLE.finditer(old)):
+        start, end = f"<!-- table {name}: start -->", f"<!-- table {name}: end -->"
+        raise SystemExit(f"{page} lacks the lines {start} and {end}: add them where the table belongs")
+    body = f"{head(stamp)}\n{text.strip()}\n"
+    new = _TABLE.sub(lambda match: match[0].replace(match[2], body) if match[1] == name else match[0], old)
+    write_text(page, refreshed(new))
+
+
+def head(stamp: Stamp) -> str:
+    """The lines of a table above its text."""
+    return f"<!-- stamp {json.dumps(stamp, ensure_ascii=False)} -->\n\n    {stamp['command']}\n\n{said(stamp)}\n"
+
+
+def stamps(page_text: str) -> Iterator[tuple[str, Stamp]]:
+    """Name and stamp of every table of a page. Raises ValueError where one has none."""
+    for match in _TABLE.finditer(page_text):
+        found = _STAMP.search(match[2])
+        if found is None:
+            raise ValueError(f"table {match[1]} has no stamp")
+        yield match[1], json.loads(found[1])
+
+
+def outdated_tables(page_text: str, present: Versions | None = None) -> list[str]:
+    """Tables of a page that depend on a version which is another one now."""
+    now = present_versions() if present is None else present
+    return [name for name, stamp in stamps(page_text) if any(changed(stamp, now))]
+
+
+def first_line(page_text: str, present: Versions | None = None) -> str:
+    """As it has to be: the title, and which tables are older than the code."""
+    title = _OLDER.sub("", page_text.partition("\n")[0])
+    older = outdated_tables(page_text, present)
+    return f"{title} (older than the code: {', '.join(older)})" if older else title
+
+
+def refreshed(page_text: str, present: Versions | None = None) -> str:
+    """The page with its first line, and every table's command and line of facts, as its stamps say."""
+    text = _HEAD.sub(lambda match: head(json.loads(match[1])), page_text)
+    return first_line(text, present) + "\n" + text.partition("\n")[2]
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench pages", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.parse_args(arguments)
+    present = present_versions()
+    for path in sorted(FOLDER.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        write_text(path, refreshed(text, present))
+        for name, stamp in stamps(text):
+            print(f"{path.name}: {name}: {', '.join(changed(stamp, present)) or 'up to date'}")

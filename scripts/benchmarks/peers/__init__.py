@@ -1,0 +1,8 @@
+"""Methods that are compared: peers, and this project's presets with settings in brackets.
+
+base      what a method is given and what it answers; pictures and weights of peers
+matching  nearest neighbours and MAGSAC++, as users of OpenCV and kornia call them
+opencv, colmap, kornia_peers, superpoint   the peers; ground: any of them on rectified views
+ours      a preset of this project
+table     name -> method
+"""

@@ -1,0 +1,118 @@
+"""Every method by name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+from aeromatch_cli.config import Settings, load, parse_method, preset_names
+from aeromatch_cli.errors import ConfigError
+from benchmarks.peers.base import Method, Options, Scene
+from benchmarks.peers.colmap import Colmap
+from benchmarks.peers.ground import OnGround
+from benchmarks.peers.kornia_peers import TFEAT, Aliked, KeyNet
+from benchmarks.peers.opencv import OpenCvAsift, OpenCvSift
+from benchmarks.peers.ours import Preset
+
+Make = Callable[[Scene, Options], Method]
+
+
+def _superpoint(scene: Scene, options: Options) -> Method:
+    """Its class needs torch as soon as it is read; names are needed without."""
+    from benchmarks.peers.superpoint import SuperPoint
+
+    return SuperPoint(scene, options)
+
+
+_FROM_PICTURES: Mapping[str, Make] = {
+    "opencv-sift": OpenCvSift,
+    "opencv-asift": OpenCvAsift,
+    "aliked": Aliked,
+    "keynet": KeyNet,
+    "keynet-tfeat": partial(KeyNet, descriptor=TFEAT),
+    "superpoint": _superpoint,
+}
+ON_GROUND = "@ground"
+PEERS: Mapping[str, Make] = {
+    **_FROM_PICTURES,
+    "pycolmap": Colmap,
+    "pycolmap-guided": partial(Colmap, guided=True),
+    **{f"{name}{ON_GROUND}": partial(OnGround, peer=make) for name, make in _FROM_PICTURES.items()},
+}
+_NETWORKS = ("aliked", "keynet", "keynet-tfeat", "superpoint")
+NEED_WEIGHTS = tuple(name for name in PEERS if name.removesuffix(ON_GROUND) in _NETWORKS)
+# What --methods stands for where it is not given: whatever needs no weights, on the pictures as they are.
+CLASSICAL = tuple(name for name in PEERS if name not in NEED_WEIGHTS and not name.endswith(ON_GROUND))
+
+
+def reads_poses(spec: str) -> bool:
+    """Whether a method's answers depend on the poses: presets, and peers on rectified views."""
+    return spec not in PEERS or spec.endswith(ON_GROUND)
+
+
+@dataclass(frozen=True)
+class Named:
+    """A method as it is asked for. label: in tables and rows. spec: a peer, or PRESET[key=value,...]."""
+
+    label: str
+    spec: str
+
+
+def named_methods(text: str) -> list[Named]:
+    """The methods between commas, each with a label before it or not: 'opencv-sift,plain=fusion[enhance=none]'.
+
+    Raises ConfigError where a label stands for two methods, or is the name of another one.
+    """
+    found: dict[str, Named] = {}
+    for part in split_methods(text):
+        match = re.fullmatch(r"(?:([^\[\]=|`]+)=)?([^\[\]=]+(?:\[.*\])?)", part)
+        if match is None:
+            raise ConfigError(f"{part!r} is not a method; write a peer, PRESET[key=value] or LABEL=PRESET[key=value]")
+        spec = match[2].strip()
+        label = (match[1] or spec).strip()
+        if label != spec and label in (*PEERS, *preset_names()):
+            raise ConfigError(f"{part!r}: {label} is a method itself; take another label")
+        if label in found:
+            raise ConfigError(f"{label} stands for {found[label].spec} and for {spec}; labels must differ")
+        found[label] = Named(label, spec)
+    return list(found.values())
+
+
+def method(text: str) -> Make:
+    """How to make the method that `text` names. Raises ConfigError as `check_method`; nothing is run yet."""
+    check_method(text)
+    name, settings = parse_method(text)
+    return PEERS[name] if name in PEERS else partial(Preset, preset=name, settings=tuple(settings))
+
+
+def check_method(text: str, peers: Collection[str] = PEERS) -> None:
+    """Raises ConfigError where it is neither a peer nor PRESET[key=value,...] with settings that there are."""
+    name, settings = parse_method(text)
+    if name in peers:
+        if settings:
+            raise ConfigError(f"{text!r}: the peer {name} has no settings; only presets have")
+    elif name not in preset_names():
+        choices = f"peers are {', '.join(peers)}; presets are {', '.join(preset_names())}"
+        raise ConfigError(f"{name!r} is no method; {choices}")
+    else:
+        load(name, settings)
+
+
+def settings_of(names: Iterable[Named]) -> list[Settings]:
+    """Of those that are presets."""
+    specs = (parse_method(name.spec) for name in names)
+    return [load(preset, settings) for preset, settings in specs if preset in preset_names()]
+
+
+def split_methods(text: str) -> list[str]:
+    """Names between commas; commas inside brackets belong to the method."""
+    parts, depth = [""], 0
+    for character in text:
+        depth += (character == "[") - (character == "]")
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts if part.strip()]

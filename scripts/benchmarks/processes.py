@@ -1,0 +1,79 @@
+"""Threads, memory and processes of their own, so that seconds and megabytes are those of what is measured."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import statistics
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def limit_threads(threads: int) -> None:
+    """For this process and those started from it; numerical libraries read it when they are loaded."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = str(threads)
+    os.environ["OPENCV_LOG_LEVEL"] = "ERROR"
+
+
+def fresh_process(workers: int = 1, start: Callable[..., None] | None = None, *given: Any) -> ProcessPoolExecutor:
+    """Processes that have imported nothing yet; `start(*given)` initialises each."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, context, _started, (start, given))
+
+
+def _started(start: Callable[..., None] | None, given: tuple[Any, ...]) -> None:
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    if start is not None:
+        start(*given)
+
+
+def _leave_with_parent() -> None:
+    """A parent that is killed can tell no one: its workers would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def watched(call: Callable[[], T]) -> tuple[T, float, float]:
+    """Value, seconds, and the peak of resident memory in MB while it ran (where the system cannot reset the peak: of
+    the process so far)."""
+    reset_peak()
+    started = time.perf_counter()
+    value = call()
+    seconds = time.perf_counter() - started
+    return value, seconds, peak_mb()
+
+
+def reset_peak() -> None:
+    """Forget the peak of resident memory, where the system can."""
+    try:
+        _CLEAR.write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process; getrusage would count its parent's before the exec, too."""
+    if _STATUS.is_file():
+        return int(_STATUS.read_text(encoding="ascii", errors="replace").partition("VmHWM:")[2].split()[0]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def median_seconds(call: Callable[[], Any], runs: int) -> tuple[float, Any]:
+    """Median of some calls after the first, and what it returned."""
+    value, seconds = call(), []
+    for _ in range(runs):
+        started = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds), value

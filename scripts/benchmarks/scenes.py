@@ -1,0 +1,196 @@
+"""Rendered scenes and real blocks, and which of their pairs are judged: the same for every method."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
+from aeromatch_cli.geometry.cameras import colmap_params, from_colmap
+from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.images.scaling import shrink, shrink_camera
+from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.workspace import fingerprint, stable_hash, write_json
+from benchmarks.options import size_px
+from benchmarks.peers.base import Scene
+from benchmarks.sources import code_digest
+
+MIN_OVERLAP = 0.2
+# Mean grey level of one image over that of the other from which a pair of real images is hard.
+HARD_BRIGHTNESS_RATIO = 1.6
+HARD, EASY = "hard", "easy"
+# What pairs are chosen by: equal numbers of these kinds, the first ones more where others lack.
+CONDITIONS = {
+    HARD: (HARD,),
+    EASY: (EASY,),
+    "all": (HARD, EASY),
+    "angles": tuple(name for name, _ in reversed(VIEW_ANGLE_CLASSES)),
+}
+EXACT_POSES, NOISY_POSES = "poses.csv", "poses_noisy.csv"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """condition: "hard", "easy", "all" (half of each) or "angles" (a quarter of each view angle class, the larger ones
+    first where some are short). pairs: of each scene."""
+
+    condition: str
+    pairs: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class JudgedPair:
+    """A pair and what makes it hard. condition: "hard" or "easy"."""
+
+    images: tuple[str, str]
+    condition: str
+    conditions: Conditions
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A scene, who judges it, and its pairs. key: changes with the images, the truth and the choice of pairs."""
+
+    scene: Scene
+    truth: BlockTruth
+    pairs: tuple[JudgedPair, ...]
+    key: str
+
+
+def render_once(folder: Path, preset: str, *, jobs: int = 2, **asked: Any) -> Path:
+    """Folder of a rendered block below `folder`; made unless it is there. asked: as of `render_block`."""
+    # The renderer's code counts, so that pictures of an older one are not taken for its own.
+    out = folder / f"{preset}-{fingerprint(preset, asked, code_digest('synthetic'))[:12]}"
+    if not (out / "truth.json").is_file():
+        render_block(out, preset, jobs=jobs, **asked)
+    return out
+
+
+def render_asked(args: argparse.Namespace, preset: str, *, flight: str, seed: int | None = None) -> Path:
+    """Folder of a block as the options of `add_rendered` ask for it, below OUT/scenes."""
+    width_px, height_px = size_px(args.size)
+    size = {"width_px": width_px, "height_px": height_px, "images": args.images}
+    return render_once(args.out / "scenes", preset, seed=args.seed if seed is None else seed, flight=flight, **size)
+
+
+def rendered_scenes(args: argparse.Namespace, condition: str) -> Iterator[tuple[str, Judged]]:
+    """Flight and scene of the blocks that the options ask for, one after the other, each made when it is needed."""
+    selection = Selection(condition, args.pairs, args.seed)
+    for flight, preset in product(args.flights, args.scenes):
+        out = render_asked(args, preset, flight=flight)
+        yield flight, _judged(preset, out, open_truth(out), selection, set())
+
+
+def real(folder: Path, data: Path, block: str, selection: Selection, *, max_size_px: int) -> Judged:
+    """A shared block with reference poses, its images reduced once to at most max_size_px."""
+    source = data / block
+    if not (source / "reference" / "poses.csv").is_file():
+        raise ConfigError(f"{source} is no block with reference poses: give --data and --blocks of such a folder")
+    out = folder / f"{block}-{max_size_px}"
+    if not (out / "block.json").is_file():
+        _reduce(source, out, max_size_px)
+    truth = open_truth(out)
+    return _judged(block, out, truth, selection, _differently_bright(out / "images"))
+
+
+def _judged(name: str, out: Path, truth: BlockTruth, selection: Selection, hard: set[tuple[str, str]]) -> Judged:
+    seen = overlapping(truth)
+    kinds = {images: HARD if found.hard or images in hard else EASY for images, found in seen.items()}
+    candidates = [JudgedPair(images, kinds[images], found) for images, found in seen.items()]
+    # Streams of their own, so that one scene's pairs do not depend on which others are judged.
+    rng = np.random.default_rng([selection.seed, stable_hash(name) % (1 << 32)])
+    pairs = chosen(candidates, selection, rng)
+    listed = tuple(pair.images for pair in pairs)
+    scene = Scene(name, out / "images", out / EXACT_POSES, out / "block.json", truth.cameras, listed)
+    return Judged(scene, truth, pairs, _key(scene))
+
+
+def overlapping(truth: BlockTruth, least: float = MIN_OVERLAP) -> dict[tuple[str, str], Conditions]:
+    """The pairs that overlap by so much at least, names in order, and what is known of them."""
+    near = (pair for pair in combinations(sorted(truth.cameras), 2) if truth.overlap_at_most(*pair) >= least)
+    found = {pair: truth.conditions(*pair) for pair in near}
+    return {pair: conditions for pair, conditions in found.items() if conditions.overlap >= least}
+
+
+def _key(scene: Scene) -> str:
+    return fingerprint(scene.images.parent.name, scene.poses.name, scene.pairs)
+
+
+def with_noisy_poses(judged: Judged) -> Judged | None:
+    """The same scene and pairs with poses that have the block's noise; None where it has none (real blocks)."""
+    poses = judged.scene.poses.with_name(NOISY_POSES)
+    if not poses.is_file():
+        return None
+    scene = replace(judged.scene, poses=poses)
+    return replace(judged, scene=scene, key=_key(scene))
+
+
+def chosen(candidates: list[JudgedPair], selection: Selection, rng: np.random.Generator) -> tuple[JudgedPair, ...]:
+    """As many pairs as asked, seeded, spread over the classes of view angle and of shadow, in the order of names.
+
+    For "all" half of them are hard, for "angles" a quarter is of each class; where a scene has too few of one kind the
+    others fill up.
+    """
+    kinds = CONDITIONS[selection.condition]
+    of_kind = [[c for c in candidates if kind in (c.condition, c.conditions.view_angle_class)] for kind in kinds]
+    orders = [_spread(members, rng) for members in of_kind]
+    wanted = [selection.pairs // len(kinds)] * len(kinds)
+    for k in range(selection.pairs - sum(wanted)):
+        wanted[k] += 1
+    taken = [order[:count] for order, count in zip(orders, wanted, strict=True)]
+    rest = [pair for order, count in zip(orders, wanted, strict=True) for pair in order[count:]]
+    pairs = [pair for part in taken for pair in part]
+    pairs += rest[: selection.pairs - len(pairs)]
+    return tuple(sorted(pairs, key=lambda pair: pair.images))
+
+
+def _spread(candidates: list[JudgedPair], rng: np.random.Generator) -> list[JudgedPair]:
+    """All of them, the classes in turn, at random within a class; the order of the classes is random too."""
+    classes: dict[tuple[str, str], list[JudgedPair]] = {}
+    for i in rng.permutation(len(candidates)):
+        pair = candidates[i]
+        classes.setdefault((pair.conditions.view_angle_class, pair.conditions.shadow_class), []).append(pair)
+    turns = [(turn, rank, pair) for rank, pairs in enumerate(classes.values()) for turn, pair in enumerate(pairs)]
+    return [pair for _, _, pair in sorted(turns, key=lambda item: item[:2])]
+
+
+def brightness_of(images: Path) -> dict[str, float]:
+    """Mean grey level of every image of a folder, by name in order."""
+    return {path.name: float(read_pixels(path, colour=False).mean()) for path in sorted(images.iterdir())}
+
+
+def _differently_bright(images: Path) -> set[tuple[str, str]]:
+    grey = brightness_of(images)
+    ratio = {(a, b): max(grey[a], grey[b]) / max(min(grey[a], grey[b]), 1.0) for a, b in combinations(grey, 2)}
+    return {images for images, value in ratio.items() if value >= HARD_BRIGHTNESS_RATIO}
+
+
+def _reduce(source: Path, out: Path, max_size_px: int) -> None:
+    """Copies of a block's images of at most max_size_px and of its reference, with half-pixel correct cameras."""
+    import cv2
+
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    facts: dict[str, Any] = json.loads((source / "reference" / "block.json").read_text(encoding="utf-8"))
+    longest = max(max(lens["width"], lens["height"]) for lens in facts["cameras"].values())
+    scale = min(1.0, max_size_px / longest)
+    for path in sorted((source / "images").iterdir()):
+        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pixels is not None:
+            cv2.imwrite(str(out / "images" / path.name), shrink(pixels, scale), [cv2.IMWRITE_JPEG_QUALITY, 98])
+    for lens in facts["cameras"].values():
+        camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
+        small = shrink_camera(camera, scale)
+        lens.update(width=small.width_px, height=small.height_px, params=list(colmap_params(small)))
+    shutil.copy(source / "reference" / "poses.csv", out / "poses.csv")
+    write_json(out / "block.json", facts)  # last: it says that the rest is there
