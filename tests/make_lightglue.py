@@ -12,8 +12,8 @@ from torch import Tensor
 from aeromatch_cli.data import Features
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue, Side
 from aeromatch_cli.nets.lightglue_file import Calibration
-from aeromatch_cli.strategies.matchers.lightglue.matcher import inference
-from aeromatch_cli.strategies.matchers.lightglue.matcher import matcher as lightglue
+from aeromatch_cli.strategies.matchers.lightglue import inference
+from aeromatch_cli.strategies.matchers.lightglue import matcher as lightglue
 
 SIFT = Dimensions(input_dim=128, descriptor_dim=64, n_layers=3, num_heads=2, add_scale_ori=True)
 

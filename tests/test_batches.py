@@ -25,7 +25,8 @@ from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
-from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue, inference
+from aeromatch_cli.strategies.matchers.lightglue import inference
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))

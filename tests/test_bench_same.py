@@ -92,7 +92,7 @@ def test_a_folder_without_verified_matches_and_an_unknown_name_are_errors(
     assert launcher.main(["same", str(first), str(first)]) == 2
     assert "has no verified matches" in capsys.readouterr().err
     assert launcher.main(["sane"]) == 2
-    assert "'sane' is no benchmark" in capsys.readouterr().err
+    assert "knows no 'sane'" in capsys.readouterr().err
     for arguments in ([], ["--help"]):
         assert launcher.main(arguments) == 0
         assert "  same " in capsys.readouterr().out

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import train_context
-from context_training import data
-from context_training.validation import compared
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trainings.context import command as train_context
+from trainings.context import data
+from trainings.context.validation import compared
 
 from aeromatch_cli.nets.context import NEIGHBOURS, Context, evened, layout_of, load_context
 from aeromatch_cli.strategies.extractors.context import as_bytes, context_inputs, from_bytes

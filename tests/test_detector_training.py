@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from detector_training.groups import SIDE_PX, block_group, homography_group
-from detector_training.loss import drawn, peaks, repeat_loss
-from detector_training.scenes import Sight, read_sights, sights, transfer, write_sights
-from detector_training.shapes import shape
-from detector_training.validation import pairs_of, scores, table
 from numpy.typing import NDArray
+from trainings.detector.groups import SIDE_PX, block_group, homography_group
+from trainings.detector.loss import drawn, peaks, repeat_loss
+from trainings.detector.scenes import Sight, read_sights, sights, transfer, write_sights
+from trainings.detector.shapes import shape
+from trainings.detector.validation import pairs_of, scores, table
 
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.synthetic import load_truth

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from patch_training import sources
-from patch_training.validation import Pair, pairs_of, sift, table
 from safetensors.torch import load_file, save_file
+from trainings.patches import sources
+from trainings.patches.validation import Pair, pairs_of, sift, table
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.files import shipped_path

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from detector_training.scenes import sights
-from detector_training.validation import by_heat, by_sift, pairs_of, scores, table
 from numpy.typing import NDArray
+from trainings.detector.scenes import sights
+from trainings.detector.validation import by_heat, by_sift, pairs_of, scores, table
 
 from aeromatch_cli.strategies.extractors.heat import SIZE_PX, heat, heat_keypoints, maxima, refined
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, levels_of

@@ -16,9 +16,9 @@ from aeromatch_cli.nets.lightglue import LightGlue as Network
 from aeromatch_cli.nets.lightglue import Side, log_assignment, mutual_best
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined
 from aeromatch_cli.strategies.matchers.descriptors.search import finished
+from aeromatch_cli.strategies.matchers.lightglue import matcher as lightglue
 from aeromatch_cli.strategies.matchers.lightglue.inference import FRAME_PX
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
-from aeromatch_cli.strategies.matchers.lightglue.matcher import matcher as lightglue
 
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 GEOMETRY = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)

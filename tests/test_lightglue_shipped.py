@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from lightglue_training.blocks import Pair, block_pairs
-from lightglue_training.validation import Found, compared
+from trainings.lightglue.blocks import Pair, block_pairs
+from trainings.lightglue.validation import Found, compared
 
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration

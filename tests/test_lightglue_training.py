@@ -1,4 +1,4 @@
-"""Truth, pieces and figures of scripts/train_lightglue.py, on places known by construction."""
+"""Truth, pieces and figures of scripts/train lightglue, on places known by construction."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import train_lightglue
-from lightglue_training.batches import batch_of, piece
-from lightglue_training.blocks import Pair
-from lightglue_training.data import OutOfTime, mapped, read_groups, write_groups
-from lightglue_training.homographies import SIZE_PX, make_group
-from lightglue_training.loss import loss_of
-from lightglue_training.sides import NONE, UNKNOWN, Partners, Seen, partners
-from lightglue_training.validation import Found, by_ratio, fitted, judged, of_like_look, recalls, thinned
 from make_lightglue import seeded_tensors, write
+from trainings.lightglue import command as train_lightglue
+from trainings.lightglue.batches import batch_of, piece
+from trainings.lightglue.blocks import Pair
+from trainings.lightglue.data import OutOfTime, mapped, read_groups, write_groups
+from trainings.lightglue.homographies import SIZE_PX, make_group
+from trainings.lightglue.loss import loss_of
+from trainings.lightglue.sides import NONE, UNKNOWN, Partners, Seen, partners
+from trainings.lightglue.validation import Found, by_ratio, fitted, judged, of_like_look, recalls, thinned
 
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from patch_training import sources
-from patch_training.turns import TurnedPairs, errors_deg, gradient_peaks, table, unseen_pairs, wrapped_deg
 from safetensors.torch import load_file, save_file
+from trainings.patches import sources
+from trainings.patches.turns import TurnedPairs, errors_deg, gradient_peaks, table, unseen_pairs, wrapped_deg
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError

@@ -1,4 +1,4 @@
-"""Tracks, crops, losses and figures of scripts/train_descriptor.py and train_orientation.py, known by construction."""
+"""Tracks, crops, losses and figures of scripts/train descriptor and train_orientation.py, known by construction."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from patch_training import data
-from patch_training.data import learnt_from
-from patch_training.draws import compressed, cropped, distinct, drawn, photographed, sources_of
-from patch_training.loss import descriptor_loss
-from patch_training.sources import homography
-from patch_training.tracks import Tracks
-from patch_training.turns import gradient_peaks, turned, wrapped_deg
-from patch_training.validation import average_precision, fpr95
 from scipy.fft import dctn, idctn
-from train_orientation import turn_loss
+from trainings.orientation.command import turn_loss
+from trainings.patches import data
+from trainings.patches.data import learnt_from
+from trainings.patches.draws import compressed, cropped, distinct, drawn, photographed, sources_of
+from trainings.patches.loss import descriptor_loss
+from trainings.patches.sources import homography
+from trainings.patches.tracks import Tracks
+from trainings.patches.turns import gradient_peaks, turned, wrapped_deg
+from trainings.patches.validation import average_precision, fpr95
 
 from aeromatch_cli.nets.orientation import BINS, bin_angles
 

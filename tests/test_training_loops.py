@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import train_descriptor
-import train_detector
-import train_lightglue
-import train_orientation
-from detector_training.scenes import sights
-from lightglue_training.blocks import Pair
-from lightglue_training.data import write_block
-from lightglue_training.sides import Partners, Seen
-from patch_training.draws import sources_of
-from patch_training.runs import Run
-from patch_training.sources import homography
 from torch import nn
+from trainings.descriptor import command as train_descriptor
+from trainings.detector import command as train_detector
+from trainings.detector.scenes import sights
+from trainings.lightglue import command as train_lightglue
+from trainings.lightglue.blocks import Pair
+from trainings.lightglue.data import write_block
+from trainings.lightglue.sides import Partners, Seen
+from trainings.orientation import command as train_orientation
+from trainings.patches.draws import sources_of
+from trainings.patches.runs import Run
+from trainings.patches.sources import homography
 
 from aeromatch_cli.nets.geodesc import GeoDesc
 from aeromatch_cli.nets.lightglue import Dimensions

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
-import train_context
-import train_descriptor
-import train_detector
-import train_orientation
-from context_training.data import ContextPair, ViewSeen
-from context_training.validation import compared
-from lightglue_training.sides import Partners, Seen
-from training_runs import check_recipe, descend, follow, load_state, save_state
+from trainings.__main__ import TABLE, main
+from trainings.context.data import ContextPair, ViewSeen
+from trainings.context.validation import compared
+from trainings.descriptor import command as train_descriptor
+from trainings.lightglue.sides import Partners, Seen
+from trainings.orientation import command as train_orientation
+from trainings.runs import check_recipe, descend, follow, load_state, save_state
 
 
 def test_another_recipe_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,28 +65,27 @@ def test_a_log_of_validation_figures_reads_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recipe", "arguments", "words"),
+    ("name", "arguments", "words"),
     [
-        (train_context, "--blocks x", "'x' is no list of numbers"),
-        (train_context, "--blocks 9-3", "names no number"),
-        (train_context, "--weights absent", "is no folder"),
-        (train_orientation, "--data . --blocks 0-x", "'0-x' is no list of numbers"),
-        (train_orientation, "--data absent", "has no folder images"),
-        (train_descriptor, "--data . --real block --groups 39", "no multiple of 40"),
-        (train_descriptor, "--data . --real block --reference .", "tfeat-liberty.params is missing"),
-        (train_detector, "--data . --trained-on block --validate absent.safetensors", "absent.safetensors"),
-        (train_detector, "--data absent", "has no folder images"),
+        ("context", "--blocks x", "'x' is no list of numbers"),
+        ("context", "--blocks 9-3", "names no number"),
+        ("context", "--weights absent", "is no folder"),
+        ("orientation", "--data . --blocks 0-x", "'0-x' is no list of numbers"),
+        ("orientation", "--data absent", "has no folder images"),
+        ("descriptor", "--data . --real block --groups 39", "no multiple of 40"),
+        ("descriptor", "--data . --real block --reference .", "tfeat-liberty.params is missing"),
+        ("detector", "--data . --trained-on block --validate absent.safetensors", "absent.safetensors"),
+        ("detector", "--data absent", "has no folder images"),
     ],
 )
 def test_wrong_arguments_are_named_and_lock_no_folder(
-    recipe: ModuleType, arguments: str, words: str,
+    name: str, arguments: str, words: str,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     (tmp_path / "block" / "images").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["train", *arguments.split(), "--out", "out"])
     with pytest.raises(SystemExit) as ended:
-        recipe.main()
+        sys.exit(main([name, *arguments.split(), "--out", "out"]))
     assert ended.value.code == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -102,7 +101,17 @@ def test_a_training_that_minutes_ended_writes_no_weights(
     for pairs in ("pairs_of", "unseen_pairs"):
         monkeypatch.setattr(recipe, pairs, lambda *_: [], raising=False)
     out = tmp_path / "out"
-    monkeypatch.setattr(sys, "argv", ["train", "--data", str(tmp_path), "--real", "block", "--out", str(out)])
-    recipe.main()
+    recipe.main(["--data", str(tmp_path), "--real", "block", "--out", str(out)])
     assert "after step 0 of" in capsys.readouterr().out
     assert [path.name for path in out.iterdir()] == ["recipe.json"]
+
+
+def test_the_table_names_modules_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    listed = capsys.readouterr().out
+    for name, (module, about) in TABLE.items():
+        assert callable(import_module(module).main)
+        assert f"  {name}" in listed
+        assert about in listed
+    assert main(["nothing"]) == 2
+    assert "scripts/train knows no 'nothing'" in capsys.readouterr().err

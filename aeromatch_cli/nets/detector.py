@@ -4,7 +4,7 @@ It is applied to every level of `strategies.extractors.pyramid.levels_of`, so it
 convolutions at the level's full resolution, because places count: 5 x 5 from the gray to CHANNELS, five of 3 x 3 (two
 of them with gaps of one pixel) and 3 x 3 to the heat; 12,161 parameters. What a pixel answers depends on the
 2 REACH_PX + 1 pixels squared around it, and through local brightness and contrast on FIELD_PX to every side.
-scripts/train_detector.py documents the training, trained/detector.md the weights.
+scripts/train detector documents the training, trained/detector.md the weights.
 
 Source: heat maps, trained on shapes and then by homographies, after DeTone, Malisiewicz and Rabinovich, SuperPoint,
 CVPR workshops 2018; their maxima over scale after the paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837).

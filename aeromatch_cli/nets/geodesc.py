@@ -2,7 +2,7 @@
 
 Sources: Tian, Fan and Wu, L2-Net, CVPR 2017 (architecture); Mishchuk et al., HardNet, NeurIPS 2017 (training with the
 hardest negatives of a batch); Luo et al., GeoDesc, ECCV 2018 (batches that know the geometry).
-scripts/train_descriptor.py documents the recipe of the weights that ship.
+scripts/train descriptor documents the recipe of the weights that ship.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Supervised by nothing except the known turn between two patches of one place, as histograms over directions: Lee, Jeong
 and Cho, Self-supervised learning of image scale and orientation, BMVC 2021. Against a direction that is regressed (Yi
 et al., CVPR 2016; Mishkin et al., OriNet, ECCV 2018) a histogram can hold several and settle for one.
-scripts/train_orientation.py documents the recipe of the weights that ship.
+scripts/train orientation documents the recipe of the weights that ship.
 """
 
 from __future__ import annotations

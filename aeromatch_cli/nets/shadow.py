@@ -1,7 +1,7 @@
 """The network that tells shadow from dark ground: a small U-Net over a reduced picture, evaluated in NumPy.
 
 Ronneberger et al. 2015, "U-Net", in small: five scales, one skip connection each. Its weights were trained on rendered
-scenes with exact shadow truth by scripts/train_shadow.py, which documents the recipe. NumPy, because a picture of one
+scenes with exact shadow truth by scripts/train shadow, which documents the recipe. NumPy, because a picture of one
 megapixel costs a fraction of a second and workers need not load a deep-learning library for it.
 """
 

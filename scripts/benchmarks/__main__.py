@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from importlib import import_module
+from collections.abc import Sequence
 
-from aeromatch_cli.errors import AeromatchError
+from benchmarks.launcher import Table, launch
 
-# Name -> module with `main(arguments)`, imported when it is run, and what it does in a line.
-TABLE: Mapping[str, tuple[str, str]] = {
+TABLE: Table = {
     "methods": ("benchmarks.methods.command", "presets beside peers on the same pairs, by truth"),
     "blocks": ("benchmarks.blocks.command", "whole real blocks beside pycolmap: matches, mapping, time"),
     "fusion": ("benchmarks.fusion", "every table of preset fusion: a list of runs of the others"),
@@ -28,27 +26,9 @@ TABLE: Mapping[str, tuple[str, str]] = {
 }
 
 
-def listing() -> str:
-    """All names, a line each."""
-    width = max(map(len, TABLE))
-    lines = [f"  {name:{width}}  {about}" for name, (_, about) in TABLE.items()]
-    return "\n".join(["usage: scripts/bench NAME [OPTION ...]; each has its own --help", "", *lines])
-
-
 def main(arguments: Sequence[str]) -> int:
-    """Exit code: 2 for a name that is none, that of an error of the package, else the benchmark's own."""
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(listing())
-        return 0
-    name, *rest = arguments
-    if name not in TABLE:
-        print(f"error: {name!r} is no benchmark\n\n{listing()}", file=sys.stderr)
-        return 2
-    try:
-        return int(import_module(TABLE[name][0]).main(rest) or 0)
-    except AeromatchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    """The exit code of the benchmark that the first argument names."""
+    return launch("scripts/bench", TABLE, arguments)
 
 
 if __name__ == "__main__":

@@ -72,19 +72,10 @@ def add_output(parser: argparse.ArgumentParser, tables: int = 1) -> None:
     about = "write into docs/results"
     if tables == 1:
         about += "; TABLE: another table than the benchmark's own"
-        parser.add_argument("--docs", type=table_name, nargs="?", const="", metavar="TABLE", help=about)
+        parser.add_argument("--docs", choices=("", *PAGES), nargs="?", const="", metavar="TABLE", help=about)
     else:
         parser.add_argument("--docs", action="store_const", const="", help=about)
     parser.add_argument("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
-
-
-def add_runs(parser: argparse.ArgumentParser) -> None:
-    """Options of a list of runs."""
-    add = parser.add_argument
-    add("--seed", type=int, default=1, help="another seed gives other blocks, pairs and samples")
-    add("--docs", action="store_true", help="write the tables into their pages of docs/results")
-    add("--list", action="store_true", help="print the commands instead of running them")
-    add("--out", type=Path, required=True, help="folder of results; a killed run goes on where it was")
 
 
 def flight_names(text: str) -> list[str]:
@@ -100,13 +91,6 @@ def positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value
-
-
-def table_name(text: str) -> str:
-    """For argparse: a table that has a page."""
-    if text not in PAGES:
-        raise argparse.ArgumentTypeError(f"{text!r} is no table of docs/results: {', '.join(PAGES)}")
-    return text
 
 
 def command_line(parser: argparse.ArgumentParser, args: argparse.Namespace, **shown: str) -> str:

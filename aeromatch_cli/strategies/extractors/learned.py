@@ -2,7 +2,7 @@
 
 A heat map network finds the keypoints, an orientation network turns them where a view does not have north up, GeoDesc
 describes a patch of learned place, size and turn, and a context network adds what is around it. Trained by
-scripts/train_detector.py, train_orientation.py, train_descriptor.py and train_context.py (nets/trained/*.md).
+scripts/train detector, orientation, descriptor and context (nets/trained/*.md).
 
 Source: Deep learning feature matching of oblique images, J. Geo-inf. Sci. 2021(10), 1823-1837; Luo et al., GeoDesc,
 ECCV 2018; Tian et al., L2-Net, CVPR 2017; Luo et al., ContextDesc, CVPR 2019.
@@ -95,7 +95,7 @@ class Learned(Described):
         if self.context and "geodesc" in own and "context" not in own:
             raise ConfigError(
                 f"extract.weights {self.weights!r} holds descriptors of your own, geodesc.safetensors, and no "
-                "context.safetensors that was trained on them: make it by scripts/train_context.py --weights, or set "
+                "context.safetensors that was trained on them: make it by scripts/train context --weights, or set "
                 "extract.context=false"
             )
 

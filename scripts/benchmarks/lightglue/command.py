@@ -16,28 +16,31 @@ its own, and speed two: with and without bfloat16 in the processor.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from lightglue_training.blocks import Pair, block_pairs
-from lightglue_training.data import pictures as pictures_of
-from lightglue_training.data import read_block, read_groups, write_block, write_groups
-from lightglue_training.validation import LIKE_DEG, LIKE_OCTAVES, Found, answered, judged, recalls, together
-from training_blocks import render
-from training_runs import check_recipe
+from trainings.blocks import render
+from trainings.lightglue.blocks import Pair, block_pairs
+from trainings.lightglue.data import pictures as pictures_of
+from trainings.lightglue.data import read_block, read_groups, write_block, write_groups
+from trainings.lightglue.validation import LIKE_DEG, LIKE_OCTAVES, Found, answered, judged, recalls, together
+from trainings.runs import check_recipe
 
+from aeromatch_cli.config import load
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 from aeromatch_cli.nets.precision import has_bfloat16
+from aeromatch_cli.workspace import write_text
 from benchmarks import options, stamps
 from benchmarks.lightglue.costs import BLOCK_PAIRS, MATCHERS, block_table, first_keypoints, forward_table, jobs_table
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import render_once
-from benchmarks.tables import Column, Row, markdown, table, write_rows
+from benchmarks.tables import Column, Row, markdown, number, ratio, table
 
 PARTS = ("accuracy", "speed")
 LIKE = (
@@ -75,24 +78,25 @@ def accuracy_rows(network: LightGlue, sets: dict[str, list[Pair]]) -> tuple[list
     rows, everything = [], []
     for name, pairs in sets.items():
         by_ratio, by_network = answered(network, pairs)
-        ratio, own = judged(by_ratio), judged(by_network)
+        test, own = judged(by_ratio), judged(by_network)
         everything.append(own)
-        least = own.least_score_at(ratio.precision)
+        least = own.least_score_at(test.precision)
         rows.append({
-            "pairs": name, "count": len(pairs), "possible": ratio.possible, "precision": ratio.precision,
-            "ratio_recall": ratio.recall, "recall": own.recall_at(ratio.precision),
-            "ratio_wrong": int((~ratio.right).sum()), "wrong": own.wrong_at(ratio.recall),
+            "pairs": name, "count": len(pairs), "possible": test.possible, "precision": test.precision,
+            "ratio_recall": test.recall, "recall": own.recall_at(test.precision),
+            "ratio_wrong": int((~test.right).sum()), "wrong": own.wrong_at(test.recall),
             "by_look": {"ratio": recalls(by_ratio, -np.inf), "network": recalls(by_network, least)},
         })  # fmt: skip
     return rows, together(everything)
 
 
 def _missed(row: Row) -> str:
-    return "-" if row["ratio_recall"] < WEAK else f"{(1.0 - row['recall']) / (1.0 - row['ratio_recall']):.2f}"
+    missed = ratio(1.0 - row["recall"], 1.0 - row["ratio_recall"])
+    return "-" if row["ratio_recall"] < WEAK else number(missed, 2)
 
 
 def _gained(row: Row) -> str:
-    return f"{row['recall'] / row['ratio_recall']:.2f}" if row["ratio_recall"] < WEAK else "-"
+    return number(ratio(row["recall"], row["ratio_recall"]), 2) if row["ratio_recall"] < WEAK else "-"
 
 
 def _wrong(row: Row) -> str:
@@ -118,7 +122,7 @@ _LOOK: tuple[Column[Row], ...] = (
     ("partners of like look", lambda row: f"{row['by_look']['ratio'][0]:.1%}"),
     _by_look("ratio", 1),
     _by_look("network", 1),
-    ("missed x", lambda row: f"{(1.0 - row['by_look']['network'][1]) / (1.0 - row['by_look']['ratio'][1]):.3f}"),
+    ("missed x", lambda row: number(ratio(*(1.0 - row["by_look"][one][1] for one in ("network", "ratio"))), 3)),
     _by_look("ratio", 2),
     _by_look("network", 2),
 )
@@ -127,7 +131,7 @@ _LOOK: tuple[Column[Row], ...] = (
 def accuracy(args: argparse.Namespace, network: LightGlue, sets: dict[str, list[Pair]]) -> str:
     """What a page says; the figures go to OUT/lightglue.json."""
     rows, found = accuracy_rows(network, sets)
-    write_rows(args.out / "lightglue.json", rows)
+    write_text(args.out / "lightglue.json", json.dumps(rows, indent=1) + "\n")  # with NaN where a set is empty
     lines = [((row["pairs"],), row) for row in rows]
     bins = found.reliability(read_calibration(args.weights))
     scores = [
@@ -201,7 +205,8 @@ def main(arguments: Sequence[str]) -> None:
     ):
         if part in args.parts:
             asked = argparse.Namespace(**vars(args) | {"parts": [part]})
-            versions = stamps.of_networks("lightglue") | stamps.of_strategies("match", *MATCHERS)
+            versions = stamps.of_settings(load("baseline"), families=("simulate", "extract"))
+            versions |= stamps.of_strategies("match", *MATCHERS)
             options.publish(
                 args, make() + "\n", args.out / f"{part}.md", table=name,
                 command=options.command_line(parser, asked), versions=versions,

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightglue_training.batches import as_side
-from lightglue_training.blocks import Pair, prepared
+from trainings.lightglue.batches import as_side
+from trainings.lightglue.blocks import Pair, prepared
 
 from aeromatch_cli.data import Features, PairGeometry
 from aeromatch_cli.formats.features import read_features

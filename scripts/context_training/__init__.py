@@ -1,1 +1,0 @@
-"""What train_context.py learns from."""

@@ -1,0 +1,26 @@
+"""`scripts/train NAME [OPTION ...]`: runs one training; without a name it lists them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from benchmarks.launcher import Table, launch
+
+TABLE: Table = {
+    "shadow": ("trainings.shadow.command", "network of enhance=shadow: cast shadow against dark ground"),
+    "lightglue": ("trainings.lightglue.command", "network of match=lightglue"),
+    "detector": ("trainings.detector.command", "keypoint detector of extract=learned"),
+    "orientation": ("trainings.orientation.command", "orientation network of extract=learned"),
+    "descriptor": ("trainings.descriptor.command", "GeoDesc descriptors of extract=learned"),
+    "context": ("trainings.context.command", "context network of extract=learned"),
+}
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The exit code of the training that the first argument names."""
+    return launch("scripts/train", TABLE, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

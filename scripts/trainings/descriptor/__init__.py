@@ -1,0 +1,1 @@
+"""GeoDesc: `scripts/train descriptor`."""

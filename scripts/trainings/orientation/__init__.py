@@ -1,0 +1,1 @@
+"""The orientation network: `scripts/train orientation`."""
