@@ -14,6 +14,8 @@ from conftest import HEIGHT, IMAGES, WIDTH, contents, invoke
 
 from aeromatch_cli.blocks import scan
 
+pytestmark = pytest.mark.slow
+
 PAIRS = IMAGES * (IMAGES - 1) // 2
 
 

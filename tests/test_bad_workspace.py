@@ -5,10 +5,13 @@ from __future__ import annotations
 import errno
 import json
 
+import pytest
 from conftest import IMAGES, contents
 
 from aeromatch_cli import workspace as workspace_module
 from aeromatch_cli.workspace import read_json
+
+pytestmark = pytest.mark.slow
 
 
 def test_workspace_below_a_file(site):

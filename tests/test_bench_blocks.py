@@ -18,6 +18,8 @@ from aeromatch_cli.data import Block, Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 
+pytestmark = pytest.mark.slow
+
 # 100 m above ground this camera sees 100 m x 80 m.
 CAMERA = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 NADIR = from_omega_phi_kappa(0.0, 0.0, 0.0)

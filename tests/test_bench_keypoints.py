@@ -16,6 +16,8 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import RenderedTruth, open_truth
 
+pytestmark = pytest.mark.slow
+
 
 def names_of(block: Path) -> list[str]:
     return sorted(open_truth(block).cameras)[:2]

@@ -17,6 +17,8 @@ from benchmarks.peers import matching, table
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import Conditions
 
+pytestmark = pytest.mark.slow
+
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 METHODS = ("opencv-sift", "opencv-asift", "pycolmap", "baseline")
 FIELDS = [

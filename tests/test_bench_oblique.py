@@ -15,6 +15,8 @@ from conftest import HEIGHT, WIDTH, Site
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import Conditions, open_truth
 
+pytestmark = pytest.mark.slow
+
 Row = dict[str, Any]
 
 

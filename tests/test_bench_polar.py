@@ -10,6 +10,8 @@ from make_ground import ground
 
 from aeromatch_cli.geometry.frames import apply_homography
 
+pytestmark = pytest.mark.slow
+
 SIZE = (360, 260)
 GROUND = np.clip(ground(7, (900, 800)), 0, 255).astype(np.uint8)
 

@@ -12,6 +12,8 @@ from aeromatch_cli.data import Camera, View
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.synthetic import render_block
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera("SIMPLE_PINHOLE", 200, 150, (180.0, 100.0, 75.0))
 
 

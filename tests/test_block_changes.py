@@ -17,6 +17,8 @@ from aeromatch_cli.stages import filter as filter_stage
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.pairs import prepare
 
+pytestmark = pytest.mark.slow
+
 PAIRS = IMAGES * (IMAGES - 1) // 2
 KINDS = ("camera", "pose", "sigma", "ground")
 

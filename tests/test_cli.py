@@ -54,6 +54,7 @@ def test_importing_the_command_line_loads_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_stage_by_stage_gives_what_run_gives(done_site):
     work = done_site.root / "stages"
     made = {}
@@ -249,6 +250,7 @@ def test_plain_progress_says_percent_and_time_left(capsys):
     assert lines[-1] == "match: 100 % (40/40), 0 s left"
 
 
+@pytest.mark.slow
 def test_synth_and_its_arguments(tmp_path):
     outcome = invoke("synth", tmp_path / "block", "--size", "160x120", "--images", "3", "--json")
     assert outcome.code == 0
@@ -286,6 +288,7 @@ def test_settings_come_from_a_file_and_options_win(site):
 # --- real processes -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_run_as_a_process(site: Site):
     done = run_process("run", "baseline", *site.options("--json", "--jobs", "2"), cwd="/")
     assert done.returncode == 0, done.stderr
@@ -298,6 +301,7 @@ def test_run_as_a_process(site: Site):
     assert (site.work / "report" / "index.html").is_file()
 
 
+@pytest.mark.slow
 def test_every_other_command_as_a_process(done_site: Site, tmp_path: Path):
     for command in ("pairs", "extract", "match", "filter", "export", "check"):
         done = run_process(command, "baseline", *done_site.options())

@@ -76,6 +76,7 @@ def test_visual_context_is_taken_where_the_keypoint_lies() -> None:
             np.testing.assert_allclose(centre.numpy(), [column, row], atol=0.3)
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_are_as_good_as_when_they_were_made(
     rendered: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,6 +38,7 @@ def test_a_picture_turned_by_half_has_its_heat_turned_by_half(network: Detector)
     assert (lopsided - network.one_way(picture)).abs().max() > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(PIECE_PX + 1, 3 * PIECE_PX - 5), (2 * PIECE_PX, 7)])
 def test_the_pieces_that_the_layers_work_on_change_nothing(network: Detector, size: tuple[int, int]) -> None:
     whole = network._both_ways(evened(noise(*size)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 from trainings.detector.groups import SIDE_PX, block_group, homography_group
@@ -15,6 +16,8 @@ from trainings.detector.validation import pairs_of, scores, table
 
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.synthetic import load_truth
+
+pytestmark = pytest.mark.slow
 
 
 def test_shapes_have_corners_that_can_be_seen() -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from conftest import invoke
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def site(finished: Path, rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -22,6 +22,8 @@ from aeromatch_cli.evaluate.work import Evaluation
 from aeromatch_cli.formats.features import read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def work(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

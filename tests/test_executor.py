@@ -95,6 +95,7 @@ def test_one_failing_task_leaves_the_others(pool: Executor) -> None:
         assert "out of memory" in found[3].error
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_blamed_and_the_rest_is_done(tmp_path: Path) -> None:
     tasks = [Task(number, "die" if number in (3, 9) else "square", str(tmp_path)) for number in range(12)]
     progress = Counter()
@@ -151,6 +152,7 @@ def test_dask_without_the_extra_says_what_to_install(monkeypatch: pytest.MonkeyP
         Executor("dask").run(work, [Task(1)], "x")
 
 
+@pytest.mark.slow
 def test_dask_gives_what_serial_gives() -> None:
     texts = [f"image {number}" for number in range(20)]
     with Executor("dask", jobs=2) as executor:

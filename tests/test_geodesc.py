@@ -80,6 +80,7 @@ def test_folded_answers_as_unfolded() -> None:
         fold(GeoDesc(folded=True), GeoDesc(folded=True))
 
 
+@pytest.mark.slow
 def test_bfloat16_is_close_to_float32(unseen: list[Pair]) -> None:
     patches = np.concatenate([pair.patches0 for pair in unseen])[:300]
     exact, quick = (describe(patches, load_geodesc(precision=kind)) for kind in ("float32", "bfloat16"))

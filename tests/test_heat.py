@@ -110,6 +110,7 @@ def test_a_spot_is_found_at_its_place(middle: tuple[float, float]) -> None:
     assert (np.diff(confidences) <= 0).all()
 
 
+@pytest.mark.slow
 def test_places_move_with_the_picture_below_the_pixel() -> None:
     # Means of 2 x 2 pixels, from the first pixel and from the second: exactly half a pixel apart.
     fine = texture(481, 641, seed=2)
@@ -124,6 +125,7 @@ def test_places_move_with_the_picture_below_the_pixel() -> None:
     assert np.median(away[same]) < 0.2
 
 
+@pytest.mark.slow
 def test_light_changes_few_keypoints() -> None:
     picture = texture(240, 320)
     darker = np.rint(picture * 0.6 + 20).astype(np.uint8)
@@ -131,6 +133,7 @@ def test_light_changes_few_keypoints() -> None:
     assert share_within(first, second, 0.5) > 0.85
 
 
+@pytest.mark.slow
 def test_tiles_change_nothing() -> None:
     picture = texture(400, 500)
     whole, tiled = heat(picture), heat(picture, tile_area_px=70_000)
@@ -138,6 +141,7 @@ def test_tiles_change_nothing() -> None:
     assert np.array_equal(heat(picture), whole)
 
 
+@pytest.mark.slow
 def test_more_of_a_rendered_place_is_found_again_than_with_sift(rendered: Path) -> None:
     pairs = pairs_of([sights(rendered)])
     heat_rows, sift_rows = (table(scores(pairs, find, 150)) for find in (by_heat(None), by_sift))

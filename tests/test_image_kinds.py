@@ -7,10 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from conftest import HEIGHT, IMAGES, WIDTH
 from make_images import write_bands
 
 from aeromatch_cli.workspace import Workspace, read_json
+
+pytestmark = pytest.mark.slow
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 

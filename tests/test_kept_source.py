@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 from conftest import QUICK, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.workspace import read_json
+
+pytestmark = pytest.mark.slow
 
 BESIDE = ("--set", "enhance=clahe", "--set", "enhance.keep_source=true")
 _EXIF_IFD, _DATE_TIME_ORIGINAL = 0x8769, 36867

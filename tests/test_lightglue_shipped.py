@@ -13,6 +13,8 @@ from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 from aeromatch_cli.synthetic import render_block
 
+pytestmark = pytest.mark.slow
+
 # Far from the seeds of scripts/training_blocks.
 SEED = 90210
 

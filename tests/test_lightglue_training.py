@@ -23,6 +23,8 @@ from trainings.lightglue.validation import Found, by_ratio, fitted, judged, of_l
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
 from aeromatch_cli.nets.lightglue_file import Calibration
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def picture(tmp_path_factory: pytest.TempPathFactory) -> Path:

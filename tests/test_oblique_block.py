@@ -10,6 +10,8 @@ from conftest import invoke
 
 from aeromatch_cli.synthetic import render_block
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -59,6 +59,7 @@ def test_folded_answers_as_unfolded() -> None:
         assert fold(network, OrientationNet(folded=True))(patches) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_turning_a_patch_by_a_right_angle_turns_its_orientation(unseen: TurnedPairs) -> None:
     # numpy's rot90 turns against x towards y.
     turned = np.ascontiguousarray(np.rot90(unseen.patches0, -1, axes=(1, 2)))

@@ -22,6 +22,8 @@ from trainings.patches.validation import average_precision, fpr95
 
 from aeromatch_cli.nets.orientation import BINS, bin_angles
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tracks(tmp_path_factory: pytest.TempPathFactory) -> Tracks:

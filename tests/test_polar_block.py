@@ -14,6 +14,8 @@ from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_pairs
 from aeromatch_cli.synthetic import render_block
 
+pytestmark = pytest.mark.slow
+
 MAX_IMAGE_ID = 2147483647
 
 

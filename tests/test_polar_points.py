@@ -121,6 +121,7 @@ def test_one_scale_alone_may_be_asked_for():
     assert Polar(min_scale=1.0, max_scale=1.0).registered(first, second, GEOMETRY).registration.accepted
 
 
+@pytest.mark.slow
 def test_a_pair_that_is_not_registered_has_no_points_and_a_remark():
     first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=15)
     _, second, _ = pair(0.0, 1.0, (0.0, 0.0), seed=16)

@@ -57,6 +57,7 @@ def test_covariance_says_how_exact_it_is():
     assert (typical < 4.0).all()
 
 
+@pytest.mark.slow
 def test_other_ground_is_refused_with_a_reason():
     for seed in range(3):
         first, _, _ = pair(0.0, 1.0, (0.0, 0.0), seed=10 + seed)
@@ -66,6 +67,7 @@ def test_other_ground_is_refused_with_a_reason():
         assert "parts of the overlap" in found.reason or "converge" in found.reason or "correlate" in found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 128.0, 255.0])
 def test_pictures_without_texture_are_refused(value):
     flat = Shot(np.full((540, 720), value, np.float32))
@@ -141,6 +143,7 @@ def test_no_evidence_of_a_place_comes_from_rows_alone(turn_deg, period_px):
     assert proof.share < 0.4
 
 
+@pytest.mark.slow
 def test_rows_of_places_apart_are_not_the_same_place():
     source = ground(300, (2600, 2600))
     source = (source - 120.0) * 0.12 + 25.0 * np.sin(2.0 * np.pi * np.arange(2600) / 30.0)[None] + 120.0

@@ -17,6 +17,8 @@ from aeromatch_cli.stages import extract, ground
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 WIDTH_PX, HEIGHT_PX = 640, 480
 SIGMA_PX = 10.0
 

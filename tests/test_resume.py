@@ -18,6 +18,8 @@ from conftest import IMAGES, Site, contents, heed_interrupts
 from aeromatch_cli.formats.rows import row_fingerprints
 from aeromatch_cli.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 PAIRS = IMAGES * (IMAGES - 1) // 2
 
 

@@ -20,6 +20,8 @@ from aeromatch_cli.synthetic.solids import Footprint, Material, boxes, shrunk, t
 from aeromatch_cli.synthetic.terrain import Area
 from aeromatch_cli.synthetic.trees import Species, hedge, tree
 
+pytestmark = pytest.mark.slow
+
 SMALL, LARGE = Area(-60.0, -60.0, 60.0, 60.0), Area(-60.0, -60.0, 150.0, 90.0)
 SCENES = {"city": city, "suburb": suburb}
 

@@ -18,6 +18,8 @@ from aeromatch_cli.synthetic.solids import Material, Surface
 from aeromatch_cli.synthetic.terrain import Area
 from aeromatch_cli.synthetic.water import BANK_M, DEEPEST_M, LEVEL_M, paint_water, shore
 
+pytestmark = pytest.mark.slow
+
 _SCENES = {
     "farmland": farmland.SCENE,
     "grass": grass.SCENE,

@@ -113,6 +113,7 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     return float((first & second).sum() / (first | second).sum())
 
 
+@pytest.mark.slow
 def test_shadow_of_a_town_is_found_and_lifted(town):
     pixels, true = town
     enhanced = ShadowEnhancement()(pixels, None)

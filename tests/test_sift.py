@@ -142,6 +142,7 @@ def test_tiles_share_out_every_pixel_once_and_are_bounded():
                 assert high == end or high - values.max() >= 120
 
 
+@pytest.mark.slow
 def test_tiles_find_the_same_keypoints(monkeypatch):
     gray = texture(1400, 900, seed=3)
     whole = extract(gray, keypoints=10**6)

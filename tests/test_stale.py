@@ -13,6 +13,8 @@ from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import context
 from aeromatch_cli.workspace import Workspace, read_json
 
+pytestmark = pytest.mark.slow
+
 
 def write_dem(path: Path, far_m: float) -> None:
     """A terrain at 0 m west of x = 20 and at far_m east of it, 1 m cells."""

@@ -24,6 +24,8 @@ from aeromatch_cli.synthetic.shade import Stage
 from aeromatch_cli.synthetic.solids import Material
 from aeromatch_cli.synthetic.terrain import Area, Flat, sample_terrain
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 240, 180
 NOISELESS = Development(exposure=0.3, vignetting=0.0, blur_px=0.0, read_noise=0.0, shot_noise=0.0)
 

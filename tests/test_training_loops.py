@@ -27,6 +27,8 @@ from aeromatch_cli.nets.geodesc import GeoDesc
 from aeromatch_cli.nets.lightglue import Dimensions
 from aeromatch_cli.nets.orientation import OrientationNet
 
+pytestmark = pytest.mark.slow
+
 STEPS = 3
 
 

@@ -28,6 +28,8 @@ from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.report import map as report_map
 from aeromatch_cli.strategies.extractors.sift import Sift
 
+pytestmark = pytest.mark.slow
+
 # --- log file -----------------------------------------------------------------------------------------------------
 
 
