@@ -29,6 +29,8 @@ from aeromatch_cli.strategies.matchers.lightglue import inference
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera("SIMPLE_PINHOLE", 640, 480, (600.0, 319.5, 239.5))
 
 

@@ -119,6 +119,7 @@ def test_report_alone_shows_an_empty_block(site):
     assert "No pair is verified" in (site.work / "report" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_outdated_results_are_not_used(done_site):
     more = ("--set", "extract.keypoints=300")
     assert done_site("extract", *more).counts("extract")[0] == IMAGES
@@ -163,6 +164,7 @@ def test_check_writes_nothing(site):
     assert not site.work.exists()
 
 
+@pytest.mark.slow
 def test_check_of_a_finished_workspace_writes_nothing(done_site):
     before = {path: path.stat().st_mtime_ns for path in done_site.root.rglob("*")}
     assert done_site("check").code == 0

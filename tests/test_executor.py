@@ -113,12 +113,14 @@ def test_a_worker_that_dies_is_blamed_and_the_rest_is_done(tmp_path: Path) -> No
     assert progress.told[-1] == "end"
 
 
+@pytest.mark.slow
 def test_a_task_that_dies_once_is_done_in_the_end(tmp_path: Path) -> None:
     tasks = [Task(number, "die-once" if number == 2 else "square", str(tmp_path)) for number in range(5)]
     with Executor("processes", 2) as executor:
         assert [one.value for one in executor.run(work, tasks, "x")] == [0, 1, 4, 9, 16]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["serial", "processes"])
 def test_a_full_disk_stops_everything(tmp_path: Path, kind: str) -> None:
     tasks = [Task(0, "disk"), *(Task(number, marks=str(tmp_path)) for number in range(1, 400))]

@@ -96,6 +96,7 @@ def test_another_networks_weights_are_refused(tmp_path: Path) -> None:
         load_geodesc(tmp_path / "less.safetensors")
 
 
+@pytest.mark.slow
 def test_the_shipped_weights_tell_unseen_places_apart(unseen: list[Pair]) -> None:
     ours, theirs = table(describe, unseen)["all"], table(sift, unseen)["all"]
     assert theirs["fpr95"] == pytest.approx(0.144, abs=0.02)  # a set as hard as it was

@@ -152,6 +152,7 @@ def test_more_of_a_rendered_place_is_found_again_than_with_sift(rendered: Path) 
         assert row["1px"] > 1.45 * sift_rows[angle]["1px"]
 
 
+@pytest.mark.slow
 def test_budget_border_and_mask() -> None:
     picture = texture(240, 320)
     valid = np.ones(picture.shape, bool)

@@ -23,6 +23,8 @@ from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.workspace import fingerprint
 
+pytestmark = pytest.mark.slow
+
 SIDE = 320
 
 

@@ -12,6 +12,8 @@ from torch import Tensor
 from aeromatch_cli.nets.lightglue import LightGlue, Side, normalised
 from aeromatch_cli.nets.lightglue_batch import batches, match_batch
 
+pytestmark = pytest.mark.slow
+
 SIZES = [(200, 150), (120, 200), (1, 30), (0, 40), (90, 0), (3, 2), (200, 200)]
 
 

@@ -68,6 +68,7 @@ def test_turning_a_patch_by_a_right_angle_turns_its_orientation(unseen: TurnedPa
     assert np.percentile(off, 98) < 1.0
 
 
+@pytest.mark.slow
 def test_a_patch_cut_along_its_orientation_is_upright(unseen: TurnedPairs) -> None:
     """The angle means what `cut_patches` means by it."""
     first = degrees(unseen.patches0)
@@ -80,6 +81,7 @@ def test_a_patch_cut_along_its_orientation_is_upright(unseen: TurnedPairs) -> No
     assert np.median(off) < 10.0
 
 
+@pytest.mark.slow
 def test_bfloat16_is_close_to_float32(unseen: TurnedPairs) -> None:
     exact, quick = (degrees(unseen.patches0, load_orientation(precision=kind)) for kind in ("float32", "bfloat16"))
     assert np.percentile(np.abs(wrapped_deg(exact - quick)), 95) < 5.0

@@ -274,6 +274,7 @@ def test_screening_loses_no_pair_that_the_cap_keeps(tilts_deg: tuple[float, ...]
     assert len(screened) <= 1.005 * len(exact)
 
 
+@pytest.mark.slow
 def test_two_thousand_images_in_seconds() -> None:
     rng = np.random.default_rng(1)
     poses: dict[str, Pose | None] = {}

@@ -338,6 +338,7 @@ def test_table_of_many_pairs_keeps_the_worst_of_both_kinds():
     assert [row.verified for row in shown[1000:1003]] == [101, 103, 105]
 
 
+@pytest.mark.slow
 def test_large_block_stays_a_small_page(tmp_path):
     ids = [f"flight_1_image_{k:05d}_jpg" for k in range(1000)]
     base = context(tmp_path, {}, ())

@@ -27,6 +27,7 @@ def test_the_page_is_up_to_date() -> None:
     assert written == formats.page(), "run: python -m aeromatch_cli.formats > docs/workspace.md"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["images.csv", "cameras.csv", "poses.csv", "pairs.csv", "failures.csv"])
 def test_every_column_is_specified(done_site: Site, name: str) -> None:
     header = (done_site.work / name).read_text(encoding="utf-8").splitlines()[0].split(",")
@@ -34,6 +35,7 @@ def test_every_column_is_specified(done_site: Site, name: str) -> None:
     read_csv(done_site.work / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["features", "matches", "verified"])
 def test_every_array_is_specified(done_site: Site, folder: str) -> None:
     path = sorted((done_site.work / folder).glob("*.npz"))[0]
@@ -43,6 +45,7 @@ def test_every_array_is_specified(done_site: Site, folder: str) -> None:
     assert [name for name in names if f"`{name}`" not in section(f"{folder}/")] == []
 
 
+@pytest.mark.slow
 def test_every_file_of_a_finished_workspace_has_a_section(done_site: Site) -> None:
     headings = " ".join(re.findall(r"^### (.*)", formats.page(), re.MULTILINE))
     tops = {path.name for path in done_site.work.iterdir()}

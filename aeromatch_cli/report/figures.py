@@ -30,13 +30,23 @@ _STYLE: dict[Any, Any] = {
 _VARIABLES = {colour: f"var(--{name})" for name, colour in COLOURS.items()}
 
 
-def new_axes(width_inches: float, height_inches: float, dpi: float = 72.0) -> Any:
-    """Axes on a figure of their own (`axes.figure`), without a window. At 72 dpi a point is a unit of the SVG."""
+def new_axes(
+    width_inches: float, height_inches: float, dpi: float = 72.0, margins: Mapping[str, float] | None = None
+) -> Any:
+    """Axes on a figure of their own (`axes.figure`), without a window. At 72 dpi a point is a unit of the SVG.
+
+    margins: left, right, bottom, top of the axes as shares of the figure. None: as the labels need them, which draws
+    everything twice.
+    """
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_STYLE):
-        return Figure(figsize=(width_inches, height_inches), dpi=dpi, layout="constrained").add_subplot()
+        if margins is None:
+            return Figure(figsize=(width_inches, height_inches), dpi=dpi, layout="constrained").add_subplot()
+        figure = Figure(figsize=(width_inches, height_inches), dpi=dpi)
+        figure.subplots_adjust(**margins)
+        return figure.add_subplot()
 
 
 def png(figure: Any) -> bytes:
@@ -105,7 +115,7 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     """Bars over about 24 equal classes with rounded limits. values: at least one. unit: what they count, a plural."""
     from matplotlib.ticker import MaxNLocator
 
-    axes = new_axes(7.0, 2.7)
+    axes = new_axes(7.0, 2.7, margins={"left": 0.085, "right": 0.985, "bottom": 0.2, "top": 0.96})
     locator = MaxNLocator(24, steps=[1, 2, 5, 10], integer=True)
     edges = np.asarray(locator.tick_values(0, max(values) + 1))
     counts, _ = np.histogram(values, edges)
