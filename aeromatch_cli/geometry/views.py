@@ -61,7 +61,7 @@ def common_stretch(ray0: FloatArray, ray1: FloatArray) -> tuple[float, float]:
 def nearest_sample(stretch: float, azimuth_rad: float) -> tuple[int, int]:
     """Level of the tilt and number of the azimuth, among `tilt_azimuths_rad`, nearest to a stretch and its azimuth.
 
-    Both are fixed to the world: two cameras asked for like views get the same one.
+    Both are fixed to the world: two cameras get the same view of the same direction.
     """
     level = max(0, round(float(np.log(stretch) / np.log(TILT_STEP))))
     count = len(tilt_azimuths_rad(level))

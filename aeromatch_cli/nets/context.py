@@ -1,4 +1,4 @@
-"""What is around a keypoint, added to what it looks like: the network of descriptor augmentation.
+"""Descriptor augmentation: visual and geometric context of a keypoint, added to its descriptor.
 
 Visual context is what a convolutional network sees in a wide, coarse window around the keypoint; geometric context is
 how the neighbouring keypoints lie around it, how large they are and what they look like. Both correct the descriptor of

@@ -81,7 +81,7 @@ def match_batch(
     depth_confidence: float,
     width_confidence: float,
 ) -> list[tuple[Tensor, Tensor]]:
-    """What `LightGlue.match` answers of each pair alone, up to rounding: sides of one picture each (B = 1).
+    """The result of `LightGlue.match` for each pair alone, up to rounding: sides of one picture each (B = 1).
 
     A pair leaves after the layer where it would stop alone. Pruned keypoints are hidden from the others but stay in the
     batch: that saves nothing, and gives the same matches.

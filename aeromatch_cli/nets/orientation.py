@@ -1,4 +1,4 @@
-"""Which way a patch is turned: a small network that has only learnt that turning a patch turns its answer.
+"""Orientation of a patch: a small network that was trained only to follow the rotation of the patch.
 
 Supervised by nothing except the known turn between two patches of one place, as histograms over directions: Lee, Jeong
 and Cho, Self-supervised learning of image scale and orientation, BMVC 2021. Against a direction that is regressed (Yi

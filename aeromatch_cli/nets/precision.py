@@ -1,4 +1,4 @@
-"""Where a network is evaluated, and in what numbers. torch is imported where it is asked: settings name these types."""
+"""Device and number type of a network. torch is imported inside the functions: settings name these types."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ DEVICE: Any = Field(
 )
 
 
-def device_of(asked: Device) -> str:
+def device_of(setting: Device) -> str:
     """The device a setting means: "cuda" where `auto` finds one, else "cpu". Raises ConfigError where there is none."""
-    if asked == "cpu":
-        return asked
+    if setting == "cpu":
+        return setting
     import torch
 
     if torch.cuda.is_available():
         return "cuda"
-    if asked == "cuda":
+    if setting == "cuda":
         raise ConfigError("device `cuda`: torch sees none on this machine; set `auto`, which takes one where there is")
     return "cpu"
 

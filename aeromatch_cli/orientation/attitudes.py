@@ -1,4 +1,4 @@
-"""Whose attitude contradicts the pictures: match-derived rotations against the given ones, image by image."""
+"""Which attitudes contradict the matches: rotations from matches against the given ones, image by image."""
 
 from __future__ import annotations
 

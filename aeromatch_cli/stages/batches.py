@@ -32,7 +32,7 @@ def matched_in_batches(
 ) -> dict[str, Matches]:
     """Matches by image_id1; none where the matcher takes pairs one by one.
 
-    A pair that fails here is left out: matched by itself it fails again, and says why, or gets along with less memory.
+    A pair that fails here is left out: it is matched by itself, and fails again with its reason, or needs less memory.
     """
     if not (isinstance(matcher, BatchedMatcher) and matcher.batches_pairs) or len(pairs) < 2:
         return {}

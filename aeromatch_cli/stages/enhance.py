@@ -111,7 +111,7 @@ def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
     """Write mask and facts, and with `picture` the enhanced pixels; an image that stays as it was taken leaves nothing.
 
     What other settings left goes: a mask of theirs would be taken for this one's. A picture of these very settings
-    stays, whether it is asked for or not.
+    stays in any case.
     """
     picture = picture and not task.as_taken
     stays = picture or _has_picture(task)

@@ -1,4 +1,4 @@
-"""What enhancers have in common: whether the picture as it was taken stays in use."""
+"""What enhancers have in common: whether the source image is used as well."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aeromatch_cli.strategies import Strategy
 
 
 class KeepsSource(Strategy):
-    """An enhancer whose picture is used instead of the one that was taken, or beside it."""
+    """An enhancer whose picture replaces the source image, or is used in addition to it."""
 
     changes: ClassVar[bool] = True
     keep_source: bool = Field(

@@ -1,4 +1,4 @@
-"""Gains applied to the full picture, strip by strip: penumbra feathered, hue kept, highlights and noise spared."""
+"""Gains applied to the full picture, strip by strip: penumbra feathered, hue kept, highlights and noise unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Adaptive shadow enhancement: shadow is found, region by region given the light it lacks, and nothing else changed.
+"""Adaptive shadow enhancement: cast shadow is detected and brightened region by region; nothing else is changed.
 
 Method 1, step 1 of J. Geo-inf. Sci. 2025(6), 1401-1419, where its abstract leaves a choice open: detection by a small
 network (nets.shadow), gains on linear light, borders by a guided filter.

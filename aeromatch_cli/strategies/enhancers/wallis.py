@@ -1,4 +1,4 @@
-"""Wallis filter: every neighbourhood brought towards one mean and one spread of brightness.
+"""Wallis filter: local mean and standard deviation of the brightness are brought towards targets.
 
 Wallis 1976, "An approach to the space variant restoration and enhancement of images".
 """

@@ -1,4 +1,4 @@
-"""Descriptors of a view with what is around them, and how they are stored."""
+"""Descriptors with context, and how descriptors are stored as bytes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def coarse_of(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def context_inputs(descriptors: NDArray[np.float32], raw: Raw, gray: NDArray[np.uint8]) -> tuple[Any, ...]:
-    """What `nets.context.Context` is asked about features (N,) of one view (H, W): tensors in its order."""
+    """Inputs of `nets.context.Context` for features (N,) of one view (H, W): tensors in its order."""
     height, width = gray.shape
     return context_inputs_of_coarse(descriptors, raw, coarse_of(gray), (width, height))
 

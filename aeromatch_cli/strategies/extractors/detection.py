@@ -1,4 +1,4 @@
-"""SIFT's two halves on a view, tile by tile: where features are, and what they look like."""
+"""SIFT on a view in two steps, tile by tile: detection and description."""
 
 from __future__ import annotations
 

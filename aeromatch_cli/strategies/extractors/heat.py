@@ -30,7 +30,7 @@ _LEAST_CONTRAST = 3
 _APART_PX = 3.0
 # Log odds are smoothed by so many pixels of a level: tops become rounder, and places a third more exact.
 _SMOOTH_PX = 0.7
-# So many times as many as are asked for leave enough of them, next to always.
+# Candidates per keypoint: thinning nearly always leaves as many keypoints as are needed.
 _SPARE = 4
 # Log odds that half an octave costs: larger keypoints are found again less exactly (measured on validation pairs).
 _FINER = 0.3

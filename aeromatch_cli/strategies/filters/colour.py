@@ -1,4 +1,4 @@
-"""Colour as evidence: matches whose places have clearly different colours go."""
+"""Colour as evidence: matches whose places have clearly different colours are dropped."""
 
 from __future__ import annotations
 

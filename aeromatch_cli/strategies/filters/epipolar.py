@@ -1,4 +1,4 @@
-"""The last gate: one epipolar geometry for all that is left, as strict as the matches themselves are accurate."""
+"""Verification by one epipolar geometry, with a band as narrow as the matches are accurate."""
 
 from __future__ import annotations
 

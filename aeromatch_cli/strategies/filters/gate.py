@@ -1,4 +1,4 @@
-"""When a model verifies a pair: enough inliers, and more than chance gives."""
+"""When a model verifies a pair: enough inliers, and more than random matches would give (a contrario test)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The source turned and tilted: simulated views for images whose pose nobody knows."""
+"""The source image rotated and tilted: simulated views for images without pose."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _TRIALS = 16
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """model: its inliers are the matches (N,) asked about. log10_false_alarms: of models that chance gives as good."""
+    """model: its inliers are among the matches (N,) given. log10_false_alarms: expected models as good from random matches."""
 
     model: TwoView
     log10_false_alarms: float

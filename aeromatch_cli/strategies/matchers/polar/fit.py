@@ -43,7 +43,7 @@ _NEIGHBOURS = 10.0  # samples that say the same, because their errors are alike
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """matrix: (3, 3) level px1 from level px0, a similarity unless it was asked for tilt. middle_px: (2,) of the
+    """matrix: (3, 3) level px1 from level px0, a similarity, or a homography with `tilted`. middle_px: (2,) of the
     overlap, in side 0. gain, offset: value0 = gain value1 + offset at the
     middle; the offset changes to second order. correlation: of all samples. sigma: standard
     deviation of the residuals (of value0). share: of side 0 that lies in side 1. covariance: (4, 4) of shift x, y

@@ -73,7 +73,7 @@ def agreed(
 
     places_px: (N, 2). shifts_px: (N, 2) against what the registration says. From the nearest usable neighbours, their
     shift by a robust plane through them; contradicts what lies farther off than four of the neighbours' own deviations,
-    which counts for `least_px` at least and thrice that at most. Without neighbours enough nobody agrees.
+    which counts for `least_px` at least and thrice that at most. With too few neighbours nothing agrees.
     """
     good = usable
     expected = np.zeros_like(shifts_px)
