@@ -23,7 +23,10 @@ _TRIALS = 16
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """model: its inliers are among the matches (N,) given. log10_false_alarms: expected models as good from random matches."""
+    """model: its inliers are among the matches (N,) given.
+
+    log10_false_alarms: how many models as good are expected among random matches.
+    """
 
     model: TwoView
     log10_false_alarms: float
