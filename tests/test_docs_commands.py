@@ -1,0 +1,76 @@
+"""Commands of the README, the guide and the methods run, on a small block with few keypoints."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from conftest import QUICK, Site, invoke
+from read_pages import ROOT, commands, text_of
+
+pytestmark = pytest.mark.slow
+
+RUN_PAGES = [ROOT / "README.md", ROOT / "docs" / "guide.md", *sorted((ROOT / "docs" / "methods").glob("*.md"))]
+# What needs files of its own: a DEM in a CRS, a configuration. tests/test_docs_links.py parses these commands.
+OWN_FILES = ("--crs", "block.yaml")
+STAGES_BEFORE = {"match": ("extract",), "filter": ("extract", "match"), "report": ("run",), "export": ("run",)}
+
+
+def given_commands() -> list[str]:
+    found = dict.fromkeys(command for page in RUN_PAGES for command in commands(text_of(page), "aeromatch"))
+    return [command for command in found if not any(mark in command for mark in OWN_FILES)]
+
+
+def on_the_site(command: str, site: Site) -> list[str]:
+    """Words of a command with the reader's placeholders replaced by the small block."""
+    words = shlex.split(re.sub(r"\$\{?\w+\}?", "1", command), comments=True)[1:]
+    places = {
+        r"(IMGS|\w+/images)": str(site.images),
+        r"(poses\.csv|\w+/poses_noisy\.csv)": str(site.poses),
+        r"\w+/block\.json": str(site.root / "block.json"),
+        r"(WORK|work[\w-]*)": str(site.work),
+    }
+    for pattern, place in places.items():
+        words = [place if re.fullmatch(pattern, word) else word for word in words]
+    return words
+
+
+def quick(words: list[str], site: Site) -> list[str]:
+    """The same with a small scene, few keypoints and one process; `check` instead of `run` where networks would run."""
+    if words[0] == "synth":
+        words[1] = str(site.root / "made")
+        options = {"--size": "160x120", "--images": "2"}
+        kept = [w for k, w in enumerate(words) if w not in options and (k == 0 or words[k - 1] not in options)]
+        return [*kept, *(text for pair in options.items() for text in pair), "--jobs", "1"]
+    if words[0] == "evaluate":
+        return [*words[:3], str(site.root), *words[4:]]
+    if words[0].startswith("-") or words[0] == "weights":
+        return words
+    if words[0] == "run" and words[1] in ("oblique", "fusion", "polar"):
+        words = ["check", *words[1:]]
+        words = [w for k, w in enumerate(words) if w != "--shard" and words[k - 1] != "--shard"]
+    if "--cameras" not in words:
+        words += ["--cameras", str(site.root / "block.json")]
+    return [*words, *(QUICK if words[1] in ("baseline", "fusion", "oblique") else QUICK[:2])]
+
+
+@pytest.mark.parametrize("command", given_commands())
+def test_the_command_runs(command: str, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(site.root)
+    words = quick(on_the_site(command, site), site)
+    for earlier in STAGES_BEFORE.get(words[0], ()):
+        assert invoke(earlier, *words[1:]).code == 0
+    if words[0] == "evaluate":
+        assert site("run").code == 0
+    outcome = invoke(*words)
+    assert outcome.code == 0, outcome.stderr
+    assert outcome.stdout or "--quiet" in words
+
+
+def test_commands_were_found() -> None:
+    found = given_commands()
+    assert len(found) > 15
+    assert {"run", "synth", "evaluate", "match"} <= {shlex.split(command)[1] for command in found}
+    assert Path(RUN_PAGES[0]).is_file()
