@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -95,6 +96,21 @@ def test_both_arithmetics_are_exact(arithmetic):
     rows, columns, _ = mutual_nearest(d0, d1, np.arange(200), ratio=0.8)
     assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == reference(d0, d1, np.arange(200), 0.8)
     assert len(rows) > 190
+
+
+def test_a_byte_product_that_saturates_is_not_used(monkeypatch):
+    # As oneDNN multiplies where it is held to AVX2: one side unsigned, neighbours added in 16 bits, the shift taken back.
+    def saturating(a, b):
+        wide0, wide1 = a.numpy().astype(np.int64) + 128, b.numpy().astype(np.int64)
+        pairs = wide0[:, 0::2, None] * wide1[None, 0::2] + wide0[:, 1::2, None] * wide1[None, 1::2]
+        total = np.clip(pairs, -(2**15), 2**15 - 1).sum(axis=1) - 128 * wide1.sum(axis=0)
+        return torch.from_numpy(total.astype(np.int32))
+
+    monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: True)
+    monkeypatch.setattr(torch, "_int_mm", lambda a, b: torch.from_numpy(a.numpy().astype(np.int32) @ b.numpy()))
+    assert scan._has_integer_product.__wrapped__()
+    monkeypatch.setattr(torch, "_int_mm", saturating)
+    assert not scan._has_integer_product.__wrapped__()
 
 
 def test_float_descriptors_are_matched_too():
