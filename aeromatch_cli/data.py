@@ -108,7 +108,8 @@ class Block:
     images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose; images without any position
     are absent. crs: authority code of the world frame, or "local". origin_m: (3,) what was subtracted from the
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
-    distance of the ground views, or None where no image has an attitude.
+    distance of the ground views, or None where no image has an attitude. tied: pairs (image_id0, image_id1) that a
+    first pass has matched.
     """
 
     images: tuple[Image, ...]
@@ -119,6 +120,7 @@ class Block:
     ground: Ground | None
     ground_source: str
     gsd_m: float | None
+    tied: tuple[tuple[str, str], ...] = ()
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]

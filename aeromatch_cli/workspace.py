@@ -62,8 +62,13 @@ class Workspace:
         return self.root / "failures.csv"
 
     @property
-    def ignored_attitudes(self) -> Path:
-        return self.root / "ignored_attitudes.json"
+    def orientation(self) -> Path:
+        return self.root / "orientation"
+
+    @property
+    def first_pass(self) -> Workspace:
+        """The first pass is a small workspace of its own."""
+        return Workspace(self.orientation / "first_pass")
 
     @property
     def reports(self) -> Path:

@@ -44,6 +44,10 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
             "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=8000",
         ),
     ),
+    "orient": (
+        "Find cameras, poses and terrain of the block from a first pass over reduced images.",
+        ("aeromatch orient baseline --images IMGS --poses exif --workspace WORK",),
+    ),
     "pairs": (
         "Read the block and choose the pairs of images.",
         ("aeromatch pairs baseline --images IMGS --poses poses.csv --set pairs.min_overlap=0.2",),

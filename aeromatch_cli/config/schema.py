@@ -13,6 +13,7 @@ from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.strategies.extractors import EXTRACTORS
 from aeromatch_cli.strategies.filters import FILTERS
 from aeromatch_cli.strategies.matchers import MATCHERS
+from aeromatch_cli.strategies.orienters import ORIENTERS
 from aeromatch_cli.strategies.pairings import PAIRINGS
 from aeromatch_cli.strategies.simulators import SIMULATORS
 
@@ -117,6 +118,9 @@ class Settings(_Section):
     seed: int = Field(0, ge=0, description="Seed of everything random.")
     block: BlockSettings = Field(BlockSettings(), description="What was flown: images, poses, cameras, ground.")
     run: RunSettings = Field(RunSettings(), description="How it is run. Nothing here changes a result.")
+    orient: _choice(ORIENTERS) = Field(  # type: ignore[valid-type]
+        ORIENTERS["global"](), description="How cameras, poses and terrain are found from a first pass."
+    )
     pairs: _choice(PAIRINGS) = Field(  # type: ignore[valid-type]
         PAIRINGS["overlap"](), description="Which images are compared."
     )
@@ -187,6 +191,7 @@ class Settings(_Section):
 
 
 FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
+    "orient": ORIENTERS,
     "pairs": PAIRINGS,
     "enhance": ENHANCERS,
     "simulate": SIMULATORS,

@@ -1,9 +1,8 @@
-"""From settings to a `Block`: inputs read in parallel, ground resolved, what was fixed before kept.
+"""From settings to a `Block` as it is given: inputs read in parallel, stated ground, what was fixed before kept.
 
-The world origin, the ground height and the common ground sampling distance are fixed when a workspace is made, as
-image ids are: images that come later must not change the views of all others. They are fixed anew when the settings
-that they come from change, or when images that they were computed from have changed or gone and they would now come
-out clearly different: one corrected pose must not re-do the block, a corrected pose list must.
+The world origin and the common ground sampling distance are fixed when a workspace is made, as image ids are: images
+that come later must not change the views of all others. The latter is fixed anew when it would now come out clearly
+different: one corrected pose must not re-do the block, a corrected pose list must.
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
@@ -27,50 +24,39 @@ from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
-from aeromatch_cli.stages.ground import UNKNOWN, find_ground, ground_fingerprint
-from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, fingerprint, image_fingerprint, read_json
+from aeromatch_cli.stages.ground import given_ground
+from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, image_fingerprint, read_json
 
 log = logging.getLogger("aeromatch")
 
-# What was fixed holds until it is off by this share of the ground sampling distance, or of the flying height.
+# What was fixed holds until it is off by this share.
 _GSD_TOLERANCE = 0.1
-_GROUND_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class BlockRead:
-    """A block with what was learnt on the way. record: contents of block.json."""
+    """A block as it is given, with what was learnt on the way.
+
+    gsd_before_m: what the workspace had, or None. ground_hint: the ground below relative altitudes, and its source.
+    """
 
     block: Block
     image_fingerprints: Mapping[str, str]
     guessed_cameras: frozenset[str]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
-    record: Mapping[str, Any]
+    gsd_before_m: float | None
+    ground_hint: tuple[Ground, str] | None
 
 
 def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> BlockRead:
-    """Read the inputs and resolve the ground. Raises ConfigError or InputError where nothing can be started."""
+    """Read the inputs and the stated ground. Raises ConfigError or InputError where nothing can be started."""
     if not settings.block.images:
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
     _check_folders(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints = _read_inputs(settings, workspace, executor, before)
-    basis = {i.image_id: _basis_print(inputs, i, prints[i.image_id]) for i in inputs.images}
-    wanted = fingerprint(ground_fingerprint(settings), settings.block.crs, inputs.crs, inputs.ground_hint_z_m)
-    kept = before.get("ground_fingerprint") == wanted
-    same = all(basis.get(image_id) == value for image_id, value in before.get("basis", {}).items())
-    warnings = [*inputs.warnings, *_mask_warnings(settings, inputs.images)]
-    ground, source = _stored_ground(before) if kept and same else (None, "")
-    if ground is None and not source.startswith(UNKNOWN):
-        ground, source, remarks = find_ground(settings, inputs, executor)
-        warnings += remarks
-    if source.startswith(UNKNOWN) and inputs.poses:
-        attitudes = any(pose.world_rotation is not None for pose in inputs.poses.values())
-        remedy = "give --ground METRES or a DEM" if attitudes else "give attitudes with --poses"
-        warnings.append(f"the ground height is {source}; no ground views, no overlap; {remedy}")
-    if kept and not same:
-        ground, source = _nearly_stored(before, ground, source, inputs)
+    ground, source, remarks = given_ground(settings, inputs)
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,
@@ -81,27 +67,37 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         ground_source=source,
         gsd_m=None,
     )
-    gsd_m = before["gsd_m"] if kept and same else common_gsd_m(block_footprints(block))
-    if kept and not same and gsd_m and before["gsd_m"] and abs(gsd_m / before["gsd_m"] - 1.0) < _GSD_TOLERANCE:
-        gsd_m = before["gsd_m"]
-    record = {
-        "format_version": FORMAT_VERSION,
-        "crs": inputs.crs,
-        "origin_m": list(inputs.origin_m),
-        "ground_source": source,
-        "ground_z_m": ground.z_m if isinstance(ground, ConstantGround) else None,
-        "gsd_m": gsd_m,
-        "ground_fingerprint": wanted,
-        "basis": before["basis"] if kept and same else basis,
-    }
     return BlockRead(
-        block=replace(block, gsd_m=gsd_m),
+        block=block,
         image_fingerprints=prints,
         guessed_cameras=inputs.guessed_cameras,
-        warnings=tuple(warnings),
+        warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
-        record=record,
+        gsd_before_m=before.get("gsd_m"),
+        ground_hint=None
+        if inputs.ground_hint_z_m is None
+        else (ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source),
     )
+
+
+def with_gsd(block: Block, before_m: float | None) -> Block:
+    """The block with its common ground sampling distance: the one that the workspace had, while that still fits."""
+    gsd_m = common_gsd_m(block_footprints(block))
+    if gsd_m and before_m and abs(gsd_m / before_m - 1.0) < _GSD_TOLERANCE:
+        gsd_m = before_m
+    return replace(block, gsd_m=gsd_m)
+
+
+def block_record(block: Block) -> dict[str, Any]:
+    """Contents of block.json."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "crs": block.crs,
+        "origin_m": list(block.origin_m),
+        "ground_source": block.ground_source,
+        "ground_z_m": block.ground.z_m if isinstance(block.ground, ConstantGround) else None,
+        "gsd_m": block.gsd_m,
+    }
 
 
 def _check_folders(settings: Settings, workspace: Workspace) -> None:
@@ -121,19 +117,6 @@ def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
         return []
     name = images[0].name
     return [f"no mask in {masks} belongs to an image: the mask of {name} would be {name}.png"]
-
-
-def _nearly_stored(
-    before: Mapping[str, Any], ground: Ground | None, source: str, inputs: BlockInputs
-) -> tuple[Ground | None, str]:
-    """The stored height where the new one is the same up to a small share of the flying height."""
-    stored, stored_source = _stored_ground(before)
-    if not isinstance(ground, ConstantGround) or not isinstance(stored, ConstantGround) or not inputs.poses:
-        return ground, source
-    height_m = float(np.median([pose.center_m[2] for pose in inputs.poses.values()])) - stored.z_m
-    if abs(ground.z_m - stored.z_m) > _GROUND_TOLERANCE * abs(height_m):
-        return ground, source
-    return stored, stored_source
 
 
 def _read_inputs(
@@ -166,14 +149,3 @@ def _read_header(path: Path) -> tuple[ExifFacts | str, str]:
         return exif_or_reason(path), image_fingerprint(path)
     except OSError as error:
         raise ItemError(f"cannot be read ({error.strerror or error}): was it moved or deleted?") from None
-
-
-def _basis_print(inputs: BlockInputs, image: Image, image_print: str) -> str:
-    pose = inputs.poses.get(image.image_id)
-    place = None if pose is None else (pose.center_m, pose.world_rotation)
-    return fingerprint(image_print, inputs.cameras[image.camera_id], place)
-
-
-def _stored_ground(record: Mapping[str, Any]) -> tuple[Ground | None, str]:
-    z_m = record["ground_z_m"]
-    return (None if z_m is None else ConstantGround(float(z_m))), str(record["ground_source"])

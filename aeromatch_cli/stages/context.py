@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +19,10 @@ from aeromatch_cli.workspace import Workspace, fingerprint
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`."""
+    """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
+
+    given: the block before it was oriented.
+    """
 
     settings: Settings
     workspace: Workspace
@@ -27,10 +30,10 @@ class Context:
     block: Block
     pairs: tuple[Pair, ...]
     image_fingerprints: Mapping[str, str]
-    given_poses: Mapping[str, Pose]
+    given: Block
     guessed_cameras: frozenset[str] = frozenset()
-    # Images without verified pairs although poses predict overlap (`stages.attitudes`).
-    isolated: frozenset[str] = frozenset()
+    # Stands before the names of stages in what is shown of progress.
+    part: str = ""
     shard: Shard | None = None
     overwrite: bool = False
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
@@ -73,21 +76,16 @@ class Context:
             pair=pair,
             camera0=self.block.camera(images[pair.image_id0]),
             camera1=self.block.camera(images[pair.image_id1]),
-            pose0=self._usable_pose(pair.image_id0),
-            pose1=self._usable_pose(pair.image_id1),
+            pose0=self.pose(pair.image_id0),
+            pose1=self.pose(pair.image_id1),
             ground_z_m=sum(heights) / len(heights) if heights else None,
         )
 
-    def _usable_pose(self, image_id: str) -> Pose | None:
-        """The pose by which matches are searched and limited; of an isolated image its position alone."""
-        pose = self.pose(image_id)
-        return replace(pose, world_rotation=None) if pose is not None and image_id in self.isolated else pose
-
     def lacks_attitude(self, image_id: str) -> bool:
-        """Whether an image, or one that it is paired with, has no usable attitude: north-up views of both cannot be
+        """Whether an image, or one that it is paired with, has no attitude: north-up views of both cannot be
         compared then, the source images can."""
         ids = (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))
-        poses = [self._usable_pose(i) for i in ids]
+        poses = [self.pose(i) for i in ids]
         return any(pose is None or pose.world_rotation is None for pose in poses)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
@@ -123,8 +121,6 @@ class Context:
             parts["camera"] = self.block.camera(self.image_by_id[image_id])
         if "pose" in needs:
             parts["pose"] = (pose.center_m, pose.world_rotation) if pose else None
-        if "pose" in needs and image_id in self.isolated:
-            parts["isolated"] = True
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:

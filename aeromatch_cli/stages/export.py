@@ -90,14 +90,14 @@ def _complete(folders: list[Path], facts: Mapping[str, Any]) -> bool:
 
 
 def _run_task(task: ExportTask) -> dict[str, Any]:
-    contents = _contents(task.context)
+    contents = contents_of(task.context)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
     files = [path.relative_to(task.folder).as_posix() for path in summary.files]
     return {"name": task.folder.name, **asdict(summary), "files": files}
 
 
-def _contents(context: Context) -> ExportContents:
-    """Read lazily: one row and one image's keypoints at a time."""
+def contents_of(context: Context) -> ExportContents:
+    """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time."""
 
     def keypoints_px(image_id: str) -> FloatArray:
         path = context.workspace.features(image_id)

@@ -22,7 +22,7 @@ from aeromatch_cli.formats.rows import (
     row_fingerprints,
     write_verified_row,
 )
-from aeromatch_cli.stages import attitudes, extract, match, rows
+from aeromatch_cli.stages import extract, match, rows
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
@@ -175,9 +175,6 @@ def run(context: Context) -> StageReport:
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     root = components(context)
     report.facts = summarise(context, root)
-    if context.shard is None:
-        judged = attitudes.judge(context, _rotations(context), None if missing else root)
-        report.facts["rotation_contradicts_pose"] = judged
     return report.write(context.workspace, context.shard)
 
 
@@ -203,14 +200,6 @@ def verified_pairs(context: Context) -> Iterator[tuple[Pair, VerifiedEntry]]:
         entry = row.get(pair.image_id1)
         if entry is not None:
             yield pair, entry
-
-
-def _rotations(context: Context) -> list[tuple[str, str, FloatArray, int]]:
-    return [
-        (pair.image_id0, pair.image_id1, entry.verdict.relative_rotation, len(entry.matches.indices))
-        for pair, entry in verified_pairs(context)
-        if entry.verdict.state == "verified" and entry.verdict.relative_rotation is not None
-    ]
 
 
 def summarise(context: Context, root: Mapping[str, str]) -> dict[str, Any]:

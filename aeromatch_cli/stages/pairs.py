@@ -14,8 +14,8 @@ from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
-from aeromatch_cli.stages.attitudes import without_ignored_attitudes
-from aeromatch_cli.stages.block import BlockRead, read_block
+from aeromatch_cli.stages import orient
+from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
@@ -32,8 +32,10 @@ def prepare(
     shard: Shard | None = None,
     overwrite: bool = False,
     dry: bool = False,
-) -> tuple[Context, StageReport]:
-    """Read the block, choose the pairs and, unless `dry`, write what the block is.
+) -> tuple[Context, StageReport, StageReport]:
+    """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
+
+    Returns the context and the reports of orient and pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
     workspace cannot be written.
@@ -46,7 +48,8 @@ def prepare(
     else:
         workspace.create()
     found = read_block(settings, workspace, executor)
-    context = without_ignored_attitudes(_context(settings, workspace, executor, found, shard, overwrite))
+    context, oriented = orient.run(_context(settings, workspace, executor, found, shard, overwrite), dry=dry)
+    context = _with_ground(context, found)
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
     if pairs is not None:
@@ -54,20 +57,19 @@ def prepare(
     else:
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
-    summary, pairs_csv = summarise(found.block, pairs), pairs_text(pairs)
+    summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     report.facts = {
         "summary": [*summary.lines(), *_remarks(settings, summary.oriented)],
         "block": summary.figures(),
         "warnings": [*found.warnings, *summary.warnings],
         "images": len(found.block.images),
-        "ignored_attitudes": sorted(_ignored(context)),
         "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
     report.failures = list(found.failures)
     report.fingerprint = wanted
     context = replace(context, pairs=tuple(pairs))
     if not dry:
-        _write(context, found, pairs_csv)
+        _write(context, pairs_csv)
         forget_absent(context)
         report.write(workspace)
     for warning in report.facts["warnings"]:
@@ -79,7 +81,15 @@ def prepare(
             f"no pairs: {len(context.block.images)} images, none of which overlap; check poses, cameras and ground "
             "(the warnings above), or use --set pairs=exhaustive"
         )
-    return context, report
+    return context, oriented, report
+
+
+def _with_ground(context: Context, found: BlockRead) -> Context:
+    """With the ground below relative altitudes where the pictures tell no terrain, and the ground sampling distance."""
+    block = context.block
+    if block.ground is None and found.ground_hint is not None:
+        block = replace(block, ground=found.ground_hint[0], ground_source=found.ground_hint[1])
+    return replace(context, block=with_gsd(block, found.gsd_before_m))
 
 
 def _context(
@@ -90,7 +100,7 @@ def _context(
     shard: Shard | None,
     overwrite: bool,
 ) -> Context:
-    """The context without pairs, with every given attitude."""
+    """The context without pairs, of the block as it is given."""
     return Context(
         settings=settings,
         workspace=workspace,
@@ -98,7 +108,7 @@ def _context(
         block=found.block,
         pairs=(),
         image_fingerprints=found.image_fingerprints,
-        given_poses=found.block.poses,
+        given=found.block,
         guessed_cameras=found.guessed_cameras,
         shard=shard,
         overwrite=overwrite,
@@ -112,7 +122,7 @@ def _check_files(settings: Settings) -> None:
 
 
 def _chosen(settings: Settings) -> Iterator[Strategy]:
-    yield from (settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
+    yield from (settings.orient, settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
     yield from settings.filter
     yield from settings.export
 
@@ -131,20 +141,11 @@ def _remarks(settings: Settings, oriented: int) -> list[str]:
     return found
 
 
-def _ignored(context: Context) -> set[str]:
-    """Images whose given attitude is not used."""
-    return {
-        i
-        for i, pose in context.given_poses.items()
-        if pose.world_rotation is not None and context.block.poses[i].world_rotation is None
-    }
-
-
 def _fingerprint(context: Context) -> str:
     block: Block = context.block
     needs = frozenset({"camera", "pose", "ground"})
     images = [(i.image_id, i.name, i.time, context.geometry_fingerprint(i.image_id, needs)) for i in block.images]
-    return fingerprint(context.settings.pairs, images)
+    return fingerprint(context.settings.pairs, images, block.tied)
 
 
 def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
@@ -158,8 +159,8 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     return read_pairs(workspace.pairs)
 
 
-def _write(context: Context, found: BlockRead, pairs_csv: str) -> None:
-    workspace, block = context.workspace, found.block
+def _write(context: Context, pairs_csv: str) -> None:
+    workspace, block = context.workspace, context.block
     texts = {
         workspace.config: dump(context.settings),
         workspace.images: images_text(block.images, context.image_fingerprints),
@@ -167,6 +168,6 @@ def _write(context: Context, found: BlockRead, pairs_csv: str) -> None:
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,
     }
-    write_json(workspace.block, dict(found.record))
+    write_json(workspace.block, block_record(block))
     for path, text in texts.items():
         write_text(path, text)

@@ -14,7 +14,6 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
-from aeromatch_cli.stages.attitudes import without_ignored_attitudes
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
@@ -33,9 +32,7 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 # Stages whose items are independent: these can be cut into shards, the others need everything.
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # What a command rests on: everything before it in this chain.
-_CHAIN = ("pairs", "extract", "match", "filter", "export", "report")
-# How often attitudes may be ignored and their images done again; each pass can only add images.
-_MAX_PASSES = 10
+_CHAIN = ("orient", "pairs", "extract", "match", "filter", "export", "report")
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ def execute(
 ) -> Result:
     """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped."""
     part = Shard.parse(shard) if shard else None
-    if part and command not in (*SHARDED, "run", "pairs"):
+    if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     try:
         with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
@@ -86,19 +83,16 @@ def _repairing(command: str, settings: Settings, executor: Executor, part: Shard
 
 
 def _attempt(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
-    context, first = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
+    context, *reports = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
     if command == "check":
-        return _check(context, first)
-    reports = [first]
+        return _check(context, reports[-1])
     if command == "run":
-        reports, context = _run_all(context, first)
+        reports += _run_all(context)
     elif command == "match":
         features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
-    elif command != "pairs":
+    elif command not in ("orient", "pairs"):
         reports.append(STAGES[command](context))
-    if command == "filter" and context.shard is None:
-        _report_ignored(context, reports[-1])
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
@@ -107,43 +101,16 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
     return _result(command, context, reports)
 
 
-def _report_ignored(context: Context, judged: StageReport) -> None:
-    """Adds a failure for each image whose attitude this stage found wrong: its views and pairs are out of date now."""
-    trusted = without_ignored_attitudes(replace(context, overwrite=False))
-    remedy = "run `aeromatch run`, or match and filter again, to go on without it"
-    doubted = dict.fromkeys(trusted.isolated - context.isolated, f"no verified pair with its attitude: {remedy}")
-    turned = dict.fromkeys(_attitudes(context) - _attitudes(trusted), f"matches contradict its attitude: {remedy}")
-    if doubted or turned:
-        judged.failures += sorted({**doubted, **turned}.items())
-        judged.write(context.workspace)
-
-
-def _run_all(context: Context, first: StageReport) -> tuple[list[StageReport], Context]:
-    """extract, match, filter, and again for images whose attitude turns out wrong; then export and report."""
-    reports: list[StageReport] = []
-    for _ in range(_MAX_PASSES):
-        again = _to_filter(context)
-        reports = (
-            [now.absorb(then, context.workspace) for now, then in zip(again, reports, strict=True)]
-            if reports
-            else again
-        )
-        trusted = without_ignored_attitudes(replace(context, overwrite=False))
-        unchanged = _attitudes(trusted) == _attitudes(context) and trusted.isolated == context.isolated
-        if context.shard is not None or unchanged:
-            break
-        log.info(
-            "attitudes of some images contradict the matches, or give none: these images are matched again without them"
-        )
-        context, first = pairs.prepare(context.settings, context.executor, shard=context.shard)
-    reports = [first, *reports]
+def _run_all(context: Context) -> list[StageReport]:
+    """extract, match, filter; then export and report."""
+    reports = _to_filter(context)
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
-            reports.append(report.run(context))
+            report.run(context)
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
         reports.append(export.run(context))
         reports.append(_current_page(context) or report.run(context))
-    return reports, context
+    return reports
 
 
 def _current_page(context: Context) -> StageReport | None:
@@ -169,13 +136,9 @@ def _to_filter(context: Context) -> list[StageReport]:
     return [features, match.run(context), filter.run(context)]
 
 
-def _attitudes(context: Context) -> set[str]:
-    return {i for i, pose in context.block.poses.items() if pose.world_rotation is not None}
-
-
 def _result(command: str, context: Context, reports: list[StageReport]) -> Result:
     failures = _all_failures(command, context, reports)
-    lines = list(reports[0].facts["summary"])
+    lines = list(reports[1].facts["summary"])
     for stage in reports:
         lines.append(
             f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
@@ -248,8 +211,6 @@ def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
     if facts["weakly_tied"]:
         names = facts["weakly_tied"]
         lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
-    for image_id, angle in facts.get("rotation_contradicts_pose", {}).items():
-        lines.append(f"          {image_id}: ignored attitude, wrong by {angle:.0f} degrees by its matches")
     return lines
 
 

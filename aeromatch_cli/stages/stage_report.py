@@ -152,7 +152,7 @@ def run_stage(
     names: Sequence[str],
 ) -> list[R]:
     """Run tasks, put failures into the report under their names, return the values of the rest."""
-    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, report.stage) if tasks else []
+    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, context.part + report.stage) if tasks else []
     values = []
     for name, outcome in zip(names, outcomes, strict=True):
         if outcome.value is None:

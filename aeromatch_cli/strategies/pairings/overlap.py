@@ -24,7 +24,8 @@ class Overlap(Strategy):
     Of the pairs that pass both limits, each image keeps its `max_neighbours` largest overlaps (equal overlaps: the
     smaller view angle); a pair stays if either image keeps it. The pairs of a maximum spanning forest stay whatever
     their rank, so that the cap never splits a block. Images without a footprint (no pose, no attitude, looking above
-    the horizon, below the ground) and images that overlap with nothing get neighbours by position, time or name.
+    the horizon, below the ground) and images that overlap with nothing get neighbours by position, time or name. Pairs
+    that a first pass has matched stay in any case.
     """
 
     name: Literal["overlap"] = "overlap"
@@ -87,9 +88,10 @@ class Overlap(Strategy):
         paired = {image_id for pair in chosen for image_id in (pair.image_id0, pair.image_id1)}
         unplaced = {image.image_id for image in block.images} - paired
         fallback = fallback_pairs(block, unplaced, self.fallback_neighbours)
-        return sorted(
-            [*chosen, *measured_pairs(block, fallback, footprints)], key=lambda pair: (pair.image_id0, pair.image_id1)
-        )
+        present = {(pair.image_id0, pair.image_id1) for pair in chosen} | fallback.keys()
+        tied = {ids: "first pass" for ids in block.tied if ids not in present}
+        others = measured_pairs(block, fallback | tied, footprints)
+        return sorted([*chosen, *others], key=lambda pair: (pair.image_id0, pair.image_id1))
 
 
 def _within_cap(pairs: IntArray, shares: FloatArray, angles: FloatArray, count: int, cap: int) -> BoolArray:

@@ -1,0 +1,177 @@
+"""Where an oriented model lies in the world: by the given positions, else levelled by the ground that it sees.
+
+A mapper gives poses and points up to a similarity. Positions that are spread in two directions determine it, the
+worse the closer they lie together; positions along one line leave the turn about the line open; without positions the
+whole orientation and the scale are open. What is open is taken from the terrain: its plane of best fit is about level,
+and the cameras are above it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray
+
+# Without positions the median flying height becomes this many units.
+LOCAL_FLYING_HEIGHT = 100.0
+# Positions count as agreeing up to this many standard deviations, or this share of the block's extent.
+_AGREE_SIGMAS = 3.0
+_AGREE_EXTENT = 0.01
+# The error that is allowed doubles until this share of the positions agrees.
+_LEAST_AGREEING = 0.6
+# Where fewer than this share agree within their standard deviations, errors have a common cause (a delay between GPS
+# and shutter, say), which no average takes away: the block is levelled as if they were larger by this factor.
+_TRUSTED = 0.85
+_DOUBTFUL = 5.0
+# How far from level the plane of best fit of a terrain usually is.
+_LEVEL_SIGMA_DEG = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """World point = scale * rotation @ model point + translation_m.
+
+    kind: "positions" (by positions, and by the terrain as far as these leave it open) or "level" (no positions: level
+    by the terrain, scale and origin arbitrary). agreeing: (N,) which positions were used; False where there is none.
+    trusted: whether nearly all positions agree with the pictures as well as their standard deviations say.
+    """
+
+    scale: float
+    rotation: FloatArray
+    translation_m: FloatArray
+    kind: str
+    agreeing: BoolArray
+    trusted: bool
+
+    def points(self, points: FloatArray) -> FloatArray:
+        """World points (N, 3) of model points (N, 3)."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation_m)
+
+    def rotations(self, cam_from_model: FloatArray) -> FloatArray:
+        """Rotations (N, 3, 3) cam_from_world of rotations cam_from_model."""
+        return np.asarray(cam_from_model @ self.rotation.T)
+
+
+def place(centers: FloatArray, points: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray) -> Placement:
+    """The similarity from a model to the world.
+
+    centers: (N, 3) projection centres in the model; points: (P, 3) its points; positions_m: (N, 3) given positions in
+    the world, NaN where there is none; sigmas_m: (N,) their standard deviations.
+    """
+    known: BoolArray = np.asarray(np.isfinite(positions_m).all(axis=1))
+    found = _by_positions(centers[known], positions_m[known], sigmas_m[known]) if known.sum() >= 2 else None
+    if found is None:
+        return _level(centers, points, known)
+    agreeing = np.zeros(len(centers), dtype=bool)
+    agreeing[np.flatnonzero(known)[found.agreeing]] = True
+    found = replace(found, agreeing=agreeing)
+    return _levelled(found, centers, points, positions_m[agreeing], float(np.median(sigmas_m[agreeing])))
+
+
+def similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Scale, rotation (3, 3) and translation (3,) that take source (N, 3) to target (N, 3) best (Umeyama 1991)."""
+    middle0, middle1 = source.mean(axis=0), target.mean(axis=0)
+    u, strengths, vt = np.linalg.svd((target - middle1).T @ (source - middle0))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
+    rotation = u * signs @ vt
+    spread = float(((source - middle0) ** 2).sum())
+    scale = float((strengths * signs).sum() / spread) if spread > 0.0 else 1.0
+    return scale, rotation, middle1 - scale * rotation @ middle0
+
+
+def _by_positions(centers: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray) -> Placement | None:
+    """The similarity that most positions agree with, or None where they are all in one place."""
+    extent_m = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
+    if extent_m <= float(np.median(sigmas_m)) * 1e-3 or np.linalg.norm(np.ptp(centers, axis=0)) <= 0.0:
+        return None
+    limits_m = np.maximum(_AGREE_SIGMAS * sigmas_m, _AGREE_EXTENT * extent_m)
+    rng = np.random.default_rng(0)
+    samples = [rng.choice(len(centers), size=min(3, len(centers)), replace=False) for _ in range(500)]
+    fits = [similarity(centers[s], positions_m[s]) for s in samples]
+    errors_m = np.array([_errors(fit, centers, positions_m) for fit in fits])
+    for factor in 2.0 ** np.arange(8):
+        agree = errors_m <= factor * limits_m
+        best = int(np.argmax(agree.sum(axis=1)))
+        if agree[best].sum() >= max(2, _LEAST_AGREEING * len(centers)):
+            break
+    chosen = agree[best]
+    fit = fits[best]
+    for _ in range(10):
+        fit = similarity(centers[chosen], positions_m[chosen])
+        again = _errors(fit, centers, positions_m) <= factor * limits_m
+        if (again == chosen).all() or again.sum() < 2:
+            break
+        chosen = again
+    scale, rotation, translation_m = fit
+    share = float((_errors(fit, centers, positions_m) <= limits_m).mean())
+    return Placement(scale, rotation, translation_m, "positions", chosen, share >= _TRUSTED) if scale > 0.0 else None
+
+
+def _errors(fit: tuple[float, FloatArray, FloatArray], centers: FloatArray, positions_m: FloatArray) -> FloatArray:
+    scale, rotation, translation_m = fit
+    return np.asarray(np.linalg.norm(scale * centers @ rotation.T + translation_m - positions_m, axis=1))
+
+
+def _level(centers: FloatArray, points: FloatArray, known: BoolArray) -> Placement:
+    """Level by the terrain, the median flying height LOCAL_FLYING_HEIGHT, the middle of the cameras at x = y = 0."""
+    up = _up(centers, points)
+    east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    east /= np.linalg.norm(east)
+    rotation = np.array([east, np.cross(up, east), up])
+    ground = float(np.median((points @ rotation.T)[:, 2]))
+    flying = float(np.median((centers @ rotation.T)[:, 2])) - ground
+    scale = LOCAL_FLYING_HEIGHT / max(flying, 1e-12)
+    middle = np.array([*np.median((centers @ rotation.T)[:, :2], axis=0), ground])
+    return Placement(scale, rotation, -scale * middle, "level", np.zeros_like(known), trusted=False)
+
+
+def _levelled(
+    found: Placement, centers: FloatArray, points: FloatArray, used_m: FloatArray, sigma_m: float
+) -> Placement:
+    """Turned about the middle of the positions used (N, 3) to the most probable attitude of the block.
+
+    Positions with standard deviation s that lie at r_i from their middle determine a small turn w with the information
+    sum [r_i]x^T [r_i]x / s^2, along a line none about it. The terrain's plane of best fit says that the block is level
+    with a standard deviation of _LEVEL_SIGMA_DEG. Both are weighed against each other.
+    """
+    from scipy.spatial.transform import Rotation
+
+    middle_m = used_m.mean(axis=0)
+    errors_m = found.points(centers[found.agreeing]) - used_m
+    sigma_m = max(sigma_m, float(np.sqrt((errors_m**2).mean())))
+    if not found.trusted:
+        sigma_m *= _DOUBTFUL
+    arms = used_m - middle_m
+    spread = np.eye(3) * (arms**2).sum() - arms.T @ arms
+    information = spread / max(sigma_m, 1e-9) ** 2
+    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(_LEVEL_SIGMA_DEG) ** 2
+    total = np.eye(3)
+    for _ in range(20):
+        up = total @ _up(found.points(centers), found.points(points))
+        to_level = np.cross(up, [0.0, 0.0, 1.0])
+        if up[2] < 0.0:
+            to_level = to_level / max(float(np.linalg.norm(to_level)), 1e-9)
+        turned = Rotation.from_matrix(total).as_rotvec()
+        step = np.linalg.solve(information + level + 1e-9 * np.eye(3), level @ to_level - information @ turned)
+        if float(np.linalg.norm(step)) < 1e-7:
+            break
+        total = Rotation.from_rotvec(step).as_matrix() @ total
+    moved = total @ (found.translation_m - middle_m) + middle_m
+    return replace(found, rotation=total @ found.rotation, translation_m=moved)
+
+
+def _up(centers: FloatArray, points: FloatArray) -> FloatArray:
+    """Unit normal (3,) of the plane through most points, towards the cameras; far points and outliers weigh less."""
+    middle = np.median(points, axis=0)
+    weights = np.ones(len(points))
+    normal = np.array([0.0, 0.0, 1.0])
+    for _ in range(10):
+        middle = np.average(points, axis=0, weights=weights)
+        normal = np.linalg.svd((points - middle) * np.sqrt(weights)[:, None], full_matrices=False)[2][2]
+        off = (points - middle) @ normal
+        scale = 1.4826 * float(np.median(np.abs(off))) or 1e-12
+        weights = 1.0 / (1.0 + (off / (2.0 * scale)) ** 2) ** 2
+    side = float(np.median((centers - middle) @ normal))
+    return normal if side >= 0.0 else -normal

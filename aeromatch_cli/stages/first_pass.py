@@ -1,0 +1,91 @@
+"""The first pass: source images at reduced size, few descriptors, fundamental matrices; a small workspace of its own.
+
+It is cheap, and it leans on nothing that the user says of attitudes and focal lengths: what it finds can judge them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from aeromatch_cli.data import Block, Pair
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.orientation.judgement import PairPoints
+from aeromatch_cli.stages import extract, filter, match  # noqa: A004
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.strategies.enhancers.none import NoEnhancement
+from aeromatch_cli.strategies.extractors.sift import Sift
+from aeromatch_cli.strategies.filters.poselib import Poselib
+from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
+from aeromatch_cli.strategies.orienters import FirstPass
+from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
+from aeromatch_cli.strategies.simulators.none import SourceOnly
+
+# Up to so many pairs of images without position are all compared: less than two minutes on two cores.
+_MOST_PAIRS = 12_000
+
+
+def prepared(context: Context, recipe: FirstPass) -> Context:
+    """The context of the first pass of a block; nothing is run yet."""
+    settings = context.settings
+    limit = settings.block.max_size_px
+    size_px = min(recipe.size_px, limit) if limit else recipe.size_px
+    own = settings.model_copy(
+        update={
+            "block": settings.block.model_copy(update={"max_size_px": size_px}),
+            "run": settings.run.model_copy(update={"keep_images": False}),
+            "enhance": NoEnhancement(),
+            "simulate": SourceOnly(),
+            "extract": Sift(keypoints=recipe.keypoints),
+            "match": Nearest(),
+            "filter": (Poselib(model="fundamental"),),
+        }
+    )
+    # Attitudes and ground are on trial: nothing here may depend on them.
+    poses = {i: replace(pose, world_rotation=None) for i, pose in context.block.poses.items()}
+    block = replace(context.block, poses=poses, ground=None, gsd_m=None)
+    return replace(
+        context,
+        settings=own,
+        workspace=context.workspace.first_pass,
+        block=block,
+        pairs=tuple(_pairs(block, recipe)),
+        shard=None,
+        part="first pass: ",
+    )
+
+
+def run(context: Context) -> None:
+    """Extract, match and filter. Images and pairs that fail are left out here and named by the final pass."""
+    context.workspace.create()
+    extract.run(context)
+    match.run(context)
+    filter.run(context)
+
+
+def _pairs(block: Block, recipe: FirstPass) -> list[Pair]:
+    """Nearest neighbours by position; images without position with all others while those are few."""
+    ids = sorted(image.image_id for image in block.images)
+    if len(block.poses) < len(ids) and len(ids) * (len(ids) - 1) // 2 <= _MOST_PAIRS:
+        chosen = set(combinations(ids, 2))
+    else:
+        chosen = set(fallback_pairs(block, ids, recipe.neighbours))
+    nan = float("nan")
+    return [Pair(id0, id1, nan, nan, "first pass") for id0, id1 in sorted(chosen)]
+
+
+def verified_points(context: Context) -> Iterator[PairPoints]:
+    """Verified matches of the first pass, stored pixels."""
+    keypoints = {}
+    for pair, entry in filter.verified_pairs(context):
+        if entry.verdict.state != "verified":
+            continue
+        for image_id in (pair.image_id0, pair.image_id1):
+            if image_id not in keypoints:
+                keypoints[image_id] = read_keypoints(context.workspace.features(image_id))[0].astype(np.float64)
+        indices = entry.matches.indices
+        sides = [keypoints[i][indices[:, side]] for side, i in enumerate((pair.image_id0, pair.image_id1))]
+        yield PairPoints(pair.image_id0, pair.image_id1, *sides)
