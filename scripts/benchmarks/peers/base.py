@@ -140,10 +140,13 @@ def read_weights(options: Options, name: str) -> dict[str, Any]:
 def prepared(
     preset: str, changes: Sequence[str], images: Path, poses: Path, cameras: Path, workspace: Path, **more: Any
 ) -> Context:
-    """A block with its chosen pairs as a preset with these settings reads it, in this process. more: seed, dry."""
+    """A block with its chosen pairs as a preset with these settings reads it, in this process. more: seed, dry.
+
+    Poses stay as they are given: the same for all peers.
+    """
     from aeromatch_cli.executor import Executor
     from aeromatch_cli.stages.pairs import prepare
 
     block = {"images": str(images), "poses": str(poses), "cameras": str(cameras)}
     top = {"workspace": str(workspace), "run": {"executor": "serial", "jobs": 1}, "seed": more.get("seed", 0)}
-    return prepare(load(preset, list(changes), block, **top), Executor("serial", 1), dry=more.get("dry", False))[0]
+    return prepare(load(preset, ["orient=none", *changes], block, **top), Executor("serial", 1), dry=more.get("dry", False))[0]

@@ -79,7 +79,8 @@ def prepared(folder: Path, workspace: str, changes: Sequence[str]) -> Context:
     block = {"images": str(folder / "images"), "poses": str(folder / "poses_noisy.csv")}
     block["cameras"] = str(folder / "block.json")
     top = {"workspace": workspace, "run": {"executor": "serial", "jobs": 1}}
-    return pairs.prepare(load("baseline", list(changes), block, **top), Executor("serial", 1))[0]
+    settings = load("baseline", ["orient=none", *changes], block, **top)
+    return pairs.prepare(settings, Executor("serial", 1))[0]
 
 
 def _suns(folder: Path) -> dict[str, int]:

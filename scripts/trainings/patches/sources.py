@@ -92,7 +92,7 @@ def reference(folder: Path, name: str) -> dict[str, Tracks]:
     rng = np.random.default_rng([len(name), *name.encode(), 32])
     with tempfile.TemporaryDirectory() as scratch:
         top = {"workspace": scratch, "run": {"executor": "serial", "jobs": 1}}
-        settings = load("baseline", ["simulate.keep_source=true", "pairs=exhaustive"], block, **top)
+        settings = load("baseline", ["orient=none", "simulate.keep_source=true", "pairs=exhaustive"], block, **top)
         context = pairs.prepare(settings, Executor("serial", 1))[0]
         sights = sights_of(context, None, None, {})
     with np.load(folder / "reference" / "points.npz") as archive:
