@@ -1,95 +1,122 @@
-"""Whether given poses explain the matches of the first pass, and which of them the pictures contradict."""
+"""Which given poses explain the matches of the first pass, as exactly as these are."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Pose
+from aeromatch_cli.data import Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
 
-# Given poses explain a block when they are as exact as its matches: this share of them near their epipolar lines...
-_EXPLAINED_SHARE = 0.9
-# ... and of the matches of every image this share.
-_EXPLAINED_IMAGE = 0.6
-# Flatter rays give no height.
+# Two poses explain the matches of a pair when this share of them lies near its epipolar line and in front of both.
+_EXPLAINED_SHARE = 0.75
+_MIN_MATCHES = 15
+# Matches at a flatter angle of intersection may seem to lie behind a camera, and give no height.
 _MIN_RAY_ANGLE_DEG = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class PairPoints:
-    """Verified matches of two images: stored pixels (M, 2) each."""
+    """Verified matches of two images: stored pixels (M, 2) each, and the numbers (M, 2) of their keypoints."""
 
     image_id0: str
     image_id1: str
     points0_px: FloatArray
     points1_px: FloatArray
+    indices: IntArray
 
 
-@dataclass(frozen=True)
-class Explained:
-    """share: of all matches, how many are near the epipolar lines of the given poses; shares: the same by image."""
+def explained_share(
+    pair: PairPoints, poses: Mapping[str, Pose], cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
+) -> float:
+    """Share of a pair's matches that both given poses explain, 0 where one has no attitude.
 
-    share: float
-    shares: Mapping[str, float]
+    A match is explained when it lies near its epipolar line, and its rays do not meet behind a camera: epipolar lines
+    alone do not tell a flight from the same flown backwards.
+    """
+    first, second = poses.get(pair.image_id0), poses.get(pair.image_id1)
+    if first is None or second is None or first.world_rotation is None or second.world_rotation is None:
+        return 0.0
+    camera0, camera1 = cameras[pair.image_id0], cameras[pair.image_id1]
+    matrix = fundamental_from_poses(camera0, first, camera1, second)
+    errors = sampson_distance_px(matrix, undistort(camera0, pair.points0_px), undistort(camera1, pair.points1_px))
+    rays0 = world_rays(camera0, first.world_rotation, pair.points0_px)
+    rays1 = world_rays(camera1, second.world_rotation, pair.points1_px)
+    flat = (rays0 * rays1).sum(axis=1) > np.cos(np.deg2rad(_MIN_RAY_ANGLE_DEG))
+    behind = ~flat & ~np.isfinite(triangulate(first.center_m, rays0, second.center_m, rays1)).all(axis=1)
+    limit = max(thresholds_px[pair.image_id0], thresholds_px[pair.image_id1])
+    return float(((errors <= limit) & ~behind).mean())
 
-    @property
-    def holds(self) -> bool:
-        """Whether poses as exact as the matches need not be found again."""
-        return self.share >= _EXPLAINED_SHARE and all(share >= _EXPLAINED_IMAGE for share in self.shares.values())
 
-
-def explained(
-    pairs: Iterable[PairPoints],
+def explained_images(
+    pairs: Sequence[PairPoints],
     poses: Mapping[str, Pose],
     cameras: Mapping[str, Camera],
     thresholds_px: Mapping[str, float],
-) -> Explained:
-    """How well given poses explain verified matches; matches of images without attitude are not explained.
+) -> set[str]:
+    """Images whose given poses explain what they share with each other.
 
-    cameras: by image_id. thresholds_px: by image_id, the error of an exact match in stored pixels.
+    thresholds_px: by image_id, the error of an exact match in stored pixels. Images are grouped by pairs that are
+    explained; the largest group counts, and each further one that does not contradict those taken before.
     """
-    good: dict[str, int] = {}
-    count: dict[str, int] = {}
-    for pair in pairs:
-        ids = pair.image_id0, pair.image_id1
-        near = 0
-        if all(i in poses and poses[i].world_rotation is not None for i in ids):
-            matrix = fundamental_from_poses(cameras[ids[0]], poses[ids[0]], cameras[ids[1]], poses[ids[1]])
-            sides = [undistort(cameras[i], p) for i, p in zip(ids, (pair.points0_px, pair.points1_px), strict=True)]
-            near = int((sampson_distance_px(matrix, *sides) <= max(thresholds_px[i] for i in ids)).sum())
-        for image_id in ids:
-            good[image_id] = good.get(image_id, 0) + near
-            count[image_id] = count.get(image_id, 0) + len(pair.points0_px)
-    shares = {i: good[i] / total for i, total in count.items() if total}
-    return Explained(sum(good.values()) / max(sum(count.values()), 1), shares)
+    ties = [p for p in pairs if len(p.indices) >= _MIN_MATCHES]
+    good = {
+        (p.image_id0, p.image_id1): explained_share(p, poses, cameras, thresholds_px) >= _EXPLAINED_SHARE for p in ties
+    }
+    taken: set[str] = set()
+    for group in _groups([ids for ids, holds in good.items() if holds]):
+        across = [ids for ids in good if len(taken.intersection(ids)) == 1 and len(group.intersection(ids)) == 1]
+        if not across:
+            taken |= group
+    return taken
 
 
-def triangulated(pairs: Iterable[PairPoints], poses: Mapping[str, Pose], cameras: Mapping[str, Camera]) -> FloatArray:
-    """World points (P, 3) of the matches of posed pairs; of rays that meet at too flat an angle none."""
-    found: list[FloatArray] = [np.zeros((0, 3))]
+def _groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
+    """Connected groups of images, the largest first; among equal ones the first by name."""
+    group: dict[str, set[str]] = {}
+    for id0, id1 in edges:
+        both = group.get(id0, {id0}) | group.get(id1, {id1})
+        for image_id in both:
+            group[image_id] = both
+    unique = {id(members): members for members in group.values()}
+    return sorted(unique.values(), key=lambda members: (-len(members), min(members)))
+
+
+def triangulated(
+    pairs: Sequence[PairPoints], poses: Mapping[str, Pose], cameras: Mapping[str, Camera]
+) -> list[FloatArray]:
+    """World points (M, 3) of the matches of every pair; NaN where a pose is unknown or the angle is too flat."""
+    found = []
     for pair in pairs:
-        first, second = poses[pair.image_id0], poses[pair.image_id1]
-        if first.world_rotation is None or second.world_rotation is None:
+        found.append(np.full((len(pair.indices), 3), np.nan))
+        first, second = poses.get(pair.image_id0), poses.get(pair.image_id1)
+        if first is None or second is None or first.world_rotation is None or second.world_rotation is None:
             continue
         rays0 = world_rays(cameras[pair.image_id0], first.world_rotation, pair.points0_px)
         rays1 = world_rays(cameras[pair.image_id1], second.world_rotation, pair.points1_px)
         points = triangulate(first.center_m, rays0, second.center_m, rays1)
-        points = points[np.isfinite(points).all(axis=1)]
-        found.append(points[view_angles_deg(first.center_m, second.center_m, points) >= _MIN_RAY_ANGLE_DEG])
-    return np.concatenate(found)
+        points[view_angles_deg(first.center_m, second.center_m, points) < _MIN_RAY_ANGLE_DEG] = np.nan
+        found[-1] = points
+    return found
 
 
-def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, FloatArray]) -> dict[str, float]:
+def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:
     """image_id -> angle in degrees between its given attitude and the one found, where both exist."""
     errors = {}
-    for image_id, rotation in found.items():
-        pose = given.get(image_id)
-        if pose is not None and pose.world_rotation is not None:
-            cosine = (np.trace(pose.world_rotation @ rotation.T) - 1.0) / 2.0
-            errors[image_id] = float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    for image_id, pose in found.items():
+        before = given.get(image_id)
+        if before is None or before.world_rotation is None or pose.world_rotation is None:
+            continue
+        cosine = (np.trace(before.world_rotation @ pose.world_rotation.T) - 1.0) / 2.0
+        errors[image_id] = float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
     return errors
+
+
+def position_errors_m(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:
+    """image_id -> distance in metres between its given position and the one found, where both exist."""
+    both = given.keys() & found.keys()
+    return {i: float(np.linalg.norm(given[i].center_m - found[i].center_m)) for i in sorted(both)}

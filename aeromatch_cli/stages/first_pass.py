@@ -35,6 +35,7 @@ def prepared(context: Context, recipe: FirstPass) -> Context:
     size_px = min(recipe.size_px, limit) if limit else recipe.size_px
     own = settings.model_copy(
         update={
+            "seed": 0,  # another seed of the matching changes no orientation
             "block": settings.block.model_copy(update={"max_size_px": size_px}),
             "run": settings.run.model_copy(update={"keep_images": False}),
             "enhance": NoEnhancement(),
@@ -87,5 +88,5 @@ def verified_points(context: Context) -> Iterator[PairPoints]:
             if image_id not in keypoints:
                 keypoints[image_id] = read_keypoints(context.workspace.features(image_id))[0].astype(np.float64)
         indices = entry.matches.indices
-        sides = [keypoints[i][indices[:, side]] for side, i in enumerate((pair.image_id0, pair.image_id1))]
-        yield PairPoints(pair.image_id0, pair.image_id1, *sides)
+        points0, points1 = keypoints[pair.image_id0][indices[:, 0]], keypoints[pair.image_id1][indices[:, 1]]
+        yield PairPoints(pair.image_id0, pair.image_id1, points0, points1, indices)

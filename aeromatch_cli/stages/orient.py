@@ -18,8 +18,15 @@ from aeromatch_cli.data import Block, Camera, FloatArray, Ground, Pose
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, terrain_of
-from aeromatch_cli.orientation.judgement import Explained, attitude_errors_deg, explained, triangulated
+from aeromatch_cli.orientation.judgement import (
+    PairPoints,
+    attitude_errors_deg,
+    explained_images,
+    position_errors_m,
+    triangulated,
+)
 from aeromatch_cli.orientation.mapping import Model, map_block
+from aeromatch_cli.orientation.resection import resected
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.export import contents_of
@@ -45,8 +52,11 @@ _SIGMA_ANGLE_DEG = 0.2
 _SIGMA_POSITION_SHARE = 0.005
 # Standard deviations of focal lengths, as a share: stated by EXIF or a file, and guessed.
 _STATED_FOCAL, _GUESSED_FOCAL = 0.03, 0.4
-# Beyond this a given attitude is wrong and not just inexact.
-_WRONG_DEG = 45.0
+# Beyond this a given attitude is wrong and not just inexact; and a position beyond so many standard deviations.
+_WRONG_DEG = 30.0
+_WRONG_SIGMAS = 5.0
+# Given poses stay where they explain the matches of this share of the images: single others are corrected.
+_MOST = 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +109,83 @@ def _found(context: Context, recipe: FirstPass) -> Found:
         first_pass.run(first)
     block = context.block
     cameras = {image.image_id: block.camera(image) for image in block.images}
-    points = list(first_pass.verified_points(first)) if first.pairs else []
-    how_well = explained(points, block.poses, cameras, _thresholds(first))
+    pairs = list(first_pass.verified_points(first)) if first.pairs else []
+    matched = {i for pair in pairs for i in (pair.image_id0, pair.image_id1)}
+    good = explained_images(pairs, block.poses, cameras, _thresholds(first))
     facts: dict[str, Any] = {
-        "method": "given",
-        "explained": round(how_well.share, 4),
-        "pairs": len(points),
-        "tied": [(pair.image_id0, pair.image_id1) for pair in points],
+        "images_matched": len(matched),
+        "given_poses_explained": len(good),
+        "tied": [(pair.image_id0, pair.image_id1) for pair in pairs],
     }
-    if not points or how_well.holds:
-        terrain = terrain_of(triangulated(points, block.poses, cameras), _area(block.poses))
-        return Found(block.cameras, block.poses, terrain, facts | {"points": sum(len(p.points0_px) for p in points)})
+    if not matched or not recipe.replaces or len(good) >= _MOST * len(matched):
+        return _kept(block, pairs, cameras, good, facts, _thresholds(first) if recipe.replaces else None)
     sigmas = {k: _GUESSED_FOCAL if k in context.guessed_cameras else _STATED_FOCAL for k in block.cameras}
-    models = map_block(contents_of(first), block.poses, sigmas, recipe.mapper)
-    return _merged(block, models, facts, how_well)
+    return _merged(block, map_block(contents_of(first), block.poses, sigmas, recipe.mapper), facts)
+
+
+def _kept(
+    block: Block,
+    pairs: Sequence[PairPoints],
+    cameras: Mapping[str, Camera],
+    good: set[str],
+    facts: dict[str, Any],
+    thresholds_px: Mapping[str, float] | None,
+) -> Found:
+    """Given poses as they are, but for those that the matches contradict: these by resection (thresholds_px: not None).
+
+    Images without matches keep what was given: nothing speaks against it.
+    """
+    poses = dict(block.poses)
+    matched = {i for pair in pairs for i in (pair.image_id0, pair.image_id1)}
+    found: dict[str, Pose] = {}
+    if thresholds_px is not None:
+        known = {i: poses[i] for i in sorted(good)}
+        height_m = _height_m([pose.center_m for pose in known.values()], pairs, known, cameras)
+        sigmas = (_SIGMA_POSITION_SHARE * height_m, _SIGMA_ANGLE_DEG)
+        found = resected(pairs, known, cameras, thresholds_px, sigmas)
+        for image_id in matched - good - found.keys():
+            if image_id in poses:
+                poses[image_id] = replace(poses[image_id], world_rotation=None)
+        poses |= found
+    points = np.concatenate([np.zeros((0, 3)), *triangulated(pairs, poses, cameras)])
+    points = points[np.isfinite(points).all(axis=1)]
+    judged = _judged(block.poses, found)
+    facts |= {"method": "given", "corrected": sorted(found), "points": len(points), **judged}
+    facts["outside"] = sorted(image.image_id for image in block.images if not _oriented(poses, image.image_id))
+    return Found(block.cameras, poses, terrain_of(points, _area(poses)), facts)
+
+
+def _height_m(
+    centers_m: Sequence[FloatArray],
+    pairs: Sequence[PairPoints],
+    poses: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+) -> float:
+    """Median flying height by the points of posed pairs, 1 where there are none."""
+    points = np.concatenate([np.zeros((0, 3)), *triangulated(pairs, poses, cameras)])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points) or not centers_m:
+        return 1.0
+    return abs(float(np.median([center[2] for center in centers_m]) - np.median(points[:, 2])))
+
+
+def _oriented(poses: Mapping[str, Pose], image_id: str) -> bool:
+    return image_id in poses and poses[image_id].world_rotation is not None
+
+
+def _judged(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, Any]:
+    """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres."""
+    angles = {i: round(error, 1) for i, error in attitude_errors_deg(given, found).items()}
+    shifts = {i: round(error, 2) for i, error in position_errors_m(given, found).items()}
+    far = {
+        i: error
+        for i, error in shifts.items()
+        if error > _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m)
+    }
+    return {
+        "wrong_attitudes": {i: error for i, error in sorted(angles.items()) if error > _WRONG_DEG},
+        "wrong_positions": dict(sorted(far.items())),
+    }
 
 
 def _thresholds(first: Context) -> dict[str, float]:
@@ -121,11 +194,11 @@ def _thresholds(first: Context) -> dict[str, float]:
     return {i.image_id: _EXACT_PX * max(1.0, max(i.width_px, i.height_px) / limit) for i in first.block.images}
 
 
-def _merged(block: Block, models: Sequence[Model], facts: dict[str, Any], how_well: Explained) -> Found:
+def _merged(block: Block, models: Sequence[Model], facts: dict[str, Any]) -> Found:
     """Given poses and cameras, replaced by what the models say."""
     poses, cameras = dict(block.poses), dict(block.cameras)
     points = [np.zeros((0, 3))]
-    wrong: dict[str, float] = {}
+    found: dict[str, Pose] = {}
     offset = np.zeros(3)
     for model in reversed(models):  # the largest model's cameras count
         shift = np.zeros(3)
@@ -137,29 +210,21 @@ def _merged(block: Block, models: Sequence[Model], facts: dict[str, Any], how_we
         height = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
         sigma_m = _SIGMA_POSITION_SHARE * abs(height)
         for image_id, rotation in model.rotations.items():
-            poses[image_id] = Pose(model.centers_m[image_id] + shift, rotation, sigma_m, _SIGMA_ANGLE_DEG)
+            found[image_id] = Pose(model.centers_m[image_id] + shift, rotation, sigma_m, _SIGMA_ANGLE_DEG)
         cameras |= model.cameras
         points.append(model.points_m[model.track_lengths >= 3] + shift)
-        errors = attitude_errors_deg(block.poses, model.rotations)
-        wrong |= {i: round(error, 1) for i, error in errors.items() if error > _WRONG_DEG}
-    oriented = {i for model in models for i in model.rotations}
-    for image_id in block.poses.keys() - oriented:
+    for image_id in block.poses.keys() - found.keys():
         # An attitude that nothing confirms in a block where others were wrong is not relied on.
         poses[image_id] = replace(poses[image_id], world_rotation=None)
-    terrain = terrain_of(np.concatenate(points), _area(poses))
-    return Found(
-        cameras,
-        poses,
-        terrain,
-        facts
-        | {
-            "method": "pictures",
-            "models": [dict(model.figures) | {"kind": model.kind} for model in models],
-            "points": sum(len(p) for p in points),
-            "wrong_attitudes": dict(sorted(wrong.items())),
-            "outside": sorted(image.image_id for image in block.images if image.image_id not in oriented),
-        },
-    )
+    poses |= found
+    facts |= {
+        "method": "pictures",
+        "models": [dict(model.figures) | {"kind": model.kind} for model in models],
+        "points": sum(len(p) for p in points),
+        **_judged(block.poses, found),
+        "outside": sorted(image.image_id for image in block.images if image.image_id not in found),
+    }
+    return Found(cameras, poses, terrain_of(np.concatenate(points), _area(poses)), facts)
 
 
 def _area(poses: Mapping[str, Pose]) -> FloatArray:

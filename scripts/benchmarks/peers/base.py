@@ -149,4 +149,6 @@ def prepared(
 
     block = {"images": str(images), "poses": str(poses), "cameras": str(cameras)}
     top = {"workspace": str(workspace), "run": {"executor": "serial", "jobs": 1}, "seed": more.get("seed", 0)}
-    return prepare(load(preset, ["orient=none", *changes], block, **top), Executor("serial", 1), dry=more.get("dry", False))[0]
+    return prepare(
+        load(preset, ["orient=none", *changes], block, **top), Executor("serial", 1), dry=more.get("dry", False)
+    )[0]
