@@ -99,7 +99,7 @@ def test_both_arithmetics_are_exact(arithmetic):
 
 
 def test_a_byte_product_that_saturates_is_not_used(monkeypatch):
-    # As oneDNN multiplies where it is held to AVX2: one side unsigned, neighbours added in 16 bits, the shift taken back.
+    # As oneDNN multiplies where it is held to AVX2: one side unsigned, neighbours added in 16 bits.
     def saturating(a, b):
         wide0, wide1 = a.numpy().astype(np.int64) + 128, b.numpy().astype(np.int64)
         pairs = wide0[:, 0::2, None] * wide1[None, 0::2] + wide0[:, 1::2, None] * wide1[None, 1::2]

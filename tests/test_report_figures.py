@@ -68,7 +68,7 @@ def test_map_is_true_to_scale_north_up_and_coloured_by_matches():
     stations = [
         report_map.Station("a", "a", "a", 0.0, 0.0),
         report_map.Station("b", "b", "b", 100.0, 0.0, "weak"),
-        report_map.Station("c", "<c>", "camera <c>", 0.0, 50.0, "ignored"),
+        report_map.Station("c", "<c>", "camera <c>", 0.0, 50.0, "wrong"),
     ]
     links = [
         report_map.Link("a", "b", "verified", 20, "weak tie"),
@@ -79,19 +79,19 @@ def test_map_is_true_to_scale_north_up_and_coloured_by_matches():
     square = np.array([[-60.0, -60.0], [60.0, -60.0], [60.0, 60.0], [-60.0, 60.0]])
     figure = report_map.block_map(stations, [square], links)
     places = {}
-    for kind, title in (("fine", "a"), ("weak", "b"), ("ignored", "camera <c>")):
+    for kind, title in (("fine", "a"), ("weak", "b"), ("wrong", "camera <c>")):
         ((found, place),) = shapes(figure.svg, kind)
         assert found == title
         places[kind] = np.array(place)
-    east, north = places["weak"] - places["fine"], places["ignored"] - places["fine"]
+    east, north = places["weak"] - places["fine"], places["wrong"] - places["fine"]
     assert east[0] > 0
     assert abs(east[1]) < 0.11
     assert abs(north[0]) < 0.11
     assert -north[1] == pytest.approx(east[0] / 2, abs=0.2)
     for css, title, ends in (
         ("k0", "weak tie", ("fine", "weak")),
-        ("k5", "strong tie", ("fine", "ignored")),
-        ("rejected", "<no>", ("weak", "ignored")),
+        ("k5", "strong tie", ("fine", "wrong")),
+        ("rejected", "<no>", ("weak", "wrong")),
     ):
         ((found, line),) = shapes(figure.svg, css)
         assert found == title

@@ -62,7 +62,7 @@ class BlockSettings(_Section):
     )
     ground: str = Field(
         "auto",
-        description="Ground height in metres, a DEM file, or `auto` (triangulated from adjacent images, else from "
+        description="Ground height in metres, a DEM file, or `auto` (the terrain that `orient` finds, else from "
         "relative altitudes).",
     )
     masks: str = Field(

@@ -23,7 +23,6 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `crs`: code of the CRS, or `local`. `origin_m`: [x, y, z] that is subtracted from it.
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
-- `ground_fingerprint`: of the settings that ground and GSD come from. `basis`: fingerprint of every image at that time.
 
 ### images.csv
 
@@ -38,22 +37,38 @@ cy are in this workspace's pixel frame (COLMAP's minus 0.5).
 ### poses.csv
 
 `image_id`; `x`, `y`, `z` of the projection centre, metres; `qw`, `qx`, `qy`, `qz` (`cam_from_world`, empty where the
-attitude is unknown or ignored); `sigma_position_m`, `sigma_angle_deg`: standard deviations.
+attitude is unknown); `sigma_position_m`, `sigma_angle_deg`: standard deviations.
 
 ### pairs.csv
 
 `image_id0`, `image_id1` (id0 < id1), `overlap` (share of the smaller footprint, 0-1), `view_angle_deg`, `reason` (the
 rule that chose the pair).
 
-### ignored_attitudes.json
+## Orientation
 
-Images whose attitude is not used because their matches contradict it.
+What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all other stages use.
 
-- `fingerprint`: of all that the judgement rests on. `settings`: fingerprint of the strategies.
-- `images`: image_id -> `angle_deg` (given attitude against the matches) and `facts` (fingerprint of the image and its
-  pose).
-- `isolated`: image_id -> facts, of images without verified pairs although poses predict overlap. They and the images
-  that they are paired with are also matched as source images.
+### orientation/orientation.json
+
+- `fingerprint`: of the inputs and settings. `images`: fingerprint of what was given of every image. `settings`: of the
+  rest. `files`: SHA-256 of the other files.
+- `facts`: `method` (`given`: the given poses explain the matches; `pictures`: a mapper oriented the block),
+  `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
+  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `wrong_attitudes`
+  (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented).
+- `tied`: pairs that the first pass verified.
+
+### orientation/cameras.csv, poses.csv
+
+As those of the workspace.
+
+### orientation/terrain.tif
+
+Heights of the terrain in the block's CRS, GeoTIFF, float32. Missing where the pictures tell none.
+
+### orientation/first_pass/
+
+Features and matches of reduced images; laid out like this workspace. It may be deleted.
 
 ## Pictures
 
@@ -117,12 +132,12 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
 
 - `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`.
 - `failures`: [[item, reason], ...].
-- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `ignored_attitudes`, `pairs_sha256`.
+- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `pairs_sha256`.
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
 - `facts` of match: `matches`. Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
-  `weakly_tied` (images with few verified matches), `rotation_contradicts_pose` (image_id -> degrees).
+  `weakly_tied` (images with few verified matches).
 - `facts` of export: exporter -> files and counts.
 
 ### failures.csv

@@ -29,13 +29,13 @@ _UNJUDGED: dict[str, Any] = {"color": COLOURS["soft"], "linewidth": 0.8, "linest
 _CAMERAS = {
     "fine": ("image", {"facecolor": COLOURS["ink"], "edgecolor": COLOURS["panel"], "linewidth": 0.8}),
     "weak": ("weakly tied image", {"facecolor": COLOURS["panel"], "edgecolor": COLOURS["bad"], "linewidth": 2.0}),
-    "ignored": ("ignored attitude", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
+    "wrong": ("wrong attitude given", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
 }
 
 
 @dataclass(frozen=True)
 class Station:
-    """One camera on the map. title: tooltip. kind: fine, weak (few verified matches) or ignored (ignored attitude)."""
+    """One camera on the map. title: tooltip. kind: fine, weak (few verified matches) or wrong (attitude given)."""
 
     image_id: str
     label: str
@@ -208,7 +208,7 @@ def _draw_links(
 
 
 def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
-    """Labels that lie on no earlier one and on no other camera; the tooltips name all. Weak and ignored come first."""
+    """Labels that lie on no earlier one and on no other camera; the tooltips name all. Weak and wrong come first."""
     taken: list[Any] = []
     places = axes.transData.transform([(s.x_m, s.y_m) for s in stations])
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):

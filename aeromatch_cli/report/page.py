@@ -72,7 +72,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     source = resources.files("aeromatch_cli.report") / "page.html.jinja"
     template = environment.from_string(source.read_text(encoding="utf-8"))
     facts = summarise(context, components(context))
-    ignored = {i: float(angle) for i, angle in _facts(context, "filter").get("rotation_contradicts_pose", {}).items()}
+    wrong = {i: float(angle) for i, angle in _facts(context, "orient").get("wrong_attitudes", {}).items()}
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
@@ -82,13 +82,13 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         headline=_headline(images, pairs, facts, failures),
-        notices=notices(images, pairs, facts, ignored, input_facts.get("warnings", [])),
+        notices=notices(images, pairs, facts, wrong, input_facts.get("warnings", [])),
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
         summary=input_facts.get("summary", []),
         block=_block_facts(context),
-        map=_map(context, images, pairs, ignored),
+        map=_map(context, images, pairs, wrong),
         histograms=[
             histogram(counts, f"verified matches per {words}", unit)
             for counts, words, unit in (
@@ -105,7 +105,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),
         weak_matches=WEAK_MATCHES,
-        ignored=ignored,
+        wrong=wrong,
         stages=stages,
         settings=_settings_text(context),
     )
@@ -142,7 +142,7 @@ def notices(
     images: Sequence[ImageRow],
     pairs: Sequence[PairRow],
     facts: Mapping[str, Any],
-    ignored: Mapping[str, float],
+    wrong: Mapping[str, float],
     warnings: Sequence[str],
 ) -> list[Notice]:
     """What needs a person's eye, the gravest first."""
@@ -155,10 +155,10 @@ def notices(
         shown = ", ".join(f"{size:,}" for size in sizes[:12] if size > 1)
         text = f"Sizes of the groups with more than one image: {shown}. Images tied to no other: {alone:,}."
         found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
-    if ignored:
-        text = "The matches contradict the attitude by the angle given; only the position is used."
-        items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in ignored.items())
-        title = _counted(len(items), "ignored attitude", "ignored attitudes")
+    if wrong:
+        text = "The pictures contradict the given attitude by the angle shown; the one from the pictures is used."
+        items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in wrong.items())
+        title = _counted(len(items), "wrong attitude", "wrong attitudes")
         found.append(Notice("bad", title, text, items))
     if facts["weakly_tied"] and facts["verified_matches"]:
         ties = {row.image_id: row for row in images}
@@ -170,7 +170,7 @@ def notices(
         ("none", "no position", "Paired by name or time, and not on the map."),
         ("position", "no usable attitude", "Paired by position, and drawn without footprint."),
     ):
-        items = tuple(row.name for row in images if row.pose == pose and row.image_id not in ignored)
+        items = tuple(row.name for row in images if row.pose == pose)
         if items:
             title = _counted(len(items), f"image has {lacks}", f"images have {lacks}")
             found.append(Notice("warn", title, text, items))
@@ -214,7 +214,7 @@ def _settings_text(context: Context) -> str:
 
 
 def _map(
-    context: Context, images: Sequence[ImageRow], pairs: Sequence[PairRow], ignored: Mapping[str, float]
+    context: Context, images: Sequence[ImageRow], pairs: Sequence[PairRow], wrong: Mapping[str, float]
 ) -> MapFigure | None:
     """None where no image has a position."""
     stations = []
@@ -226,7 +226,7 @@ def _map(
         ties = _counted(row.verified_matches, "verified match", "verified matches")
         title = f"{row.name}: {ties} in {row.verified_pairs} of {_counted(row.pairs, 'pair', 'pairs')}, z {z:.1f} m"
         weak = "weak" if row.verified_matches < WEAK_MATCHES else "fine"
-        stations.append(Station(row.image_id, label, title, x, y, "ignored" if row.image_id in ignored else weak))
+        stations.append(Station(row.image_id, label, title, x, y, "wrong" if row.image_id in wrong else weak))
     if not stations:
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]

@@ -1,7 +1,7 @@
 """What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
 
 Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
-`summary` and `warnings` of pairs and `rotation_contradicts_pose` of filter (page.py).
+`summary` and `warnings` of pairs and `wrong_attitudes` of orient (page.py).
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ def prepare(
         report.items = report.done = len(pairs)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     report.facts = {
-        "summary": [*summary.lines(), *_remarks(settings, summary.oriented)],
+        "summary": [*summary.lines(), *_remarks(settings)],
         "block": summary.figures(),
         "warnings": [*found.warnings, *summary.warnings],
         "images": len(found.block.images),
@@ -127,18 +127,9 @@ def _chosen(settings: Settings) -> Iterator[Strategy]:
     yield from settings.export
 
 
-def _remarks(settings: Settings, oriented: int) -> list[str]:
-    """What the recipe makes of this block that its user may not expect. oriented: images with attitude."""
-    found = [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
-    # The last model wins (filters.chain); every chain has one (config).
-    *_, last = (one for one in settings.filter if one.verifies)
-    if oriented and not last.gives_rotation():
-        chain = "+".join(one.name for one in settings.filter)
-        found.append(
-            f"attitudes        not judged: filter={chain} gives no rotation (poselib and epipolar do, with "
-            "model: relative_pose)"
-        )
-    return found
+def _remarks(settings: Settings) -> list[str]:
+    """What the recipe brings that its user may not expect."""
+    return [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
 
 
 def _fingerprint(context: Context) -> str:

@@ -13,6 +13,7 @@ from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
@@ -20,6 +21,9 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owne
 from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
+
+# A focal length that differs more from the given one is said.
+_FOCAL_SAID = 0.02
 
 STAGES: Mapping[str, Callable[[Context], StageReport]] = {
     "enhance": enhance.run,
@@ -144,9 +148,10 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
             f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
             f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
         )
-        lines += (
-            _filter_lines(stage, part=context.shard is not None) if stage.stage == "filter" else _picture_lines(stage)
-        )
+        if stage.stage == "filter":
+            lines += _filter_lines(stage, part=context.shard is not None)
+        else:
+            lines += _orient_lines(stage, context) if stage.stage == "orient" else _picture_lines(stage)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -212,6 +217,30 @@ def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
         names = facts["weakly_tied"]
         lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
     return lines
+
+
+def _orient_lines(stage: StageReport, context: Context) -> list[str]:
+    """How the block was oriented, and what of that which was given is wrong."""
+    facts = stage.facts
+    if "method" not in facts:
+        return []
+    matched, explained = facts["images_matched"], facts["given_poses_explained"]
+    if facts["method"] == "given":
+        words = [f"given poses explain the matches of {explained} of {matched} images"]
+    else:
+        sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
+        words = [f"given poses explain {explained} of {matched} images; oriented from the pictures: {sizes}"]
+        for camera_id, camera in sorted(context.block.cameras.items()):
+            before = focal_px(context.given.cameras[camera_id])
+            if abs(focal_px(camera) / before - 1.0) > _FOCAL_SAID:
+                words.append(f"focal length of {camera_id}: {focal_px(camera):.0f} px instead of {before:.0f} px")
+    for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
+        if facts[what]:
+            named = _listed([f"{i} ({value:.0f} {unit})" for i, value in facts[what].items()])
+            words.append(f"{what.replace('_', ' ')} given and corrected: {named}")
+    if facts["outside"]:
+        words.append(f"not oriented: {_listed(facts['outside'])}")
+    return [f"          {line}" for line in words]
 
 
 def _listed(names: list[str], shown: int = 10) -> str:

@@ -63,10 +63,6 @@ class Strategy(BaseModel):
         """The user's own weights files, used instead of the package's. To be called after `check_files`."""
         return ()
 
-    def gives_rotation(self) -> bool:
-        """Whether a filter's verdict holds the relative rotation, by which attitudes are judged."""
-        return False
-
 
 @dataclass(frozen=True, eq=False)
 class Enhanced:

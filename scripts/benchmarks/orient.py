@@ -153,11 +153,9 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     if done.returncode not in (0, 1):
         return head | {"seconds": seconds, "said": done.stderr.strip()[-300:]}
     stages = json.loads(done.stdout.splitlines()[-1])["stages"]
-    evaluated = subprocess.run(
-        [sys.executable, "-m", "aeromatch_cli.cli", "evaluate", str(work), "--truth", str(reference), "--quiet"]
-        + ["--json", *([] if args.mapping else ["--no-mapping"])],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
+    command = [sys.executable, "-m", "aeromatch_cli.cli", "evaluate", str(work), "--truth", str(reference)]
+    command += ["--quiet", "--json", *([] if args.mapping else ["--no-mapping"])]
+    evaluated = subprocess.run(command, check=False, capture_output=True, text=True)
     facts = json.loads(evaluated.stdout.splitlines()[-1])
     row = head | judged(work, reference, names, wrong)
     row |= {"correct": facts["totals"]["correct"], "kept": facts["totals"]["kept"]}

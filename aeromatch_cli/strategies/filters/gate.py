@@ -118,7 +118,3 @@ class TwoViewGated(Gated):
         gt=0.0,
         description="Largest Sampson error of an inlier, undistorted pixels. Larger: more matches, less accurate ones.",
     )
-
-    def gives_rotation(self) -> bool:
-        """Known cameras have one; a fundamental matrix holds none."""
-        return self.model == "relative_pose"
