@@ -25,7 +25,7 @@ KINDS = ("camera", "pose", "sigma", "ground")
 
 def context_of(site: Site) -> Context:
     """The context of a command on a finished site."""
-    context, _ = prepare(load(str(site.work / "config.yaml")), Executor("serial"))
+    context, *_ = prepare(load(str(site.work / "config.yaml")), Executor("serial"))
     return context
 
 

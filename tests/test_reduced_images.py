@@ -13,7 +13,7 @@ from aeromatch_cli.config import validate
 from aeromatch_cli.data import Block, Camera, Features, FloatArray, Image
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import read_features
-from aeromatch_cli.stages import extract, ground
+from aeromatch_cli.stages import extract
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import Workspace
 
@@ -93,25 +93,6 @@ def test_the_half_pixel_in_numbers():
     np.testing.assert_allclose(moved.sizes_px, [8.0, 12.0, 16.0], atol=1e-5)
     np.testing.assert_array_equal(moved.view_keypoints_px, rows)
     np.testing.assert_array_equal(extract._in_stored_frame(plain, 1.0).keypoints_px, rows)
-
-
-def test_points_for_the_ground_height_are_stored_pixels(tmp_path, monkeypatch):
-    """A reduced picture and a window of it at full size: points differ by the corner of the window."""
-    monkeypatch.setattr(ground, "_GROUND_SIZE_PX", 300)
-    rng = np.random.default_rng(6)
-    texture = cv2.GaussianBlur(rng.normal(size=(600, 750)), (0, 0), 4.0)
-    picture = np.clip(128 + 40 * texture / texture.std(), 0, 255).astype(np.uint8)
-    paths, cameras = [], []
-    for name, part in (("whole", picture), ("window", picture[130:355, 210:510])):
-        paths.append(tmp_path / f"{name}.png")
-        cv2.imwrite(str(paths[-1]), part)
-        height, width = part.shape
-        cameras.append(Camera("SIMPLE_PINHOLE", width, height, (700.0, (width - 1) / 2, (height - 1) / 2)))
-    points0, points1 = ground._match_reduced(ground._GroundTask(tuple(paths), tuple(cameras)))
-    assert len(points0) > 40
-    assert points0[:, 0].max() > 400  # scale 0.4: not reduced pixels
-    # Without the half pixel the median would be 0.75 px off.
-    np.testing.assert_allclose(np.median(points0 - points1, axis=0), [210.0, 130.0], atol=0.1)
 
 
 def test_reduced_images_give_keypoints_in_stored_pixels(site):

@@ -126,8 +126,11 @@ def full(tmp_path: Path) -> Context:
     first.write(result.workspace)
     StageReport("extract", items=5, done=4, failures=[("broken.png", "cut <off> & empty")]).write(result.workspace)
     judged = StageReport("filter", items=5, done=4)
-    judged.facts = {"rotation_contradicts_pose": {"c": 178.4}, "verified_matches": 80}
+    judged.facts = {"verified_matches": 80}
     judged.write(result.workspace)
+    oriented = StageReport("orient", items=4, done=4)
+    oriented.facts = {"wrong_attitudes": {"c": 178.4}}
+    oriented.write(result.workspace)
     return result
 
 
@@ -345,7 +348,7 @@ def test_large_block_stays_a_small_page(tmp_path):
     images = tuple(Image(i, f"{i[:-4]}.jpg", WIDTH, HEIGHT, "cam") for i in ids)
     centers = {i: np.array([20.0 * (k % 40), 20.0 * (k // 40), 100.0]) for k, i in enumerate(ids)}
     poses = {i: Pose(center, LOOKING_DOWN, 1.0, 1.0) for i, center in centers.items()}
-    large = replace(base, block=replace(base.block, images=images, poses=poses), given_poses=poses)
+    large = replace(base, block=replace(base.block, images=images, poses=poses))
     pairs = [
         pair_row(k, "verified" if step % 3 else "rejected", 20 + 37 * k % 900, (ids[k], ids[k + step]))
         for k in range(1000)

@@ -172,27 +172,38 @@ def test_an_edited_pose_redoes_one_image(done_site):
     assert outcome.counts("match") == (IMAGES - 1, PAIRS - IMAGES + 1, 0)
 
 
-def test_an_ignored_attitude_stays_ignored_until_it_changes(done_site):
-    def turn(rows):
-        return [{**row, "kappa_deg": str((float(row["kappa_deg"]) + 360) % 360 - 180)} if i == 1 else row
-                for i, row in enumerate(rows)]  # fmt: skip
+def turned(rows, which):
+    return [{**row, "kappa_deg": str((float(row["kappa_deg"]) + 360) % 360 - 180)} if i in which else row
+            for i, row in enumerate(rows)]  # fmt: skip
 
+
+def test_a_wrong_attitude_is_corrected_once_and_the_second_run_does_nothing(done_site):
     image_id = done_site.names()[1].replace(".", "_")
-    done_site.rewrite_poses(turn)
+    before = pair_prints(done_site)
+    done_site.rewrite_poses(lambda rows: turned(rows, {1}))
     outcome = done_site("run")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["rotation_contradicts_pose"] == {
-        image_id: pytest.approx(180, abs=8)
-    }
-    assert outcome.facts["stages"]["pairs"]["facts"]["ignored_attitudes"] == [image_id]
+    facts = outcome.facts["stages"]["orient"]["facts"]
+    assert facts["method"] == "given"
+    assert facts["corrected"] == [image_id]
+    assert facts["wrong_attitudes"] == {image_id: pytest.approx(180, abs=2)}
+    # The others keep their poses to the last bit: nothing of theirs is made again.
+    assert kept_pairs(before, pair_prints(done_site)) == {pair for pair in before if image_id not in pair}
+    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    workspace = contents(done_site.work)
     assert done_site("run").done() == {}
-    os.utime(done_site.image(3), (1_700_000_000, 1_700_000_000))  # another image changes: the judgement stands
-    assert done_site("run").counts("extract") == (1, IMAGES - 1, 0)
-    done_site.rewrite_poses(turn)
+    assert contents(done_site.work) == workspace
+
+
+def test_every_verified_pair_is_exported_where_a_third_of_the_attitudes_is_wrong(done_site):
+    done_site.rewrite_poses(lambda rows: turned(rows, {0, 3}))
     outcome = done_site("run")
-    assert outcome.facts["stages"]["filter"]["facts"]["rotation_contradicts_pose"] == {}
-    # Its neighbours, too, are seen with north up alone again.
-    assert outcome.counts("extract") == (IMAGES, 0, 0)
+    assert outcome.code == 0
+    assert len(outcome.facts["stages"]["orient"]["facts"]["wrong_attitudes"]) == 2
+    verified = outcome.facts["stages"]["filter"]["facts"]["pairs"]["verified"]
+    assert verified == PAIRS
+    assert len(contents(done_site.work)["export/colmap/database.db"]["two_view_geometries"]) == verified
+    assert done_site("run").done() == {}
 
 
 def test_replaced_masks_redo_the_images_that_they_mask(done_site):
@@ -215,7 +226,7 @@ def test_overwrite_redoes_everything(done_site):
     before = contents(done_site.work)
     outcome = done_site("run", "--overwrite")
     assert outcome.done() == {
-        "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "export": 1, "report": 1
+        "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "export": 1, "report": 1
     }  # fmt: skip
     assert contents(done_site.work) == before
 
@@ -243,7 +254,8 @@ def test_keep_images_makes_the_pictures_of_features_that_exist(done_site):
         "images.csv",
         "reports/filter.json",
         "reports/export.json",
-        "ignored_attitudes.json",
+        "orientation/orientation.json",
+        "orientation/poses.csv",
     ],
 )
 def test_damaged_files_are_made_again(done_site, name, damage):

@@ -30,8 +30,9 @@ def write_tiff(path: Path, bands: np.ndarray, **more: object) -> None:
 def raster(tmp_path: Path, *settings: str) -> StoredRaster:
     """Of the one picture in tmp_path/images."""
     block = {"images": str(tmp_path / "images")}
-    context, _ = pairs.prepare(
-        load("polar", ["pairs=exhaustive", *settings], block, workspace=str(tmp_path / "work")), Executor("serial", 1)
+    context, *_ = pairs.prepare(
+        load("polar", ["orient=none", "pairs=exhaustive", *settings], block, workspace=str(tmp_path / "work")),
+        Executor("serial", 1),
     )
     return StoredRaster(enhance.source_of(context, context.block.images[0]))
 

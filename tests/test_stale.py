@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site, invoke
 
-from aeromatch_cli.formats.tables import read_pairs
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import context
 from aeromatch_cli.workspace import Workspace, read_json
@@ -59,30 +58,6 @@ def test_the_ground_is_where_an_oblique_image_looks() -> None:
     heights_m = context._ground_heights(block)
     assert heights_m["a"] == pytest.approx(20.0)
     assert heights_m["b"] == 0.0
-
-
-def test_an_attitude_that_filter_rejects_is_a_failure_with_a_way_out(site: Site) -> None:
-    def turn_one(rows: list[dict[str, str]]) -> list[dict[str, str]]:
-        rows[2]["kappa_deg"] = str(float(rows[2]["kappa_deg"]) + 180.0)
-        return rows
-
-    site.rewrite_poses(turn_one)
-    image_id = site.names()[2].replace(".", "_")
-    # Turned by its attitude it matches nothing; compared as it was taken it contradicts its attitude; then it is right.
-    for reason in ("no verified pair with its attitude", "matches contradict its attitude"):
-        assert site("match").code == 0
-        judged = site("filter")
-        assert judged.code == 1
-        assert ("filter", image_id) in site.failures()
-        assert f"{reason}: run" in judged.stderr
-        assert "match and filter again" in judged.stderr
-    assert site("match").code == 0
-    assert site("filter").code == 0
-    assert site("export").code == 0
-    assert site.failures() == []
-    assert (
-        len(read_pairs(Workspace(site.work).pairs)) == read_json(Workspace(site.work).stage_report("filter"))["items"]
-    )
 
 
 def test_missing_weights_are_noticed_before_anything_is_made(site: Site) -> None:

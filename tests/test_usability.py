@@ -83,24 +83,6 @@ def test_the_summary_names_own_weights_and_only_those(site):
     assert "own weights" not in site("pairs", "--set", "extract=learned").stdout
 
 
-@pytest.mark.parametrize(
-    ("chain", "judged"),
-    [
-        ("poselib", True),
-        ("epipolar+graph", True),
-        ("poselib+magsac", False),
-        ("magsac+graph", False),
-        ("[{name: epipolar, model: fundamental}]", False),
-    ],
-)
-def test_the_summary_tells_where_the_chain_judges_no_attitude(site, chain, judged):
-    lines = site("pairs", "--set", f"filter={chain}").stdout.splitlines()
-    told = [line for line in lines if line.startswith("attitudes ")]
-    name = "epipolar" if "fundamental" in chain else chain
-    expected = f"attitudes        not judged: filter={name} gives no rotation (poselib and epipolar do, with "
-    assert told == ([] if judged else [expected + "model: relative_pose)"])
-
-
 # --- configuration ------------------------------------------------------------------------------------------------
 
 

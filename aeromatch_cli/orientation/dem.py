@@ -15,22 +15,22 @@ _NEIGHBOURS = 16
 # Points farther from the median of their neighbours than so many median deviations are wrong.
 _OUTLIER_DEVIATIONS = 4.0
 _MIN_POINTS = 12
+# A terrain of more pictures is the same up to this share of the flying height.
+_SAME_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
     """Heights on a grid.
 
-    heights_m: (H, W) float32 world heights, rows from north to south, no gaps. west_m, north_m: world position of the
-    centre of the first cell. cell_m: spacing, the same both ways. spread_m: median distance of the points used from
-    the heights.
+    heights_m: (H, W) world heights, rows from north to south, no gaps. west_m, north_m: world position of the centre
+    of the first cell. cell_m: spacing, the same both ways.
     """
 
     heights_m: FloatArray
     west_m: float
     north_m: float
     cell_m: float
-    spread_m: float
 
 
 def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
@@ -60,9 +60,56 @@ def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
     _, nearest = cKDTree(points_m[:, :2]).query(centres, k=min(_NEIGHBOURS, len(points_m)))
     heights = np.median(points_m[:, 2][nearest], axis=1).reshape(rows, columns)
     heights = gaussian_filter(heights, 0.7, mode="nearest").astype(np.float32)
-    at = np.rint((points_m[:, :2] - [x[0], y[0]]) / [cell, -cell]).astype(int)
-    spread = float(np.median(np.abs(points_m[:, 2] - heights[at[:, 1], at[:, 0]])))
-    return Terrain(heights, float(x[0]), float(y[0]), cell, spread)
+    return Terrain(heights, float(x[0]), float(y[0]), cell)
+
+
+def continued(old: Terrain, new: Terrain, centers_m: FloatArray) -> Terrain:
+    """The old terrain of a block that has grown, with heights of the new one around it; the new one where they differ.
+
+    centers_m: (N, 3) projection centres. Cells of the old terrain keep their places and heights, so that views made of
+    it stay as they are.
+    """
+    inside = _sampled(new, _grid(old)).reshape(old.heights_m.shape)
+    height_m = abs(float(np.median(centers_m[:, 2]) - np.median(old.heights_m)))
+    if float(np.median(np.abs(inside - old.heights_m))) > _SAME_SHARE * height_m:
+        return new
+    low, high = _extent(old)
+    low_new, high_new = _extent(new)
+    before = np.maximum(np.ceil((low - low_new) / old.cell_m - 1e-6), 0).astype(int)
+    after = np.maximum(np.ceil((high_new - high) / old.cell_m - 1e-6), 0).astype(int)
+    if not before.any() and not after.any():
+        return old
+    rows, columns = np.array(old.heights_m.shape) + (before + after)[::-1]
+    whole = Terrain(
+        np.zeros((rows, columns)), old.west_m - before[0] * old.cell_m, old.north_m + after[1] * old.cell_m, old.cell_m
+    )
+    heights = _sampled(new, _grid(whole)).reshape(rows, columns)
+    heights[after[1] : rows - before[1], before[0] : columns - after[0]] = old.heights_m
+    return Terrain(heights, whole.west_m, whole.north_m, whole.cell_m)
+
+
+def _extent(terrain: Terrain) -> tuple[FloatArray, FloatArray]:
+    """South-west and north-east corner cell's centres."""
+    rows, columns = terrain.heights_m.shape
+    south, east = terrain.north_m - (rows - 1) * terrain.cell_m, terrain.west_m + (columns - 1) * terrain.cell_m
+    return np.array([terrain.west_m, south]), np.array([east, terrain.north_m])
+
+
+def _grid(terrain: Terrain) -> FloatArray:
+    """(H W, 2) centres of its cells."""
+    rows, columns = terrain.heights_m.shape
+    x = terrain.west_m + terrain.cell_m * np.arange(columns)
+    y = terrain.north_m - terrain.cell_m * np.arange(rows)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _sampled(terrain: Terrain, places_m: FloatArray) -> FloatArray:
+    """Bilinear heights (N,), those of the border beyond it."""
+    from scipy.ndimage import map_coordinates
+
+    columns = (places_m[:, 0] - terrain.west_m) / terrain.cell_m
+    rows = (terrain.north_m - places_m[:, 1]) / terrain.cell_m
+    return np.asarray(map_coordinates(terrain.heights_m.astype(float), [rows, columns], order=1, mode="nearest"))
 
 
 def _without_outliers(points_m: FloatArray) -> FloatArray:

@@ -149,7 +149,9 @@ def _ground_heights(block: Block) -> Mapping[str, float]:
     if block.ground is None:
         return {}
     below = {i: float(block.ground.height_m(pose.center_m[None, :2])[0]) for i, pose in block.poses.items()}
-    return below | {i: footprint.ground_z_m for i, footprint in block_footprints(block).items()}
+    heights = below | {i: footprint.ground_z_m for i, footprint in block_footprints(block).items()}
+    # To the millimetre: a terrain that has grown gives the same heights but for the last bits.
+    return {i: round(height_m, 3) for i, height_m in heights.items()}
 
 
 @lru_cache(maxsize=4)
