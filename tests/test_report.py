@@ -230,7 +230,7 @@ def test_every_figure_of_the_page_is_well_formed_and_the_map_shows_the_poses(ful
     for svg in figures:
         assert ElementTree.fromstring(svg).get("viewBox")
     (block_map,) = (svg for svg in figures if 'aria-label="Block map"' in svg)
-    cameras = [shape for kind in ("fine", "weak", "ignored") for shape in shapes(block_map, kind)]
+    cameras = [shape for kind in ("fine", "weak", "wrong") for shape in shapes(block_map, kind)]
     assert [title for title, _ in cameras] == [
         "a.png: 60 verified matches in 1 of 3 pairs, z 100.0 m",
         "b.jpg: 80 verified matches in 2 of 2 pairs, z 100.0 m",

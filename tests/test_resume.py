@@ -82,7 +82,7 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
         ("filter.poselib.threshold_px=3", {"filter": PAIRS, "export": 1, "report": 1}),
         ("extract.keypoints=300", {"extract": IMAGES, "match": PAIRS, "filter": PAIRS, "export": 1, "report": 1}),
         ("seed=5", {"filter": PAIRS, "export": 1, "report": 1}),
-        ("block.sigma_position_m=9", {"export": 1, "report": 1}),
+        ("block.sigma_position_m=9", {"orient": IMAGES, "export": 1, "report": 1}),
         ("export.colmap.pose_priors=false", {"export": 1, "report": 1}),
     ],
 )

@@ -24,7 +24,7 @@ from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
-from aeromatch_cli.stages.ground import given_ground
+from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, image_fingerprint, read_json
 
 log = logging.getLogger("aeromatch")
@@ -73,7 +73,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         guessed_cameras=inputs.guessed_cameras,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
-        gsd_before_m=before.get("gsd_m"),
+        gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
         ground_hint=None
         if inputs.ground_hint_z_m is None
         else (ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source),
@@ -88,7 +88,7 @@ def with_gsd(block: Block, before_m: float | None) -> Block:
     return replace(block, gsd_m=gsd_m)
 
 
-def block_record(block: Block) -> dict[str, Any]:
+def block_record(block: Block, settings: Settings) -> dict[str, Any]:
     """Contents of block.json."""
     return {
         "format_version": FORMAT_VERSION,
@@ -97,6 +97,7 @@ def block_record(block: Block) -> dict[str, Any]:
         "ground_source": block.ground_source,
         "ground_z_m": block.ground.z_m if isinstance(block.ground, ConstantGround) else None,
         "gsd_m": block.gsd_m,
+        "ground_fingerprint": ground_fingerprint(settings),
     }
 
 

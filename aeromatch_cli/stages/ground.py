@@ -10,6 +10,13 @@ from aeromatch_cli.blocks.ground import ConstantGround, open_dem
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Ground
+from aeromatch_cli.workspace import image_fingerprint
+
+
+def ground_fingerprint(settings: Settings) -> str:
+    """The ground setting; of a DEM also its content, since it may be replaced in place."""
+    text = settings.block.ground
+    return f"{text} {image_fingerprint(Path(text))}" if Path(text).is_file() else text
 
 
 def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None, str, tuple[str, ...]]:

@@ -159,6 +159,6 @@ def _write(context: Context, pairs_csv: str) -> None:
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,
     }
-    write_json(workspace.block, block_record(block))
+    write_json(workspace.block, block_record(block, context.settings))
     for path, text in texts.items():
         write_text(path, text)

@@ -25,7 +25,7 @@ class Overlap(Strategy):
     smaller view angle); a pair stays if either image keeps it. The pairs of a maximum spanning forest stay whatever
     their rank, so that the cap never splits a block. Images without a footprint (no pose, no attitude, looking above
     the horizon, below the ground) and images that overlap with nothing get neighbours by position, time or name. Pairs
-    that a first pass has matched stay in any case.
+    that a first pass has matched stay where the overlap is unknown.
     """
 
     name: Literal["overlap"] = "overlap"
@@ -89,7 +89,8 @@ class Overlap(Strategy):
         unplaced = {image.image_id for image in block.images} - paired
         fallback = fallback_pairs(block, unplaced, self.fallback_neighbours)
         present = {(pair.image_id0, pair.image_id1) for pair in chosen} | fallback.keys()
-        tied = {ids: "first pass" for ids in block.tied if ids not in present}
+        placed = footprints.keys()
+        tied = {ids: "first pass" for ids in block.tied if ids not in present and not placed >= set(ids)}
         others = measured_pairs(block, fallback | tied, footprints)
         return sorted([*chosen, *others], key=lambda pair: (pair.image_id0, pair.image_id1))
 
