@@ -32,7 +32,7 @@ def run_step(step: Callable[..., Figures], *given: Any) -> Figures:
 def preset(
     name: str, own: list[str], images: Path, reference: Path, work: Path, keypoints: int, jobs: int, pairs: Path | None
 ) -> Figures:
-    """Extract, match and filter of a preset, timed; then export, untimed. What an earlier, killed run made is kept:
+    """Orient, extract, match and filter of a preset, timed; then export, untimed. What an earlier, killed run made is kept:
     seconds are null then. own: settings. pairs: a list of them, or None for the preset's choice.
     """
     from aeromatch_cli.config import load
@@ -48,10 +48,10 @@ def preset(
     asked += ["pairs=file", f"pairs.path={pairs}"] if pairs else []
     settings = load(name, [*asked, *own], block, **top)
     with Executor("processes", jobs) as executor:
-        context, _ = pairing.prepare(settings, executor)
+        context, oriented, _ = pairing.prepare(settings, executor)
         started = time.perf_counter()
-        reports = [stage.run(context) for stage in (extract, match, filter)]
-        seconds = time.perf_counter() - started
+        reports = [oriented, *(stage.run(context) for stage in (extract, match, filter))]
+        seconds = oriented.seconds + time.perf_counter() - started
         export.run(context)
     fresh = not any(report.skipped for report in reports)
     return {
