@@ -32,7 +32,7 @@ def run_step(step: Callable[..., Figures], *given: Any) -> Figures:
 def preset(
     name: str, own: list[str], images: Path, reference: Path, work: Path, keypoints: int, jobs: int, pairs: Path | None
 ) -> Figures:
-    """Orient, extract, match and filter of a preset, timed; then export, untimed. What an earlier, killed run made is kept:
+    """Orient, extract, match and filter of a preset, timed; then export, untimed. What a killed run made is kept:
     seconds are null then. own: settings. pairs: a list of them, or None for the preset's choice.
     """
     from aeromatch_cli.config import load
