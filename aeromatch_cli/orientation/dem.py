@@ -15,6 +15,8 @@ _NEIGHBOURS = 16
 # Points farther from the median of their neighbours than so many median deviations are wrong.
 _OUTLIER_DEVIATIONS = 4.0
 _MIN_POINTS = 12
+# More points than this say no more of a terrain.
+_MOST_POINTS = 50_000
 # A terrain of more pictures is the same up to this share of the flying height.
 _SAME_SHARE = 0.02
 
@@ -43,7 +45,7 @@ def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import cKDTree
 
-    points_m = _without_outliers(points_m)
+    points_m = _without_outliers(points_m[:: 1 + len(points_m) // _MOST_POINTS])
     if len(points_m) < _MIN_POINTS:
         return None
     around = np.concatenate([points_m[:, :2], np.asarray(area_m).reshape(-1, 2)])

@@ -31,6 +31,8 @@ def resected(
     """
     poses, found = dict(known), dict[str, Pose]()
     waiting = sorted({i for pair in pairs for i in (pair.image_id0, pair.image_id1)} - poses.keys())
+    if not waiting:
+        return found
     seen = _PointsSeen(pairs, poses, cameras)
     failed: dict[str, int] = {}
     while waiting:

@@ -79,7 +79,8 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     poses, found = dict(block.poses), dict[str, Pose]()
     if correct:
         known = {i: poses[i] for i in sorted(good)}
-        sigmas = (_SIGMA_POSITION_SHARE * _flying_height_m(evidence, known), _SIGMA_ANGLE_DEG)
+        height_m = _flying_height_m(evidence, known) if evidence.matched - good else 1.0
+        sigmas = (_SIGMA_POSITION_SHARE * height_m, _SIGMA_ANGLE_DEG)
         found = resected(pairs, known, cameras, evidence.thresholds_px, sigmas)
         for image_id in evidence.matched - good - found.keys():
             if image_id in poses:

@@ -24,8 +24,21 @@ from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 
+# A look at given poses needs less than finding poses does: reduced size, share of the keypoints, neighbours.
+_LOOK_SIZE_PX, _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 1200, 0.5, 8
 # Up to so many pairs of images without position are all compared: less than two minutes on two cores.
 _MOST_PAIRS = 12_000
+
+
+def look(recipe: FirstPass) -> FirstPass:
+    """The cheaper first pass by which given poses are judged before they are found anew."""
+    return recipe.model_copy(
+        update={
+            "size_px": min(recipe.size_px, _LOOK_SIZE_PX),
+            "keypoints": max(100, round(_LOOK_KEYPOINTS * recipe.keypoints)),
+            "neighbours": min(recipe.neighbours, _LOOK_NEIGHBOURS),
+        }
+    )
 
 
 def prepared(context: Context, recipe: FirstPass) -> Context:

@@ -86,27 +86,37 @@ def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
 def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     """What the first pass says. kept: images that have not changed since an earlier run, whose poses and terrain stay
     as they were where the new ones agree with them."""
-    first = first_pass.prepared(context, recipe)
-    if first.pairs:
-        first_pass.run(first)
     block = context.block
-    limit = first.settings.block.max_size_px
-    sizes = {image.image_id: max(image.width_px, image.height_px) for image in block.images}
-    pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    evidence = Evidence(block, pairs, {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()})
+    given = sum(pose.world_rotation is not None for pose in block.poses.values())
+    first, evidence = _evidence(context, first_pass.look(recipe) if given == len(block.images) else recipe)
     good = evidence.explained()
-    if not pairs or not recipe.replaces or suffices(evidence, good):
+    if given == len(block.images) and recipe.replaces and not suffices(evidence, good):
+        first, evidence = _evidence(context, recipe)
+        good = evidence.explained()
+    if not evidence.pairs or not recipe.replaces or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
     else:
         sigmas = {k: _GUESSED_FOCAL if k in context.guessed_cameras else _STATED_FOCAL for k in block.cameras}
         models = map_block(contents_of(first), block.poses, sigmas, recipe.mapper)
         solution = from_models(block, models, _poses_before(context, kept))
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
-    facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in pairs]
+    facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     terrain = solution.terrain
     if terrain is not None and kept and (old := _terrain(context)) is not None:
         terrain = continued(old, terrain, np.array([p.center_m for p in solution.poses.values()]))
     return replace(solution, terrain=terrain, facts=facts)
+
+
+def _evidence(context: Context, recipe: FirstPass) -> tuple[Context, Evidence]:
+    """The context of a first pass that has been run, and its verified matches."""
+    first = first_pass.prepared(context, recipe)
+    if first.pairs:
+        first_pass.run(first)
+    limit = first.settings.block.max_size_px
+    sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
+    pairs = list(first_pass.verified_points(first)) if first.pairs else []
+    thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
+    return first, Evidence(context.block, pairs, thresholds_px)
 
 
 def _poses_before(context: Context, kept: set[str]) -> dict[str, Pose]:
