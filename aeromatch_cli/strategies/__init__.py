@@ -10,6 +10,7 @@ Calls, by family (table in the family's __init__):
   matchers    strategy(features0, features1, geometry) -> Matches      those with reads_pixels: also rasters, of both
   filters     strategy(candidates, geometry, seed) -> Verdict            points in stored pixels
   exporters   strategy(contents, folder) -> ExportSummary            the only family that writes: a foreign format
+  orienters   no call: a recipe of the first pass and the orientation that `stages.orient` follows
 """
 
 from __future__ import annotations
