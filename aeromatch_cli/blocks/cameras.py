@@ -5,78 +5,101 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePosixPath
+from zlib import crc32
 
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.scan import identifier
 from aeromatch_cli.blocks.sensors import sensor_size_mm
 from aeromatch_cli.data import Camera
-from aeromatch_cli.geometry.cameras import resized
+from aeromatch_cli.geometry.cameras import focal_px, resized
 
 FULL_FRAME_DIAGONAL_MM = 43.267
 # Between a wide and a normal lens: what to start from where nothing is known (COLMAP's default_focal_length_factor).
 GUESSED_FOCAL_FACTOR = 1.2
+# Standard deviation of a focal length, as a share of it, by where it comes from.
+FOCAL_SIGMAS: Mapping[str, float] = {
+    "XMP calibration": 0.01,
+    "camera file": 0.03,
+    "sensor size": 0.03,
+    "focal-plane resolution": 0.05,
+    "35-mm equivalent": 0.05,
+    "guess": 0.4,
+}
+# Two statements of the focal length that differ by more than this factor cannot both be meant.
+_CONTRADICTION = 1.25
 
 
 @dataclass(frozen=True)
 class CameraAssignment:
     """cameras: camera id -> Camera. camera_ids: image name -> camera id. reasons: image name -> why it has none.
 
-    guessed: camera ids whose focal length is a guess.
+    focal_sigmas: camera id -> standard deviation of its focal length, as a share of it.
     """
 
     cameras: Mapping[str, Camera]
     camera_ids: Mapping[str, str]
     reasons: Mapping[str, str]
     warnings: tuple[str, ...]
-    guessed: frozenset[str] = frozenset()
+    focal_sigmas: Mapping[str, float] = field(default_factory=dict)
 
 
 def focal_from_exif_px(facts: ExifFacts) -> tuple[float, str]:
-    """Focal length in px of the stored raster, and where it came from, in words.
+    """Focal length in px of the stored raster, and where it came from: a key of FOCAL_SIGMAS.
 
-    In this order: sensor size of a known model, focal-plane resolution whose raster EXIF names, 35-mm equivalent (by
-    the diagonal), any focal-plane resolution, a guess of 1.2 x the longer side. The picture lies inside the sensor, so
-    its pixels are no larger than either side allows.
+    In this order: the calibration in XMP, sensor size of a known model, focal-plane resolution whose raster EXIF names
+    and that the 35-mm equivalent does not contradict, 35-mm equivalent (by the diagonal), any focal-plane resolution, a
+    guess of 1.2 x the longer side. The picture lies inside the sensor, so its pixels are no larger than either side
+    allows. Programs that reduce pictures often keep the focal-plane resolution of the original.
     """
+    if facts.calibrated is not None:
+        return focal_px(facts.calibrated), "XMP calibration"
     long_px, short_px = max(facts.width_px, facts.height_px), min(facts.width_px, facts.height_px)
     sensor_mm = sensor_size_mm(facts.make, facts.model)
     if facts.focal_mm and sensor_mm:
         return facts.focal_mm * max(long_px / sensor_mm[0], short_px / sensor_mm[1]), "sensor size"
     plane_px = (facts.focal_mm or 0.0) * (facts.focal_plane_px_per_mm or 0.0)
+    equivalent_px = (facts.focal_35mm_mm or 0.0) / FULL_FRAME_DIAGONAL_MM * math.hypot(long_px, short_px)
     plausible = 0.2 * long_px < plane_px < 50.0 * long_px
-    if plausible and facts.focal_plane_confirmed:
+    if plausible and facts.focal_plane_confirmed and not _contradicts(plane_px, equivalent_px):
         return plane_px, "focal-plane resolution"
-    if facts.focal_35mm_mm:
-        return facts.focal_35mm_mm / FULL_FRAME_DIAGONAL_MM * math.hypot(long_px, short_px), "35-mm equivalent"
+    if equivalent_px:
+        return equivalent_px, "35-mm equivalent"
     if plausible:
         return plane_px, "focal-plane resolution"
     return GUESSED_FOCAL_FACTOR * long_px, "guess"
+
+
+def _contradicts(first_px: float, second_px: float) -> bool:
+    """Whether two focal lengths cannot both be meant; one that is not stated, 0, contradicts none."""
+    return second_px > 0.0 and not 1.0 / _CONTRADICTION < first_px / second_px < _CONTRADICTION
 
 
 def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str]) -> CameraAssignment:
     """One camera per make, model, focal length, size and group; facts and groups by image name.
 
     groups: what else keeps cameras apart (folder or column of the pose list), "" for nothing. A camera depends on
-    the image's own header alone, so it does not change when images are added. Model SIMPLE_RADIAL without distortion.
+    the image's own header alone, so it does not change when images are added. Model SIMPLE_RADIAL without distortion,
+    but for cameras whose calibration is in XMP.
     """
     cameras: dict[str, Camera] = {}
     camera_ids: dict[str, str] = {}
-    guessed: list[str] = []
+    sources: dict[str, str] = {}
     for name, fact in facts.items():
-        focal_px, source = focal_from_exif_px(fact)
-        focal_px = round(focal_px, 2)
-        if source == "guess":
-            guessed.append(name)
+        focal, sources[name] = focal_from_exif_px(fact)
+        focal = round(focal, 2)
         lens = re.sub(r"[^a-z0-9._]+", "-", _full_model(fact).lower()).strip("-")
         parts = [identifier(groups.get(name, "")), lens or "unknown"]
         parts += [f"{fact.focal_mm:.4g}mm"] if fact.focal_mm else []
-        parts += [f"f{focal_px:g}", f"{fact.width_px}x{fact.height_px}"]
+        parts += [f"f{focal:g}", f"{fact.width_px}x{fact.height_px}"]
+        parts += [f"{crc32(repr(fact.calibrated).encode()):08x}"] if fact.calibrated else []
         camera_id = "_".join(part for part in parts if part)
         principal = ((fact.width_px - 1) / 2.0, (fact.height_px - 1) / 2.0)
-        cameras[camera_id] = Camera("SIMPLE_RADIAL", fact.width_px, fact.height_px, (focal_px, *principal, 0.0))
+        own = Camera("SIMPLE_RADIAL", fact.width_px, fact.height_px, (focal, *principal, 0.0))
+        cameras[camera_id] = fact.calibrated or own
         camera_ids[name] = camera_id
+    guessed = [name for name, source in sources.items() if source == "guess"]
     warnings = (
         (
             f"the focal length of {len(guessed)} of {len(facts)} images is a guess ({GUESSED_FOCAL_FACTOR} x the "
@@ -85,7 +108,24 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
         if guessed
         else ()
     )
-    return CameraAssignment(cameras, camera_ids, {}, warnings, frozenset(camera_ids[name] for name in guessed))
+    sigmas = {camera_ids[name]: FOCAL_SIGMAS[source] for name, source in sources.items()}
+    return CameraAssignment(cameras, camera_ids, {}, (*warnings, *_contradictions(facts)), sigmas)
+
+
+def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
+    """One sentence where EXIF states two focal lengths of which one must be wrong."""
+    odd = []
+    for name, fact in facts.items():
+        plane_px = (fact.focal_mm or 0.0) * (fact.focal_plane_px_per_mm or 0.0)
+        other_px, source = focal_from_exif_px(fact)
+        if plane_px and source not in ("guess", "focal-plane resolution") and _contradicts(plane_px, other_px):
+            odd.append(f"{name}: {plane_px:.0f} px by focal-plane resolution, {other_px:.0f} px by {source}")
+    if not odd:
+        return ()
+    return (
+        f"EXIF of {len(odd)} of {len(facts)} images states two focal lengths ({odd[0]}): the latter is used; the "
+        "pictures were probably reduced by a program that kept the resolution of the original",
+    )
 
 
 def _full_model(facts: ExifFacts) -> str:
@@ -116,7 +156,7 @@ def cameras_from_file(
         size = "" if camera is stated[chosen.camera] else f"_{width_px}x{height_px}"
         camera_ids[name] = identifier(chosen.camera) + size
         cameras[camera_ids[name]] = camera
-    return CameraAssignment(cameras, camera_ids, reasons, ())
+    return CameraAssignment(cameras, camera_ids, reasons, (), dict.fromkeys(cameras, FOCAL_SIGMAS["camera file"]))
 
 
 def fitted(camera: Camera, width_px: int, height_px: int) -> Camera | None:

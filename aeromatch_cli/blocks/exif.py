@@ -17,6 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigma_m
+from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import tiff
 
@@ -49,7 +51,8 @@ class ExifFacts:
     focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. notes: what was found and could not be used.
+    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: by an RTK receiver,
+    standard deviation of each coordinate. notes: what was found and could not be used.
     """
 
     width_px: int
@@ -67,6 +70,8 @@ class ExifFacts:
     altitude_m: float | None = None
     relative_altitude_m: float | None = None
     angles: CameraAngles | None = None
+    calibrated: Camera | None = None
+    sigma_position_m: float | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -110,6 +115,8 @@ def read_exif(path: Path) -> ExifFacts:
         altitude_m=altitude_m,
         relative_altitude_m=_number(xmp.get("drone-dji:RelativeAltitude")),
         angles=_angles(xmp),
+        calibrated=calibrated_camera(xmp, width_px, height_px),
+        sigma_position_m=position_sigma_m(xmp),
         notes=tuple(notes),
     )
 

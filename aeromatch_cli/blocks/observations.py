@@ -65,10 +65,11 @@ def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observatio
     position = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
     found = facts.angles
     if found is None:
-        return Observation(position, "geographic", None, "none", forward=True)
+        return Observation(position, "geographic", None, "none", forward=True, sigma_position_m=facts.sigma_position_m)
     convention = found.convention if angles == "auto" else angles
     attitude = (found.yaw_deg, found.pitch_deg, found.roll_deg)
-    return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward=convention == "gimbal")
+    forward = convention == "gimbal"
+    return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward, facts.sigma_position_m)
 
 
 def oriented(

@@ -47,8 +47,8 @@ class BlockInputs:
     images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose in the world (crs - origin_m);
     images without position are absent. ground_hint_z_m: world height of the ground as the input states it, or None;
     ground_hint_source: where it came from, in words, "" for None; ground_is_stated: the user's camera file says so,
-    rather than a barometer. guessed_cameras: camera ids whose focal length is a guess. warnings: for a person, in
-    order of reading.
+    rather than a barometer. focal_sigmas: camera id -> standard deviation of its focal length, as a share of it.
+    warnings: for a person, in order of reading.
     """
 
     images: tuple[Image, ...]
@@ -59,7 +59,7 @@ class BlockInputs:
     ground_hint_z_m: float | None
     ground_hint_source: str
     ground_is_stated: bool
-    guessed_cameras: frozenset[str]
+    focal_sigmas: Mapping[str, float]
     warnings: tuple[str, ...]
     failures: tuple[ReadFailure, ...]
 
@@ -147,7 +147,7 @@ def block_inputs(
         ground_hint_z_m=hint_z_m,
         ground_hint_source=hint_source,
         ground_is_stated=stated is not None,
-        guessed_cameras=assignment.guessed,
+        focal_sigmas=assignment.focal_sigmas,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
     )

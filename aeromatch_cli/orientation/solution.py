@@ -128,6 +128,7 @@ def from_models(block: Block, models: Sequence[Model], before: Mapping[str, Pose
     facts = {
         "method": "pictures",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
+        "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": sum(len(p) for p in points),
         **_judged(block.poses, found),
         "outside": _outside(block, poses),

@@ -42,7 +42,7 @@ class BlockRead:
 
     block: Block
     image_fingerprints: Mapping[str, str]
-    guessed_cameras: frozenset[str]
+    focal_sigmas: Mapping[str, float]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
     gsd_before_m: float | None
@@ -70,7 +70,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
     return BlockRead(
         block=block,
         image_fingerprints=prints,
-        guessed_cameras=inputs.guessed_cameras,
+        focal_sigmas=inputs.focal_sigmas,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,

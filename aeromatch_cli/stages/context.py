@@ -16,12 +16,16 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.workspace import Workspace, fingerprint
 
+# A focal length with a larger standard deviation, as a share of it, is a guess.
+_GUESS = 0.2
+
 
 @dataclass(frozen=True, eq=False)
 class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
-    given: the block before it was oriented.
+    given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
+    share of it.
     """
 
     settings: Settings
@@ -31,7 +35,7 @@ class Context:
     pairs: tuple[Pair, ...]
     image_fingerprints: Mapping[str, str]
     given: Block
-    guessed_cameras: frozenset[str] = frozenset()
+    focal_sigmas: Mapping[str, float] = field(default_factory=dict)
     # Stands before the names of stages in what is shown of progress.
     part: str = ""
     shard: Shard | None = None
@@ -39,6 +43,11 @@ class Context:
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
     known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
     known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def guessed_cameras(self) -> frozenset[str]:
+        """Cameras whose focal length is no more than a guess."""
+        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS)
 
     def owns(self, item_id: str) -> bool:
         return self.shard is None or self.shard.owns(item_id)

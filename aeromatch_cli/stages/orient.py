@@ -38,8 +38,8 @@ from aeromatch_cli.workspace import (
 VERSION = 1
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
-# Standard deviations of focal lengths, as a share: stated by EXIF or a file, and guessed.
-_STATED_FOCAL, _GUESSED_FOCAL = 0.03, 0.4
+# Standard deviation of a focal length that the pictures gave, as a share of it.
+_FOUND_FOCAL = 0.01
 
 
 def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
@@ -80,7 +80,9 @@ def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
         ground_source=source,
         tied=tuple((id0, id1) for id0, id1 in record["tied"]),
     )
-    return replace(context, block=block), report if dry else report.write(context.workspace)
+    found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
+    context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
+    return context, report if dry else report.write(context.workspace)
 
 
 def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
@@ -96,8 +98,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     if not evidence.pairs or not recipe.replaces or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
     else:
-        sigmas = {k: _GUESSED_FOCAL if k in context.guessed_cameras else _STATED_FOCAL for k in block.cameras}
-        models = map_block(contents_of(first), block.poses, sigmas, recipe.mapper)
+        models = map_block(contents_of(first), block.poses, context.focal_sigmas, recipe.mapper)
         solution = from_models(block, models, _poses_before(context, kept))
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]

@@ -109,7 +109,7 @@ def _context(
         pairs=(),
         image_fingerprints=found.image_fingerprints,
         given=found.block,
-        guessed_cameras=found.guessed_cameras,
+        focal_sigmas=found.focal_sigmas,
         shard=shard,
         overwrite=overwrite,
     )

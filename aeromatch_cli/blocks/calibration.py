@@ -1,0 +1,87 @@
+"""What aircraft write into XMP of the camera's calibration and of the position's accuracy.
+
+DJI's namespace `drone-dji`: DewarpData ("date;fx,fy,cx,cy,k1,k2,p1,p2,k3", pixels, cx and cy from the picture's centre,
+distortion as in OpenCV), CalibratedFocalLength (pixels), CalibratedOpticalCenterX (pixels, of the picture that both
+were measured in), DewarpFlag (1: the picture is free of distortion already), RtkStdLon, RtkStdLat, RtkStdHgt (metres).
+Source: DJI, Phantom 4 RTK and Zenmuse P1 user manuals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.geometry.cameras import resized
+
+# Antenna and shutter add to what the receiver states.
+_LEAST_SIGMA_M = 0.02
+# A calibration further from the picture's size than this speaks of something else.
+_LEAST_FOCAL, _LARGEST_FOCAL = 0.3, 20.0
+
+
+def calibrated_camera(xmp: Mapping[str, str], width_px: int, height_px: int) -> Camera | None:
+    """The camera of a picture by its own calibration, resized with it; None where XMP states none, or an absurd one.
+
+    xmp: properties as "prefix:Name" -> text.
+    """
+    dewarp = _numbers(xmp.get("drone-dji:DewarpData", "").rpartition(";")[2])
+    focal = _numbers(xmp.get("drone-dji:CalibratedFocalLength", ""))
+    centre = _numbers(xmp.get("drone-dji:CalibratedOpticalCenterX", ""))
+    # The calibrated picture is about twice as wide as its centre is far from its left side.
+    scale = 0.5 * width_px / centre[0] if centre and centre[0] > 0.0 else 1.0
+    full_width, full_height = round(width_px / scale), round(height_px / scale)
+    if abs(full_width - width_px) < 0.05 * width_px:
+        full_width, full_height = width_px, height_px
+    if len(dewarp) == 9:
+        camera = _of_dewarp(dewarp, full_width, full_height, xmp.get("drone-dji:DewarpFlag", "").strip() == "1")
+    elif len(focal) == 1:
+        middle = ((full_width - 1) / 2.0, (full_height - 1) / 2.0)
+        camera = Camera("SIMPLE_RADIAL", full_width, full_height, (focal[0], *middle, 0.0))
+    else:
+        return None
+    if not _LEAST_FOCAL < camera.params[0] / max(full_width, full_height) < _LARGEST_FOCAL:
+        return None
+    if (full_width, full_height) == (width_px, height_px):
+        return camera
+    return resized(camera, width_px / full_width, width_px, height_px)
+
+
+def position_sigma_m(xmp: Mapping[str, str]) -> float | None:
+    """Standard deviation of a coordinate by the RTK receiver, the largest of the three; None where XMP states none."""
+    stated = [_numbers(xmp.get(f"drone-dji:RtkStd{name}", "")) for name in ("Lon", "Lat", "Hgt")]
+    if not all(len(one) == 1 and one[0] > 0.0 for one in stated):
+        return None
+    return max(_LEAST_SIGMA_M, *(one[0] for one in stated))
+
+
+def _of_dewarp(values: tuple[float, ...], width_px: int, height_px: int, dewarped: bool) -> Camera:
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values
+    cx, cy = (width_px - 1) / 2.0 + cx, (height_px - 1) / 2.0 + cy
+    if dewarped:
+        return Camera("PINHOLE", width_px, height_px, (fx, fy, cx, cy))
+    k1, k2 = _two_terms(np.array([k1, k2, k3]), math.hypot(width_px, height_px) / (fx + fy))
+    return Camera("OPENCV", width_px, height_px, (fx, fy, cx, cy, k1, k2, p1, p2))
+
+
+def _two_terms(terms: FloatArray, largest_radius: float) -> tuple[float, float]:
+    """The k1 and k2 whose distortion comes nearest that of k1, k2, k3 over the picture, by least squares.
+
+    largest_radius: of the picture's corner, in units of the focal length. Rings count by their area.
+    """
+    radius = np.linspace(0.02, 1.0, 50) * largest_radius
+    powers = radius[:, None] ** [3, 5, 7]
+    weights = np.sqrt(radius)[:, None]
+    found = np.linalg.lstsq(powers[:, :2] * weights, (powers @ terms)[:, None] * weights, rcond=None)[0].ravel()
+    return float(found[0]), float(found[1])
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Finite numbers of a comma-separated text; none where one part is no number."""
+    try:
+        values = tuple(float(part) for part in text.split(",")) if text.strip() else ()
+    except ValueError:
+        return ()
+    return values if all(math.isfinite(value) for value in values) else ()

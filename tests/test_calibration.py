@@ -1,0 +1,94 @@
+"""Calibration and accuracy that aircraft write into XMP: numbers worked out by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from make_images import DJI_XMP, gps_tags, write_image
+
+from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS, cameras_from_exif, focal_from_exif_px
+from aeromatch_cli.blocks.exif import ExifFacts, read_exif
+from aeromatch_cli.blocks.observations import observation_of_exif
+from aeromatch_cli.geometry.cameras import distort, focal_px, parameters
+
+DEWARP = "2021-03-04;3678.87,3671.84,10.10,27.29,-0.26,0.11,0.0001,-0.0002,-0.03"
+
+
+def test_dewarp_data_of_the_full_picture() -> None:
+    camera = calibrated_camera({"drone-dji:DewarpData": DEWARP}, 5472, 3648)
+    assert camera is not None
+    found = parameters(camera)
+    assert (found["fx"], found["fy"]) == (3678.87, 3671.84)
+    assert (found["cx"], found["cy"]) == (pytest.approx(2735.5 + 10.10), pytest.approx(1823.5 + 27.29))
+    assert (found["p1"], found["p2"]) == (0.0001, -0.0002)
+    # k1 and k2 stand for k1, k2 and k3: within 3 px over the picture, where k3 left out would cost 14 px.
+    radius = np.linspace(0.0, np.hypot(2736, 1824) / 3675, 30)
+    wanted = radius * (1 - 0.26 * radius**2 + 0.11 * radius**4 - 0.03 * radius**6)
+    got = radius * (1 + found["k1"] * radius**2 + found["k2"] * radius**4)
+    assert np.abs(got - wanted).max() * 3675 < 3.0
+    assert np.abs(0.03 * radius**7).max() * 3675 > 9.0
+
+
+def test_reduced_picture_gets_the_reduced_calibration() -> None:
+    xmp = {"drone-dji:DewarpData": DEWARP, "drone-dji:CalibratedOpticalCenterX": "2736.0"}
+    half, full = calibrated_camera(xmp, 2736, 1824), calibrated_camera(xmp, 5472, 3648)
+    assert half is not None
+    assert full is not None
+    assert focal_px(half) == pytest.approx(focal_px(full) / 2.0)
+    place = np.array([[100.0, 50.0]])
+    # Pixel centres: (x + 0.5) / 2 - 0.5.
+    assert distort(half, (place + 0.5) / 2.0 - 0.5) == pytest.approx((distort(full, place) + 0.5) / 2.0 - 0.5, abs=1e-6)
+
+
+def test_dewarped_picture_has_no_distortion() -> None:
+    camera = calibrated_camera({"drone-dji:DewarpData": DEWARP, "drone-dji:DewarpFlag": "1"}, 5472, 3648)
+    assert camera is not None
+    assert camera.model == "PINHOLE"
+
+
+@pytest.mark.parametrize("text", ["", "2021;1,2,3", "x;" + ",".join(["nan"] * 9), "2021;1,1,0,0,0,0,0,0,0", "a;b,c"])
+def test_unusable_dewarp_data_is_passed_over(text: str) -> None:
+    assert calibrated_camera({"drone-dji:DewarpData": text}, 5472, 3648) is None
+
+
+def test_calibrated_focal_length_alone() -> None:
+    xmp = {"drone-dji:CalibratedFocalLength": "3666.67", "drone-dji:CalibratedOpticalCenterX": "2736"}
+    camera = calibrated_camera(xmp, 2736, 1824)
+    assert camera is not None
+    assert focal_px(camera) == pytest.approx(1833.335)
+
+
+def test_rtk_accuracy_is_the_position_s_sigma() -> None:
+    xmp = {"drone-dji:RtkStdLon": "0.0112", "drone-dji:RtkStdLat": "0.0131", "drone-dji:RtkStdHgt": "0.0291"}
+    assert position_sigma_m(xmp) == 0.0291
+    assert position_sigma_m(dict.fromkeys(xmp, "0.004")) == 0.02
+    assert position_sigma_m(dict.fromkeys(xmp, "0")) is None
+    assert position_sigma_m({}) is None
+
+
+def test_an_image_file_is_read_with_both(tmp_path: Path) -> None:
+    more = 'drone-dji:DewarpData="2021;60,60,1,1,0,0,0,0,0" drone-dji:RtkStdLon="0.05" drone-dji:RtkStdLat="0.05" '
+    xmp = DJI_XMP.format(yaw="1", pitch="-90", roll="0", relative="40").replace(
+        "drone-dji:GimbalYaw", more + 'drone-dji:RtkStdHgt="0.1" drone-dji:GimbalYaw'
+    )
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp, gps=gps_tags(46.0, 7.0, 500.0)))
+    assert focal_from_exif_px(facts) == (60.0, "XMP calibration")
+    observation = observation_of_exif(facts, "auto")
+    assert observation is not None
+    assert observation.sigma_position_m == 0.1
+    found = cameras_from_exif({"a.jpg": facts}, {})
+    assert set(found.focal_sigmas.values()) == {FOCAL_SIGMAS["XMP calibration"]}
+
+
+def test_focal_plane_resolution_of_the_original_gives_way_to_the_35_mm_equivalent() -> None:
+    facts = ExifFacts(
+        2000, 1500, focal_mm=4.0, focal_35mm_mm=24.0, focal_plane_px_per_mm=700.0, focal_plane_confirmed=True
+    )
+    focal, source = focal_from_exif_px(facts)
+    assert source == "35-mm equivalent"
+    assert focal == pytest.approx(24.0 / 43.267 * 2500)
+    (warning,) = cameras_from_exif({"a.jpg": facts, "b.jpg": facts}, {}).warnings
+    assert "2 of 2 images states two focal lengths (a.jpg: 2800 px by focal-plane resolution, 1387 px" in warning
