@@ -48,6 +48,36 @@ class Pose:
     sigma_angle_deg: float
 
 
+@dataclass(frozen=True, eq=False)
+class AdjustedPose:
+    """A pose as a bundle adjustment leaves it.
+
+    center_m: (3,) in the world frame; rotation: (3, 3) cam_from_world. sigmas_m, sigmas_deg: (3,) standard deviations
+    of x, y, z and of omega, phi, kappa; NaN where they are not known.
+    """
+
+    center_m: FloatArray
+    rotation: FloatArray
+    sigmas_m: FloatArray
+    sigmas_deg: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedBlock:
+    """Cameras, poses and points of a bundle adjustment, world frame.
+
+    cameras: camera_id -> Camera. poses: image_id -> AdjustedPose; images that could not be tied are absent. points_m:
+    (P, 3). errors_px: (P,) mean reprojection errors. tracks: image_id -> (n, 2) int32, keypoint of the image and row
+    of points_m.
+    """
+
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, AdjustedPose]
+    points_m: FloatArray
+    errors_px: FloatArray
+    tracks: Mapping[str, IntArray]
+
+
 @dataclass(frozen=True)
 class Image:
     """One stored raster of the block.

@@ -66,6 +66,10 @@ class Workspace:
         return self.root / "orientation"
 
     @property
+    def adjusted(self) -> Path:
+        return self.orientation / "adjusted.npz"
+
+    @property
     def first_pass(self) -> Workspace:
         """The first pass is a small workspace of its own."""
         return Workspace(self.orientation / "first_pass")

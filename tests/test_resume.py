@@ -61,7 +61,7 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     assert verified(halves) == expected
     rest = done_site("run", "--workspace", halves)
     assert rest.code == 0
-    assert set(rest.done()) == {"export", "report"}
+    assert set(rest.done()) == {"adjust", "export", "report"}
     assert contents(halves)["export/colmap/database.db"] == contents(done_site.work)["export/colmap/database.db"]
 
     swapped = Site(tmp_path / "swapped")
@@ -78,11 +78,14 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
 @pytest.mark.parametrize(
     ("change", "redone"),
     [
-        ("match.ratio=0.75", {"match": PAIRS, "filter": PAIRS, "export": 1, "report": 1}),
-        ("filter.poselib.threshold_px=3", {"filter": PAIRS, "export": 1, "report": 1}),
-        ("extract.keypoints=300", {"extract": IMAGES, "match": PAIRS, "filter": PAIRS, "export": 1, "report": 1}),
-        ("seed=5", {"filter": PAIRS, "export": 1, "report": 1}),
-        ("block.sigma_position_m=9", {"orient": IMAGES, "export": 1, "report": 1}),
+        ("match.ratio=0.75", {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
+        ("filter.poselib.threshold_px=3", {"filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
+        (
+            "extract.keypoints=300",
+            {"extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1},
+        ),
+        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
+        ("block.sigma_position_m=9", {"orient": IMAGES, "adjust": IMAGES, "export": 1, "report": 1}),
         ("export.colmap.pose_priors=false", {"export": 1, "report": 1}),
     ],
 )
@@ -226,7 +229,8 @@ def test_overwrite_redoes_everything(done_site):
     before = contents(done_site.work)
     outcome = done_site("run", "--overwrite")
     assert outcome.done() == {
-        "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "export": 1, "report": 1
+        "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES,
+        "export": 1, "report": 1
     }  # fmt: skip
     assert contents(done_site.work) == before
 
@@ -375,9 +379,9 @@ def test_sigterm_is_heard_while_pycolmap_is_loaded():
     code = (
         "import os, signal\n"
         "from aeromatch_cli.cli.output import _terminated_like_interrupt\n"
-        "from aeromatch_cli.strategies.exporters.colmap import _import_pycolmap\n"
+        "from aeromatch_cli.strategies.exporters.colmap_model import import_pycolmap\n"
         "with _terminated_like_interrupt():\n"
-        "    _import_pycolmap()\n"
+        "    import_pycolmap()\n"
         "    try:\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n"
         "        signal.pause()\n"

@@ -72,6 +72,10 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
         "Verify the matches of every pair.",
         ("aeromatch filter baseline --images IMGS --poses poses.csv --set filter=poselib+graph",),
     ),
+    "adjust": (
+        "Adjust the oriented block from the verified matches: poses, cameras and points.",
+        ("aeromatch adjust baseline --images IMGS --poses poses.csv --workspace WORK",),
+    ),
     "export": (
         "Write the verified matches for other programs.",
         ("aeromatch export baseline --images IMGS --poses poses.csv --workspace WORK",),

@@ -57,7 +57,8 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `wrong_attitudes`
   (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented).
-- `tied`: pairs that the first pass verified.
+- `tied`: pairs that the first pass verified. `groups`: images that were oriented together, the largest group first:
+  `kind` (`given`, `positions`, or `level`: no positions, scale and origin arbitrary), `images`.
 
 ### orientation/cameras.csv, poses.csv
 
@@ -66,6 +67,31 @@ As those of the workspace.
 ### orientation/terrain.tif
 
 Heights of the terrain in the block's CRS, GeoTIFF, float32. Missing where the pictures tell none.
+
+### orientation/orientation.csv
+
+Written by `adjust`: the bundle adjustment of the verified matches. One line per oriented image, in the block's CRS:
+`image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
+(photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
+are not known; `camera`: camera_id.
+
+### orientation/adjusted.json
+
+- `fingerprint`; `files`: SHA-256 of `adjusted.npz` and `orientation.csv`.
+- `facts`: `images`, `points`, `track_length` (images per point, mean), `reprojection_error_px` (mean),
+  `sigma_position_m`, `sigma_angle_deg` (medians over the images), `groups` (the same figures of each), `outside`
+  (image_id -> why it is not oriented).
+
+### orientation/adjusted.npz
+
+N images, P points, O observations, C cameras.
+
+- `images` (N,) str: image_id. `rotations` (N, 3, 3), `centers_m` (N, 3), `sigmas_m` (N, 3), `sigmas_deg` (N, 3: omega,
+  phi, kappa): float64.
+- `points_m` (P, 3), `errors_px` (P,) float64: triangulated points and their mean reprojection errors.
+- `track_images`, `track_keypoints`, `track_points` (O,) int32: row of `images`, keypoint of that image, row of
+  `points_m`.
+- `cameras` (2, C) str: camera_id, and model, width and height; `params` (C,) str: as in `cameras.csv`.
 
 ### orientation/first_pass/
 
@@ -137,6 +163,7 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
+- `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of match: `matches`. Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).
 - `facts` of export: exporter -> files and counts.
@@ -159,7 +186,9 @@ line per pair), `conditions.csv`, plots as PNG.
 ### export/colmap/
 
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
-0.5). `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin.
+0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
+their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
+`orientation.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin.
 """
 
 

@@ -11,14 +11,15 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, IntArray, Pose
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
 from aeromatch_cli.strategies.exporters.colmap import Colmap
@@ -52,48 +53,130 @@ def map_block(
 ) -> tuple[Model, ...]:
     """Models of a block's verified pairs, the largest first.
 
-    focal_sigmas: camera_id -> standard deviation of its focal length, as a share of it.
-
     positions: image_id -> pose whose centre and sigma_position_m are observations; its rotation is not used.
+    focal_sigmas: camera_id -> standard deviation of its focal length, as a share of it.
     Raises InputError where the mapper stops; no model is no error.
     """
-    image_ids = sorted(image.image_id for image in contents.block.images)
-    camera_ids = sorted(contents.block.cameras)
+    block = contents.block
+    with _task(contents, positions, focal_sigmas) as folder:
+        facts = _solved(folder, "mapper", {"mapper": mapper}, f"pycolmap's {mapper} mapping")
+        return tuple(_read(folder, one, block) for one in facts)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Images that one orientation holds. kind: "given", or how `placing` put them into the world."""
+
+    kind: str
+    images: tuple[str, ...]
+
+
+def refine_block(
+    contents: ExportContents,
+    given: Mapping[str, Pose],
+    focal_sigmas: Mapping[str, float],
+    groups: Sequence[Group],
+    *,
+    fixed: bool,
+) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
+    """The block adjusted from its poses and verified pairs, and figures of every group.
+
+    given: image_id -> pose whose centre is an observation; its rotation is one in groups of kind "given", where the
+    block still has it. groups: the largest first; images of none are tied to the first where they share enough of its
+    points. fixed: poses and cameras stay, points are triangulated all the same. Raises InputError where pycolmap stops.
+    """
+    block = contents.block
+    number = {image_id: row for row, image_id in enumerate(_image_ids(block), start=1)}
+    grouped = {image_id for group in groups for image_id in group.images}
+    task = {
+        "groups": [{"kind": group.kind, "images": [number[i] for i in group.images]} for group in groups],
+        "more": len(grouped) < len(block.images),
+        "fixed": fixed,
+    }
+    with _task(contents, given, focal_sigmas) as folder:
+        facts = _solved(folder, "refiner", task, "pycolmap's bundle adjustment")
+        archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
+    for one in facts:
+        one["registered"] = [_image_ids(block)[k - 1] for k in one["registered"]]
+    return _joined(archives, block), facts
+
+
+def _joined(archives: Sequence[Mapping[str, Any]], block: Block) -> AdjustedBlock:
+    """All groups as one block; a camera that several have is that of the largest."""
+    image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
+    cameras = dict(block.cameras)
+    poses: dict[str, AdjustedPose] = {}
+    tracks: dict[str, IntArray] = {}
+    first = 0
+    for arrays in reversed(archives):
+        cameras |= {
+            camera_ids[n - 1]: _camera(block.cameras[camera_ids[n - 1]], arrays[f"params{n}"])
+            for n in arrays["cameras"]
+        }
+    for arrays in archives:
+        parts = (arrays[name] for name in ("images", "centers_m", "rotations", "sigmas_m", "sigmas_deg"))
+        for number, *pose in zip(*parts, strict=True):
+            own = arrays["track_images"] == number
+            keypoints, points = arrays["track_keypoints"][own], arrays["track_points"][own] + first
+            poses[image_ids[number - 1]] = AdjustedPose(*pose)
+            tracks[image_ids[number - 1]] = np.column_stack([keypoints, points]).astype(np.int32)
+        first += len(arrays["points_m"])
+    points_m = np.concatenate([np.zeros((0, 3)), *(arrays["points_m"] for arrays in archives)])
+    errors_px = np.concatenate([np.zeros(0), *(arrays["errors_px"] for arrays in archives)])
+    return AdjustedBlock(cameras, poses, points_m, errors_px, tracks)
+
+
+def _image_ids(block: Block) -> list[str]:
+    """In the order of their numbers in the database."""
+    return sorted(image.image_id for image in block.images)
+
+
+@contextmanager
+def _task(contents: ExportContents, positions: Mapping[str, Pose], focal_sigmas: Mapping[str, float]) -> Iterator[Path]:
+    """A folder with database.db, sparse/, priors.npz and task.json for a process of its own."""
+    image_ids = _image_ids(contents.block)
     with tempfile.TemporaryDirectory(prefix="aeromatch-") as scratch:
-        folder = Path(scratch)
-        exporter = Colmap(raw_matches=False, pose_priors=False)
-        exporter(contents, folder / "colmap")
-        (folder / "colmap" / "database.db").rename(folder / "database.db")
+        folder = Path(scratch) / "task"
+        Colmap(raw_matches=False, pose_priors=False)(contents, folder)
         cameras = {
             str(number): {
                 "params": colmap_params(contents.block.cameras[k]),
                 "focal_px": focal_px(contents.block.cameras[k]),
                 "sigma": focal_sigmas[k],
             }
-            for number, k in enumerate(camera_ids, start=1)
+            for number, k in enumerate(sorted(contents.block.cameras), start=1)
         }
-        (folder / "task.json").write_text(json.dumps({"mapper": mapper, "cameras": cameras}), encoding="utf-8")
-        nowhere = np.full(3, np.nan)
+        (folder / "task.json").write_text(json.dumps({"cameras": cameras}), encoding="utf-8")
+        nowhere, untold = np.full(3, np.nan), np.full((3, 3), np.nan)
+        turns = {i: pose.world_rotation for i, pose in positions.items() if pose.world_rotation is not None}
         np.savez(
             folder / "priors.npz",
             positions_m=np.array([positions[i].center_m if i in positions else nowhere for i in image_ids]),
             sigmas_m=np.array([positions[i].sigma_position_m if i in positions else np.nan for i in image_ids]),
+            rotations=np.array([turns.get(i, untold) for i in image_ids]),
+            sigmas_deg=np.array([positions[i].sigma_angle_deg if i in positions else np.nan for i in image_ids]),
         )
-        command = [sys.executable, "-m", "aeromatch_cli.orientation.mapper", str(folder)]
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
-        result = folder / "result.json"
-        if done.returncode or not result.is_file():
-            said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
-            raise InputError(f"pycolmap's {mapper} mapping stopped with exit code {done.returncode}: {said}")
-        facts = json.loads(result.read_text(encoding="utf-8"))["models"]
-        return tuple(_read(folder, one, image_ids, camera_ids, contents.block.cameras) for one in facts)
+        yield folder
 
 
-def _read(
-    folder: Path, facts: dict[str, Any], image_ids: list[str], camera_ids: list[str], given: Mapping[str, Camera]
-) -> Model:
+def _solved(folder: Path, process: str, task: Mapping[str, Any], what: str) -> list[dict[str, Any]]:
+    """Facts of the models that a process of its own makes in `folder`. InputError where it stops."""
+    path = folder / "task.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | task), encoding="utf-8")
+    command = [sys.executable, "-m", f"aeromatch_cli.orientation.{process}", str(folder)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    result = folder / "result.json"
+    if done.returncode or not result.is_file():
+        said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
+        raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")
+    return list(json.loads(result.read_text(encoding="utf-8"))["models"])
+
+
+def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
     arrays = np.load(folder / facts.pop("file"))
+    image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
     names = [image_ids[number - 1] for number in arrays["images"]]
+    given = block.cameras
     cameras = {camera_ids[n - 1]: _camera(given[camera_ids[n - 1]], arrays[f"params{n}"]) for n in arrays["cameras"]}
     return Model(
         rotations=dict(zip(names, arrays["rotations"], strict=True)),

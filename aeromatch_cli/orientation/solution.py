@@ -90,6 +90,7 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     facts = {
         "method": "given",
         "corrected": sorted(found),
+        "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
         "points": len(points),
         **_judged(block.poses, found),
         "outside": _outside(block, poses),
@@ -128,6 +129,7 @@ def from_models(block: Block, models: Sequence[Model], before: Mapping[str, Pose
     facts = {
         "method": "pictures",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
+        "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
         "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": sum(len(p) for p in points),
         **_judged(block.poses, found),

@@ -17,11 +17,11 @@ from aeromatch_cli.data import Pose
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
-from aeromatch_cli.orientation.mapping import map_block
+from aeromatch_cli.orientation.mapping import Group, map_block
 from aeromatch_cli.orientation.solution import Evidence, Solution, from_given, from_models, suffices
 from aeromatch_cli.stages import first_pass
+from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.export import contents_of
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -35,7 +35,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 1
+VERSION = 2
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -83,6 +83,12 @@ def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
     found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
     context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
     return context, report if dry else report.write(context.workspace)
+
+
+def groups(context: Context) -> list[Group]:
+    """Images that the orientation on file holds, the largest group first; none without an orientation."""
+    record = _on_file(replace(context, overwrite=False))
+    return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 
 
 def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
@@ -166,9 +172,10 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
         data = terrain_bytes(terrain.heights_m, *place, np.array(context.block.origin_m), context.block.crs)
         write_atomically(folder / "terrain.tif", lambda stream: stream.write(data))
         names.append("terrain.tif")
-    facts = {key: value for key, value in solution.facts.items() if key != "tied"}
+    large = {key: solution.facts[key] for key in ("tied", "groups")}
+    facts = {key: value for key, value in solution.facts.items() if key not in large}
     files = {name: file_digest(folder / name) for name in names}
-    write_json(path, {**head, "facts": facts, "tied": solution.facts["tied"], "files": files})
+    write_json(path, {**head, "facts": facts, **large, "files": files})
     return read_json(path)
 
 

@@ -14,7 +14,7 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.geometry.cameras import focal_px
-from aeromatch_cli.stages import check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
+from aeromatch_cli.stages import adjust, check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
@@ -30,13 +30,14 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
     "simulate": simulate.run,
     "extract": extract.run,
     "filter": filter.run,
+    "adjust": adjust.run,
     "export": export.run,
     "report": report.run,
 }
 # Stages whose items are independent: these can be cut into shards, the others need everything.
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # What a command rests on: everything before it in this chain.
-_CHAIN = ("orient", "pairs", "extract", "match", "filter", "export", "report")
+_CHAIN = ("orient", "pairs", "extract", "match", "filter", "adjust", "export", "report")
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
         features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
     elif command not in ("orient", "pairs"):
+        if command == "export":
+            reports.append(adjust.run(replace(context, overwrite=False)))
         reports.append(STAGES[command](context))
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
@@ -112,7 +115,7 @@ def _run_all(context: Context) -> list[StageReport]:
         if not reports[-1].facts["verified_matches"]:
             report.run(context)
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
-        reports.append(export.run(context))
+        reports += [adjust.run(context), export.run(context)]
         reports.append(_current_page(context) or report.run(context))
     return reports
 
@@ -150,8 +153,10 @@ def _result(command: str, context: Context, reports: list[StageReport]) -> Resul
         )
         if stage.stage == "filter":
             lines += _filter_lines(stage, part=context.shard is not None)
+        elif stage.stage == "orient":
+            lines += _orient_lines(stage, context)
         else:
-            lines += _orient_lines(stage, context) if stage.stage == "orient" else _picture_lines(stage)
+            lines += _adjust_lines(stage) if stage.stage == "adjust" else _picture_lines(stage)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -240,6 +245,22 @@ def _orient_lines(stage: StageReport, context: Context) -> list[str]:
             words.append(f"{what.replace('_', ' ')} given and corrected: {named}")
     if facts["outside"]:
         words.append(f"not oriented: {_listed(facts['outside'])}")
+    return [f"          {line}" for line in words]
+
+
+def _adjust_lines(stage: StageReport) -> list[str]:
+    """Figures of the bundle adjustment, and images that it could not tie."""
+    facts = stage.facts
+    if not facts.get("points"):
+        return []
+    words = [
+        f"{facts['images']} of {stage.items} images oriented, {facts['points']} points in {facts['track_length']:.1f} "
+        f"images each, reprojection error {facts['reprojection_error_px']:.2f} px"
+    ]
+    if len(facts["groups"]) > 1:
+        sizes = ", ".join(str(group["images"]) for group in facts["groups"])
+        words.append(f"{len(facts['groups'])} groups of images that nothing ties to each other: {sizes}")
+    words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
     return [f"          {line}" for line in words]
 
 

@@ -1,4 +1,4 @@
-"""COLMAP: a database for its mappers and a text model of the given poses for its point triangulator.
+"""COLMAP: a database for its mappers and a text model: the adjusted block, or the given poses without points.
 
 Translated on the way: keypoints and principal points move by +0.5 px (COLMAP's origin is the corner of the first
 pixel); image and camera ids become 1, 2, ... in the order of our sorted ids, so that id0 < id1 stays true and
@@ -9,26 +9,23 @@ world.json.
 from __future__ import annotations
 
 import json
-import signal
 import sqlite3
-import threading
-import zlib
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray, Pose
+from aeromatch_cli.data import Block, Camera, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.formats.adjusted import orientation_text
 from aeromatch_cli.geometry.cameras import colmap_params
 from aeromatch_cli.geometry.epipolar import fundamental
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.colmap_model import Numbers, import_pycolmap, write_model
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
 
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
@@ -37,10 +34,11 @@ _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFS
 
 class Colmap(Strategy):
     """Writes database.db (cameras, rigs, frames, images, keypoints, matches, two-view geometries, pose priors),
-    sparse/{cameras,images,points3D}.txt and world.json. Where an image name contains a space, which COLMAP cannot read
-    from text, sparse holds the binary model as well.
+    sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv. Where an image name
+    contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
     """
 
+    version: ClassVar[int] = 2
     name: Literal["colmap"] = "colmap"
     raw_matches: bool = Field(
         True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
@@ -52,21 +50,23 @@ class Colmap(Strategy):
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ValueError on a match without keypoint."""
         with whole_folder(folder) as partial:
-            ids = _Ids.of(contents.block)
+            ids = Numbers.of(contents.block)
             counts = self._write_database(contents, ids, partial / "database.db")
-            posed = _posed_images(contents.block)
-            _write_poses(contents.block, posed, ids, partial / "sparse")
+            posed = write_model(contents, ids, partial / "sparse")
+            if contents.adjusted is not None:
+                text = orientation_text(contents.adjusted, contents.block)
+                (partial / "orientation.csv").write_text(text, encoding="utf-8")
             (partial / "world.json").write_text(_world_text(contents.block), encoding="utf-8")
             names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
         return ExportSummary(
             files=tuple(folder / name for name in names),
             images=len(contents.block.images),
-            posed_images=len(posed),
+            posed_images=posed,
             **counts,
         )
 
-    def _write_database(self, contents: ExportContents, ids: _Ids, path: Path) -> dict[str, int]:
-        pycolmap = _import_pycolmap()
+    def _write_database(self, contents: ExportContents, ids: Numbers, path: Path) -> dict[str, int]:
+        pycolmap = import_pycolmap()
         try:
             # No pycolmap.DatabaseTransaction: it aborts the process on a full disk, and is no faster.
             with pycolmap.Database.open(path) as database:
@@ -80,21 +80,24 @@ class Colmap(Strategy):
         _leave_wal_mode(path)
         return {"keypoints": sum(sizes.values()), **counts}
 
-    def _write_images(self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: _Ids) -> dict[str, int]:
+    def _write_images(
+        self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: Numbers
+    ) -> dict[str, int]:
         """Images, keypoints and pose priors; returns the number of keypoints of every image."""
         sizes = {}
+        given = contents.block.poses if contents.positions is None else contents.positions
         for image in contents.block.images:
             _write_image(pycolmap, database, image, ids)
             keypoints = np.asarray(contents.keypoints_px(image.image_id), dtype=np.float32).reshape(-1, 2)
             database.write_keypoints(ids.image[image.image_id], keypoints + np.float32(COLMAP_OFFSET_PX))
             sizes[image.image_id] = len(keypoints)
-            pose = contents.block.poses.get(image.image_id)
+            pose = given.get(image.image_id)
             if self.pose_priors and pose is not None:
                 _write_pose_prior(pycolmap, database, ids.image[image.image_id], ids.camera[image.camera_id], pose)
         return sizes
 
     def _write_pairs(
-        self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: _Ids, sizes: dict[str, int]
+        self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: Numbers, sizes: dict[str, int]
     ) -> dict[str, int]:
         """Matches and two-view geometries; returns the counts of the summary."""
         counts = dict.fromkeys(("matched_pairs", "matches", "verified_pairs", "verified_matches"), 0)
@@ -121,33 +124,7 @@ def _leave_wal_mode(path: Path) -> None:
         connection.execute("PRAGMA journal_mode = DELETE")
 
 
-@dataclass(frozen=True)
-class _Ids:
-    """COLMAP numbers, from 1, in the order of the sorted ids. Rigs are numbered like cameras, frames like images."""
-
-    image: dict[str, int]
-    camera: dict[str, int]
-
-    @classmethod
-    def of(cls, block: Block) -> _Ids:
-        image = {name: number for number, name in enumerate(sorted(i.image_id for i in block.images), start=1)}
-        camera = {name: number for number, name in enumerate(sorted(block.cameras), start=1)}
-        return cls(image, camera)
-
-
-def _import_pycolmap() -> ModuleType:
-    # pycolmap 4.2.1 aborts the process when its own zlib is initialised before Python's.
-    zlib.compress(b"")
-    # Importing it replaces the handler of SIGTERM by one that prints a stack and dies: no clean-up, no resume message.
-    before = signal.getsignal(signal.SIGTERM)
-    import pycolmap
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, before)
-    return pycolmap
-
-
-def _write_cameras(pycolmap: ModuleType, database: Any, contents: ExportContents, ids: _Ids) -> None:
+def _write_cameras(pycolmap: ModuleType, database: Any, contents: ExportContents, ids: Numbers) -> None:
     """Cameras, each with the rig of one sensor that COLMAP 4 asks for."""
     for camera_id, number in ids.camera.items():
         camera = contents.block.cameras[camera_id]
@@ -167,7 +144,7 @@ def _write_cameras(pycolmap: ModuleType, database: Any, contents: ExportContents
         database.write_rig(rig, use_rig_id=True)
 
 
-def _write_image(pycolmap: ModuleType, database: Any, image: Image, ids: _Ids) -> None:
+def _write_image(pycolmap: ModuleType, database: Any, image: Image, ids: Numbers) -> None:
     """An image and the frame that holds it alone."""
     number, camera_number = ids.image[image.image_id], ids.camera[image.camera_id]
     database.write_image(pycolmap.Image(name=image.name, camera_id=camera_number, image_id=number), use_image_id=True)
@@ -191,7 +168,7 @@ def _write_pose_prior(pycolmap: ModuleType, database: Any, image_number: int, ca
     database.write_pose_prior(prior, use_pose_prior_id=True)
 
 
-def _check_indices(item: PairContents, ids: _Ids, sizes: dict[str, int]) -> None:
+def _check_indices(item: PairContents, ids: Numbers, sizes: dict[str, int]) -> None:
     id0, id1 = item.pair.image_id0, item.pair.image_id1
     if not ids.image[id0] < ids.image[id1]:
         raise ValueError(f"pair {id0}, {id1} is not in ascending order")
@@ -223,50 +200,6 @@ def _two_view_geometry(pycolmap: ModuleType, item: PairContents, camera0: Camera
     else:
         raise ValueError(f"pair {item.pair.image_id0}, {item.pair.image_id1}: unknown model {item.model_kind!r}")
     return geometry
-
-
-def _posed_images(block: Block) -> list[tuple[Image, FloatArray, FloatArray]]:
-    """Image, world_rotation (3, 3) and centre (3,) of every image whose position and attitude are known."""
-    posed = []
-    for image in block.images:
-        pose = block.poses.get(image.image_id)
-        if pose is not None and pose.world_rotation is not None:
-            posed.append((image, pose.world_rotation, pose.center_m))
-    return posed
-
-
-def _write_poses(block: Block, posed: list[tuple[Image, FloatArray, FloatArray]], ids: _Ids, sparse: Path) -> None:
-    """The given poses as a model without points."""
-    sparse.mkdir()
-    (sparse / "cameras.txt").write_text(_cameras_text(block, ids), encoding="utf-8")
-    (sparse / "images.txt").write_text(_images_text(posed, ids), encoding="utf-8")
-    (sparse / "points3D.txt").write_text("# Empty: points are triangulated by COLMAP.\n", encoding="utf-8")
-    if any(letter.isspace() for image, _, _ in posed for letter in image.name):
-        # COLMAP reads names from text up to the first space; its binary model, which it prefers, keeps them whole.
-        reconstruction = _import_pycolmap().Reconstruction()
-        reconstruction.read_text(sparse)
-        for image, _, _ in posed:
-            reconstruction.images[ids.image[image.image_id]].name = image.name
-        reconstruction.write_binary(sparse)
-
-
-def _cameras_text(block: Block, ids: _Ids) -> str:
-    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for camera_id, number in ids.camera.items():
-        camera = block.cameras[camera_id]
-        params = " ".join(f"{value:.17g}" for value in colmap_params(camera))
-        lines.append(f"{number} {camera.model} {camera.width_px} {camera.height_px} {params}")
-    return "\n".join(lines) + "\n"
-
-
-def _images_text(posed: list[tuple[Image, FloatArray, FloatArray]], ids: _Ids) -> str:
-    """Two lines an image: the pose, and the empty list of its points."""
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for image, world_rotation, center_m in posed:
-        values = (*to_quaternion(world_rotation), *(-world_rotation @ center_m))
-        numbers = " ".join(f"{value:.17g}" for value in values)
-        lines += [f"{ids.image[image.image_id]} {numbers} {ids.camera[image.camera_id]} {image.name}", ""]
-    return "\n".join(lines) + "\n"
 
 
 def _world_text(block: Block) -> str:

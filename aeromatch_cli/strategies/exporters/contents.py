@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from aeromatch_cli.data import Block, FloatArray, IntArray, Pair
+from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose
 from aeromatch_cli.errors import WorkspaceError
 
 
@@ -34,12 +34,16 @@ class ExportContents:
     keypoints_px: image_id -> (K, 2) float32 in stored pixels, the array that match indices point into; (0, 2) for an
     image without features. pairs: each pair at most once, in the order of pairs.csv; only iterated once.
     guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
+    positions: image_id -> position as it was given, with its standard deviation; None: those of the block. adjusted:
+    the block after bundle adjustment, or None.
     """
 
     block: Block
     keypoints_px: Callable[[str], FloatArray]
     pairs: Iterable[PairContents]
     guessed_cameras: frozenset[str] = frozenset()
+    positions: Mapping[str, Pose] | None = None
+    adjusted: AdjustedBlock | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""The block after bundle adjustment on file: arrays for the program, a table for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray
+from aeromatch_cli.formats.features import load_arrays
+from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
+
+_POSES = ("rotations", "centers_m", "sigmas_m", "sigmas_deg")
+_REST = ("images", "points_m", "errors_px", "track_images", "track_keypoints", "track_points", "cameras", "params")
+
+
+def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
+    """An .npz without pickles; text as arrays of characters."""
+    ids = sorted(adjusted.poses)
+    poses = [adjusted.poses[i] for i in ids]
+    lenses = sorted(adjusted.cameras)
+    seen = [adjusted.tracks[i] for i in ids]
+    cameras = [f"{c.model} {c.width_px} {c.height_px}" for c in (adjusted.cameras[k] for k in lenses)]
+    params = [" ".join(map(repr, map(float, adjusted.cameras[k].params))) for k in lenses]
+    np.savez(
+        stream,
+        images=np.array(ids, dtype=np.str_),
+        rotations=np.array([p.rotation for p in poses]).reshape(-1, 3, 3),
+        centers_m=_rows([p.center_m for p in poses]),
+        sigmas_m=_rows([p.sigmas_m for p in poses]),
+        sigmas_deg=_rows([p.sigmas_deg for p in poses]),
+        points_m=adjusted.points_m,
+        errors_px=adjusted.errors_px,
+        track_images=np.repeat(np.arange(len(ids), dtype=np.int32), [len(one) for one in seen]),
+        track_keypoints=np.concatenate([np.zeros(0, np.int32), *(one[:, 0] for one in seen)]),
+        track_points=np.concatenate([np.zeros(0, np.int32), *(one[:, 1] for one in seen)]),
+        cameras=np.array([lenses, cameras], dtype=np.str_).reshape(2, -1),
+        params=np.array(params, dtype=np.str_),
+    )
+
+
+def read_adjusted(path: Path) -> AdjustedBlock:
+    """Raises BrokenFileError where it is missing or broken."""
+    arrays = load_arrays(path, (*_POSES, *_REST))
+    ids = [str(name) for name in arrays["images"]]
+    cameras = {}
+    for name, kind, params in zip(*arrays["cameras"], arrays["params"], strict=True):
+        model, width, height = str(kind).split()
+        cameras[str(name)] = Camera(model, int(width), int(height), tuple(map(float, str(params).split())))
+    parts = zip(*(arrays[name] for name in _POSES), strict=True)
+    poses = {
+        name: AdjustedPose(center_m, rotation, sigmas_m, sigmas_deg)
+        for name, (rotation, center_m, sigmas_m, sigmas_deg) in zip(ids, parts, strict=True)
+    }
+    both = np.column_stack([arrays["track_keypoints"], arrays["track_points"]]).astype(np.int32)
+    tracks = {name: both[arrays["track_images"] == row] for row, name in enumerate(ids)}
+    return AdjustedBlock(cameras, poses, arrays["points_m"], arrays["errors_px"], tracks)
+
+
+def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
+    """orientation.csv: one line per oriented image, in the block's CRS.
+
+    x, y, z: projection centre, metres. omega, phi, kappa: degrees, photogrammetric, against the grid of the CRS.
+    sigma_*: their standard deviations.
+    """
+    names = {image.image_id: image for image in block.images}
+    header = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
+    rows = []
+    for image_id, pose in sorted(adjusted.poses.items(), key=lambda item: names[item[0]].name):
+        center_m = [round(float(v), 4) for v in pose.center_m + np.array(block.origin_m)]
+        angles = [round(float(v), 6) for v in to_omega_phi_kappa(pose.rotation)]
+        sigmas = [float(f"{v:.3g}") for v in (*pose.sigmas_m, *pose.sigmas_deg)]
+        image = names[image_id]
+        rows.append((image.name, *center_m, *angles, *sigmas, image.camera_id))
+    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera"), rows)
+
+
+def _rows(values: list[FloatArray]) -> FloatArray:
+    return np.array(values, dtype=np.float64).reshape(-1, 3)

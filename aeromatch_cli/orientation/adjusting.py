@@ -1,0 +1,290 @@
+"""Bundle adjustment of pycolmap models, for the processes of `mapper` and `refiner`: in the world frame, with the given
+positions as observations.
+
+Image numbers are those of the database, from 1; arrays of positions and standard deviations have one row for each.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.placing import Placement, place
+from aeromatch_cli.orientation.precision import Observations, pose_sigmas
+
+# A prior focal length is taken where the cost with it is larger by no more than this share.
+_SAME_COST = 0.05
+# An adjustment has converged when a step lowers the cost by a smaller share; pycolmap itself would take 100 steps.
+_COST_TOLERANCE = 1e-6
+# No coordinate of a keypoint is measured more exactly, in pixels.
+_LEAST_ERROR_PX = 0.03
+# Fewer images do not determine a camera's distortion: it stays as it was given or as mapping left it.
+_DISTORTION_IMAGES = 10
+# So many positions hold a model in the world frame.
+_HOLDING = 3
+# Position priors beyond this many standard deviations pull less and less (Cauchy).
+_PRIOR_LOSS_SIGMAS = 3.0
+
+
+def adjusted(
+    pycolmap: ModuleType, model: Any, cameras: dict[str, Any], positions_m: FloatArray, sigmas_m: FloatArray
+) -> Placement:
+    """Place a model in the world, adjust it with the given positions as observations, and place it once more.
+
+    The adjustment takes what the positions say of the model's shape; how it is levelled is for `place` to weigh.
+    """
+    ids = image_numbers(model)
+    rows = np.array(ids) - 1
+    placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows])
+    used = [] if placement.kind == "level" else [i for i, agrees in zip(ids, placement.agreeing, strict=True) if agrees]
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m)
+    return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows])
+
+
+def adjust_in_place(
+    pycolmap: ModuleType,
+    model: Any,
+    cameras: dict[str, Any],
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    attitudes: Attitudes,
+) -> None:
+    """Adjust a model whose poses are in the world frame already; it stays there.
+
+    The adjustment itself knows no attitudes: afterwards the whole model is turned to the most probable attitude of the
+    block, by what its positions and its attitudes say of it.
+    """
+    used = [i for i in image_numbers(model) if np.isfinite(positions_m[i - 1]).all()]
+    used = used if len(used) >= _HOLDING else []
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m)
+    rows = np.array(used, dtype=int) - 1
+    arms_m = positions_m[rows] - positions_m[rows].mean(axis=0) if used else np.zeros((0, 3))
+    weights = 1.0 / sigmas_m[rows] ** 2
+    by_positions = np.eye(3) * (weights @ (arms_m**2).sum(axis=1)) - (arms_m * weights[:, None]).T @ arms_m
+    turn = attitudes.turn(model, by_positions)
+    middle_m = _centers(model, used or image_numbers(model)).mean(axis=0)
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn), middle_m - turn @ middle_m))
+
+
+@dataclass(frozen=True, eq=False)
+class Attitudes:
+    """Observed attitudes of some images: numbers, (N, 3, 3) cam_from_world, (N,) standard deviations in degrees."""
+
+    images: tuple[int, ...]
+    rotations: FloatArray
+    sigmas_deg: FloatArray
+
+    def turn(self, model: Any, information: FloatArray) -> FloatArray:
+        """Rotation (3, 3) of the world that brings a model nearest to them.
+
+        information: (3, 3) that other observations have of the model's turn as it is, per square radian.
+        """
+        from scipy.spatial.transform import Rotation
+
+        weights = 1.0 / np.deg2rad(self.sigmas_deg) ** 2
+        if not weights.sum() > 0.0:
+            return np.eye(3)
+        now = np.array([model.images[i].cam_from_world().rotation.matrix() for i in self.images])
+        turns = Rotation.from_matrix(self.rotations.transpose(0, 2, 1) @ now)
+        own = weights.sum() * np.eye(3)
+        mean = turns.mean(weights).as_rotvec()
+        return np.asarray(Rotation.from_rotvec(np.linalg.solve(own + information, own @ mean)).as_matrix())
+
+
+def _adjust(
+    pycolmap: ModuleType,
+    model: Any,
+    cameras: dict[str, Any],
+    used: list[int],
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+) -> None:
+    """used: numbers of the images whose positions are observations; without any the frame is held by two images."""
+
+    def adjuster(which: Any, fixed_cameras: bool) -> Any:
+        return _adjuster(pycolmap, which, used, positions_m, sigmas_m, fixed_cameras)
+
+    if not _with_prior_focal_lengths(pycolmap, model, cameras, adjuster):
+        adjuster(model, False).solve()
+
+
+def _with_prior_focal_lengths(
+    pycolmap: ModuleType, model: Any, priors: dict[str, Any], adjuster: Callable[[Any, bool], Any]
+) -> bool:
+    """Whether focal lengths far from their priors are given up, since the pictures say nothing against the priors.
+
+    Where all images look straight down on flat ground, any focal length goes with some flying height, and what an
+    adjustment finds is chance. A prior is taken where the cost of an adjustment with it is nearly the same.
+    """
+    far = {
+        number: prior
+        for number, prior in priors.items()
+        if int(number) in model.cameras
+        and abs(model.cameras[int(number)].mean_focal_length() / prior["focal_px"] - 1.0) > 2.0 * prior["sigma"]
+    }
+    if not far:
+        return False
+    cost = adjuster(model, False).solve().ceres_summary.final_cost
+    trial = copy.deepcopy(model)
+    for number, prior in far.items():
+        trial.cameras[int(number)].params = prior["params"]
+    if adjuster(trial, True).solve().ceres_summary.final_cost > (1.0 + _SAME_COST) * cost:
+        return False
+    for number, prior in far.items():
+        model.cameras[int(number)].params = prior["params"]
+    adjuster(model, True).solve()
+    return True
+
+
+def _placed(
+    pycolmap: ModuleType, model: Any, ids: list[int], positions_m: FloatArray, sigmas_m: FloatArray
+) -> Placement:
+    placement = place(_centers(model, ids), _points(model), positions_m, sigmas_m)
+    rotation = pycolmap.Rotation3d(placement.rotation)
+    model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.translation_m))
+    return placement
+
+
+def _adjuster(
+    pycolmap: ModuleType,
+    model: Any,
+    used: list[int],
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    fixed_cameras: bool,
+) -> Any:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.function_tolerance = _COST_TOLERANCE
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.refine_extra_params = _determines_distortion(model)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in image_numbers(model):
+        config.add_image(image_id)
+    if fixed_cameras:
+        for camera_id in model.cameras:
+            config.set_constant_cam_intrinsics(camera_id)
+    if not used:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    prior_options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    prior_options.ceres.prior_position_loss_scale = _PRIOR_LOSS_SIGMAS
+    priors = [_prior(pycolmap, model.images[i], positions_m[i - 1], sigmas_m[i - 1]) for i in used]
+    return pycolmap.create_pose_prior_ceres_bundle_adjuster(options, prior_options, config, priors, model)
+
+
+def _determines_distortion(model: Any) -> bool:
+    """Whether a camera has so many images that its distortion is no longer confused with their tilts."""
+    used = Counter(image.camera_id for image in model.images.values() if image.has_pose)
+    return max(used.values(), default=0) >= _DISTORTION_IMAGES
+
+
+def _prior(pycolmap: ModuleType, image: Any, position_m: FloatArray, sigma_m: float) -> Any:
+    return pycolmap.PosePrior(
+        corr_data_id=image.data_id,
+        position=position_m,
+        position_covariance=np.eye(3) * float(sigma_m) ** 2,
+        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+    )
+
+
+def image_numbers(model: Any) -> list[int]:
+    return sorted(int(image_id) for image_id, image in model.images.items() if image.has_pose)
+
+
+def _centers(model: Any, ids: list[int]) -> FloatArray:
+    return np.array([model.images[i].projection_center() for i in ids])
+
+
+def _points(model: Any) -> FloatArray:
+    return np.array([model.points3D[i].xyz for i in sorted(model.points3D)]).reshape(-1, 3)
+
+
+def arrays(model: Any) -> dict[str, Any]:
+    """What the parent reads: see `mapping.Model`."""
+    ids, point_ids = image_numbers(model), sorted(model.points3D)
+    model.update_point_3d_errors()
+    points = [model.points3D[i] for i in point_ids]
+    cameras = sorted(model.cameras)
+    return {
+        "images": np.array(ids),
+        "rotations": np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
+        "centers_m": _centers(model, ids),
+        "observations": np.array([model.images[i].num_points3D for i in ids]),
+        "cameras": np.array(cameras),
+        "points_m": _points(model),
+        "errors_px": np.array([point.error for point in points]),
+        "track_lengths": np.array([point.track.length() for point in points]),
+        **{f"params{i}": np.array(model.cameras[i].params) for i in cameras},
+    }
+
+
+def tracks_of(model: Any) -> dict[str, Any]:
+    """Which keypoints see the points: (M,) image numbers, keypoints of these, and rows of `points_m`."""
+    images, keypoints, rows = [], [], []
+    for row, number in enumerate(sorted(model.points3D)):
+        elements = model.points3D[number].track.elements
+        images += [element.image_id for element in elements]
+        keypoints += [element.point2D_idx for element in elements]
+        rows += [row] * len(elements)
+    return {
+        "track_images": np.array(images, np.int32),
+        "track_keypoints": np.array(keypoints, np.int32),
+        "track_points": np.array(rows, np.int32),
+    }
+
+
+def sigmas_of(model: Any, sigmas_m: FloatArray, cameras: dict[str, Any], attitudes: Attitudes) -> dict[str, Any]:
+    """Standard deviations (N, 3) of the poses of `arrays`: x, y, z in metres and omega, phi, kappa in degrees.
+
+    sigmas_m: of the observed positions, by number, NaN where there is none.
+    """
+    ids, tracks, lenses = image_numbers(model), tracks_of(model), sorted(model.cameras)
+    known = np.isin(tracks["track_images"], ids)
+    seen = Observations(
+        image=np.searchsorted(ids, tracks["track_images"][known]),
+        point=tracks["track_points"][known],
+        camera=np.array([lenses.index(model.images[i].camera_id) for i in ids]),
+        rotations=np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
+        centers_m=_centers(model, ids),
+        focal_px=np.array([model.cameras[k].mean_focal_length() for k in lenses]),
+        points_m=_points(model),
+        error_px=_error_px(model),
+    )
+    given_m = np.where(np.isfinite(sigmas_m), sigmas_m, np.inf)[np.array(ids) - 1]
+    given_deg = np.full(len(ids), np.inf)
+    places = [ids.index(i) for i in attitudes.images if i in ids]
+    given_deg[places] = attitudes.sigmas_deg[[i in ids for i in attitudes.images]]
+    focal = np.array([cameras[str(k)]["sigma"] for k in lenses])
+    of_position, of_angles = pose_sigmas(seen, given_m, given_deg, focal)
+    return {"sigmas_m": of_position, "sigmas_deg": of_angles}
+
+
+def _error_px(model: Any) -> float:
+    """Standard deviation of a keypoint's coordinate, from the residuals and what the unknowns have taken from them.
+
+    Distances of normally distributed residuals have the mean sqrt(pi / 2) times the standard deviation of a coordinate.
+    """
+    coordinates = 2 * model.compute_num_observations()
+    unknowns = 3 * model.num_points3D() + 6 * model.num_reg_images()
+    taken = np.sqrt(coordinates / max(coordinates - unknowns, 1))
+    spread_px = model.compute_mean_reprojection_error() / np.sqrt(np.pi / 2.0)
+    return max(float(spread_px * taken), _LEAST_ERROR_PX)
+
+
+def figures(model: Any) -> dict[str, Any]:
+    return {
+        "images": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "track_length": model.compute_mean_track_length(),
+        "reprojection_error_px": model.compute_mean_reprojection_error(),
+    }

@@ -1,0 +1,149 @@
+"""The refiner's own process: a COLMAP database, poses and given positions in; adjusted models with their points out.
+
+Run as a module: FOLDER, which holds database.db, sparse/ (poses without points), task.json and priors.npz; model<k>.npz
+and result.json are written into it. See `mapping`, and `mapper` for why it is a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.adjusting import (
+    Attitudes,
+    adjust_in_place,
+    adjusted,
+    arrays,
+    figures,
+    image_numbers,
+    sigmas_of,
+    tracks_of,
+)
+
+# Points are made and poses adjusted again while that takes away this share of the reprojection error.
+_WORTH_AGAIN = 0.1
+_MAX_ROUNDS = 3
+_MIN_OBSERVATIONS = 12
+# Elements of rotations that were written and read again.
+_SAME = 1e-6
+_NONE = np.zeros(0)
+# Poses that are not exact yet: points of the first round may be so far off, and are filtered as usual from then on.
+_FIRST_ERROR_PX = 12.0
+
+
+def refine(folder: Path) -> None:
+    """Triangulate and adjust every group of posed images, and tie further images to the largest."""
+    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
+    priors = np.load(folder / "priors.npz")
+    facts = []
+    for number, group in enumerate(task["groups"]):
+        model = _posed(pycolmap, folder, set(group["images"]))
+        model = _triangulated(pycolmap, model, folder, not task["fixed"])
+        registered: list[int] = []
+        if number == 0 and task["more"] and not task["fixed"]:
+            model, registered = _grown(pycolmap, model, folder)
+        positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
+        attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
+        if not task["fixed"]:
+            for _ in range(_MAX_ROUNDS):
+                if model.num_points3D() < _MIN_OBSERVATIONS:
+                    break
+                before = model.compute_mean_reprojection_error()
+                if group["kind"] == "positions":
+                    adjusted(pycolmap, model, task["cameras"], positions_m, sigmas_m)
+                else:
+                    adjust_in_place(pycolmap, model, task["cameras"], positions_m, sigmas_m, attitudes)
+                model.update_point_3d_errors()
+                if model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
+                    break
+                model = _triangulated(pycolmap, model, folder, rough=False)
+        model.update_point_3d_errors()
+        _drop_weak_images(model)
+        if not image_numbers(model):
+            continue
+        name = f"model{number}.npz"
+        deviations = sigmas_of(model, sigmas_m, task["cameras"], attitudes)
+        np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
+        facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
+    (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+
+
+def _posed(pycolmap: ModuleType, folder: Path, numbers: set[int]) -> Any:
+    """The given poses of some images."""
+    model = pycolmap.Reconstruction(folder / "sparse")
+    for image in list(model.images.values()):
+        if image.has_pose and image.image_id not in numbers:
+            model.deregister_frame(image.frame_id)
+    return model
+
+
+def _attitudes(model: Any, priors: Mapping[str, FloatArray]) -> Attitudes:
+    """Given attitudes of the images that have them still: those that were corrected tell nothing."""
+    rows, now = [], model.images
+    for row, given in enumerate(priors["rotations"]):
+        if row + 1 in now and now[row + 1].has_pose and np.isfinite(given).all():
+            found = now[row + 1].cam_from_world().rotation.matrix()
+            if np.abs(found - given).max() < _SAME:
+                rows.append(row)
+    return Attitudes(tuple(row + 1 for row in rows), priors["rotations"][rows], priors["sigmas_deg"][rows])
+
+
+def _triangulated(pycolmap: ModuleType, model: Any, folder: Path, rough: bool) -> Any:
+    options = _options(pycolmap)
+    # Points in two images only are weak: they count where there are no others.
+    options.triangulation.ignore_two_view_tracks = len(image_numbers(model)) > 2
+    if rough:
+        options.mapper.filter_max_reproj_error = _FIRST_ERROR_PX
+        options.triangulation.create_max_angle_error *= 3.0
+        options.triangulation.continue_max_angle_error *= 3.0
+        options.triangulation.complete_max_reproj_error = _FIRST_ERROR_PX
+        options.triangulation.merge_max_reproj_error = _FIRST_ERROR_PX
+    # The poses stand: `adjusted` weighs them with the given positions.
+    out = folder / "triangulated"
+    out.mkdir(exist_ok=True)
+    return pycolmap.triangulate_points(model, folder / "database.db", out, out, True, options, False)
+
+
+def _grown(pycolmap: ModuleType, model: Any, folder: Path) -> tuple[Any, list[int]]:
+    """The model with further images resected from its points, and their numbers."""
+    before = {image.image_id for image in model.images.values() if image.has_pose}
+    start, out = folder / "grown_from", folder / "grown"
+    for path in (start, out):
+        path.mkdir(exist_ok=True)
+    model.write(start)
+    options = _options(pycolmap)
+    options.fix_existing_frames = True  # the frame of the world, and the time
+    options.multiple_models = False
+    found = pycolmap.incremental_mapping(folder / "database.db", out, out, options=options, input_path=start)
+    grown = max(found.values(), key=lambda one: one.num_reg_images(), default=model)
+    return grown, sorted({i.image_id for i in grown.images.values() if i.has_pose} - before)
+
+
+def _options(pycolmap: ModuleType) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed, options.num_threads = 0, 1
+    options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    return options
+
+
+def _drop_weak_images(model: Any) -> None:
+    for image in list(model.images.values()):
+        if image.has_pose and image.num_points3D < _MIN_OBSERVATIONS:
+            model.deregister_frame(image.frame_id)
+
+
+if __name__ == "__main__":
+    refine(Path(sys.argv[1]))

@@ -1,0 +1,82 @@
+"""What leaves the workspace: keypoints and verified matches of the pairs that are up to date."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
+from aeromatch_cli.errors import BrokenFileError, InputError
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import MatchEntry, read_match_row
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import outdated_pairs, verified_pairs
+from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
+from aeromatch_cli.strategies.exporters import ExportContents, PairContents
+
+
+def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
+    """The context with the pairs whose results are up to date, and the other pairs. InputError where none is left."""
+    outdated = outdated_pairs(context)
+    absent = {(pair.image_id0, pair.image_id1) for pair in outdated}
+    pairs = [p for p in context.pairs if (p.image_id0, p.image_id1) not in absent]
+    if not pairs:
+        raise InputError(
+            "nothing to export: no pair is matched and filtered with the present settings and inputs; "
+            "run `aeromatch filter` first (`aeromatch run` does everything), and see failures.csv"
+        )
+    return replace(context, pairs=tuple(pairs)), outdated
+
+
+def contents_of(context: Context, adjusted: AdjustedBlock | None = None) -> ExportContents:
+    """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time."""
+
+    def keypoints_px(image_id: str) -> FloatArray:
+        path = context.workspace.features(image_id)
+        # An image whose extraction failed is exported without keypoints, so that ids stay complete.
+        return read_keypoints(path)[0] if path.exists() else np.zeros((0, 2), np.float32)
+
+    if not context.settings.match.reads_pixels:
+        return _contents(context, keypoints_px, _pairs(context), adjusted)
+    matched = list(_matched(context))
+    tracks = tracks_of(matched, keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id]))
+
+    def with_measured_px(image_id: str) -> FloatArray:
+        return tracks.keypoints_px[image_id] if image_id in tracks.keypoints_px else keypoints_px(image_id)
+
+    return _contents(context, with_measured_px, _joined(matched, tracks), adjusted)
+
+
+def _contents(
+    context: Context,
+    keypoints_px: Callable[[str], FloatArray],
+    pairs: Iterable[PairContents],
+    adjusted: AdjustedBlock | None,
+) -> ExportContents:
+    given = context.given.poses
+    return ExportContents(context.block, keypoints_px, pairs, context.guessed_cameras, given, adjusted)
+
+
+def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:
+    for item in matched:
+        key, verdict = (item.pair.image_id0, item.pair.image_id1), item.verified.verdict
+        yield PairContents(item.pair, tracks.raw[key], tracks.verified[key], verdict.model_kind, verdict.model)
+
+
+def _pairs(context: Context) -> Iterator[PairContents]:
+    for item in _matched(context):
+        verdict, kept = item.verified.verdict, item.verified.matches.indices
+        yield PairContents(item.pair, item.raw.indices, kept, verdict.model_kind, verdict.model)
+
+
+def _matched(context: Context) -> Iterator[MatchedPair]:
+    row_id, row = "", dict[str, MatchEntry]()
+    for pair, entry in verified_pairs(context):
+        if pair.image_id0 != row_id:
+            row_id, row = pair.image_id0, read_match_row(context.workspace.matches(pair.image_id0))
+        found = row.get(pair.image_id1)
+        if found is None:  # the row was rewritten under another configuration while this one ran
+            raise BrokenFileError(str(context.workspace.matches(pair.image_id0)), f"no entry {pair.image_id1}")
+        yield MatchedPair(pair, found.matches, entry)

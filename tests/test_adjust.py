@@ -1,0 +1,239 @@
+"""The bundle adjustment of verified matches: exact points of a known block, its file, and the stage that runs it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import IMAGES, Site
+from scipy.spatial.transform import Rotation
+from test_export_colmap import ORIGIN_M, Truth, make_truth
+
+from aeromatch_cli.data import AdjustedBlock, FloatArray, Pose
+from aeromatch_cli.errors import InputError
+from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
+from aeromatch_cli.orientation.mapping import Group, refine_block
+from aeromatch_cli.stages import adjust
+from aeromatch_cli.strategies.exporters import Colmap, ExportContents
+from aeromatch_cli.synthetic import load_truth
+
+zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
+
+NOISE_PX = 0.3
+IMAGE_IDS = tuple(f"img{number}" for number in range(6))
+FOCAL_SIGMAS = {"a": 0.02, "b": 0.02}
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return make_truth()
+
+
+def disturbed(truth: Truth, seed: int, *, degrees: float = 0.3, metres: float = 0.5) -> ExportContents:
+    """Keypoints with NOISE_PX, poses off by some degrees and metres, as a first pass leaves them."""
+    rng = np.random.default_rng(seed)
+    keypoints = {i: k + rng.normal(0.0, NOISE_PX, k.shape).astype(np.float32) for i, k in truth.keypoints_px.items()}
+    poses = {
+        i: Pose(
+            p.center_m + rng.normal(0.0, metres, 3),
+            Rotation.from_rotvec(rng.normal(0.0, degrees, 3), degrees=True).as_matrix() @ p.world_rotation,
+            1.0,
+            1.0,
+        )
+        for i, p in truth.block.poses.items()
+    }
+    return ExportContents(replace(truth.block, poses=poses), keypoints.__getitem__, truth.pairs)
+
+
+def given_positions(truth: Truth, seed: int, sigma_m: float) -> dict[str, Pose]:
+    rng = np.random.default_rng(seed)
+    return {
+        i: Pose(p.center_m + rng.normal(0.0, sigma_m, 3), None, sigma_m, 180.0) for i, p in truth.block.poses.items()
+    }
+
+
+def refined(
+    truth: Truth, seed: int = 0, images: tuple[str, ...] = IMAGE_IDS, fixed: bool = False
+) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
+    positions = given_positions(truth, seed + 100, 0.1)
+    groups = [Group("positions", images)]
+    return refine_block(disturbed(truth, seed), positions, FOCAL_SIGMAS, groups, fixed=fixed)
+
+
+def errors(truth: Truth, adjusted: AdjustedBlock) -> tuple[FloatArray, FloatArray]:
+    """(N, 3) errors of the centres in metres, (N,) of the attitudes in degrees."""
+    pairs = [(adjusted.poses[i], truth.block.poses[i]) for i in sorted(adjusted.poses)]
+    angles = [angle_between_deg(found.rotation, true.world_rotation) for found, true in pairs]
+    return np.array([found.center_m - true.center_m for found, true in pairs]), np.array(angles)
+
+
+def test_disturbed_poses_are_adjusted_to_the_truth(truth: Truth) -> None:
+    adjusted, figures = refined(truth)
+    off_m, off_deg = errors(truth, adjusted)
+    assert sorted(adjusted.poses) == list(IMAGE_IDS)
+    assert np.abs(off_m).max() < 0.4
+    assert off_deg.max() < 0.5
+    assert len(adjusted.points_m) >= 0.95 * truth.tied
+    assert float(np.mean(adjusted.errors_px)) < 2 * NOISE_PX
+    assert (figures[0]["images"], figures[0]["points"]) == (6, len(adjusted.points_m))
+
+
+def test_points_are_those_that_their_keypoints_see(truth: Truth) -> None:
+    adjusted, _ = refined(truth)
+    for image_id, track in adjusted.tracks.items():
+        pose, camera = adjusted.poses[image_id], adjusted.cameras["ab"[int(image_id[-1]) % 2]]
+        seen_px = project(camera, pose.rotation, pose.center_m, adjusted.points_m[track[:, 1]])
+        distances_px = np.linalg.norm(seen_px - truth.keypoints_px[image_id][track[:, 0]], axis=1)
+        assert np.median(distances_px) < 2 * NOISE_PX
+        assert len(np.unique(track[:, 0])) == len(track) > 50
+
+
+def test_standard_deviations_are_those_of_repeated_measurements(truth: Truth) -> None:
+    """Eight blocks with other noise: root mean square errors, and the standard deviations that are stated."""
+    runs = [refined(truth, seed)[0] for seed in range(8)]
+    measured = np.array([errors(truth, run)[0] for run in runs])
+    stated = np.array([[run.poses[i].sigmas_m for i in IMAGE_IDS] for run in runs])
+    ratio = np.sqrt((measured**2).mean(axis=(0, 1))) / np.sqrt((stated**2).mean(axis=(0, 1)))
+    assert ((ratio > 0.6) & (ratio < 1.6)).all(), ratio
+    angles = np.array([errors(truth, run)[1] for run in runs])
+    whole = np.array([[np.linalg.norm(run.poses[i].sigmas_deg) for i in IMAGE_IDS] for run in runs])
+    assert 0.6 < np.sqrt((angles**2).mean() / (whole**2).mean()) < 1.6
+
+
+def test_surveyed_poses_stay_and_get_points(truth: Truth) -> None:
+    contents = replace(disturbed(truth, 0), block=truth.block)
+    groups = [Group("given", IMAGE_IDS)]
+    adjusted, _ = refine_block(contents, truth.block.poses, FOCAL_SIGMAS, groups, fixed=True)
+    off_m, off_deg = errors(truth, adjusted)
+    assert np.abs(off_m).max() < 1e-9
+    assert off_deg.max() < 1e-5
+    assert adjusted.cameras == truth.block.cameras
+    assert len(adjusted.points_m) >= 0.95 * truth.tied
+
+
+def test_an_image_outside_is_tied_by_its_points(truth: Truth) -> None:
+    adjusted, figures = refined(truth, images=IMAGE_IDS[:5])
+    assert figures[0]["registered"] == ["img5"]
+    off_m, off_deg = errors(truth, adjusted)
+    assert sorted(adjusted.poses) == list(IMAGE_IDS)
+    assert np.abs(off_m[5]).max() < 0.5
+    assert off_deg[5] < 0.5
+
+
+def test_two_groups_are_both_adjusted(truth: Truth) -> None:
+    contents = disturbed(truth, 0)
+    sides = {i: n % 3 == 2 for n, i in enumerate(IMAGE_IDS)}
+    apart = [p for p in truth.pairs if sides[p.pair.image_id0] == sides[p.pair.image_id1]]
+    groups = [Group("positions", ("img0", "img1", "img3", "img4")), Group("positions", ("img2", "img5"))]
+    adjusted, figures = refine_block(
+        replace(contents, pairs=apart), given_positions(truth, 1, 0.1), FOCAL_SIGMAS, groups, fixed=False
+    )
+    assert [one["images"] for one in figures] == [4, 2]
+    assert sorted(adjusted.poses) == list(IMAGE_IDS)
+    seen = np.concatenate([track[:, 1] for track in adjusted.tracks.values()])
+    assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
+
+
+def test_the_file_reads_back_exactly(truth: Truth, tmp_path: Path) -> None:
+    adjusted, _ = refined(truth)
+    path = tmp_path / "adjusted.npz"
+    with path.open("wb") as stream:
+        write_adjusted(stream, adjusted)
+    again = read_adjusted(path)
+    assert again.cameras == adjusted.cameras
+    np.testing.assert_array_equal(again.points_m, adjusted.points_m)
+    np.testing.assert_array_equal(again.errors_px, adjusted.errors_px)
+    for image_id, pose in adjusted.poses.items():
+        for name in ("center_m", "rotation", "sigmas_m", "sigmas_deg"):
+            np.testing.assert_array_equal(getattr(again.poses[image_id], name), getattr(pose, name))
+        np.testing.assert_array_equal(again.tracks[image_id], adjusted.tracks[image_id])
+
+
+def test_the_table_is_in_the_crs(truth: Truth) -> None:
+    adjusted, _ = refined(truth)
+    rows = list(csv.DictReader(orientation_text(adjusted, truth.block).splitlines()))
+    assert [row["image"] for row in rows] == sorted(image.name for image in truth.block.images)
+    for row, image in zip(rows, truth.block.images, strict=True):
+        true = truth.block.poses[image.image_id]
+        center_m = np.array([float(row[axis]) for axis in "xyz"]) - ORIGIN_M
+        np.testing.assert_allclose(center_m, true.center_m, atol=0.4)
+        angles = [float(row[f"{name}_deg"]) for name in ("omega", "phi", "kappa")]
+        assert angle_between_deg(from_omega_phi_kappa(*angles), true.world_rotation) < 0.5
+        assert 0.0 < float(row["sigma_x_m"]) < 0.5
+        assert 0.0 < float(row["sigma_kappa_deg"]) < 0.5
+
+
+def test_the_exported_model_has_points_and_the_databases_keypoints(truth: Truth, tmp_path: Path) -> None:
+    import pycolmap
+
+    contents = disturbed(truth, 0)
+    positions = given_positions(truth, 100, 0.1)
+    adjusted, _ = refined(truth)
+    folder = tmp_path / "colmap"
+    Colmap()(replace(contents, pairs=iter(truth.pairs), positions=positions, adjusted=adjusted), folder)
+    model = pycolmap.Reconstruction(folder / "sparse")
+    assert (model.num_reg_images(), model.num_points3D()) == (6, len(adjusted.points_m))
+    stated = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    assert model.compute_mean_reprojection_error() == pytest.approx(stated, rel=1e-4)
+    assert stated == pytest.approx(float(np.mean(adjusted.errors_px)), rel=1e-3)
+    with pycolmap.Database.open(folder / "database.db") as database:
+        for image in model.images.values():
+            stored = database.read_keypoints(image.image_id)
+            np.testing.assert_allclose([p.xy for p in image.points2D], stored[:, :2], atol=1e-4)
+        for prior, image_id in zip(database.read_all_pose_priors(), IMAGE_IDS, strict=True):
+            np.testing.assert_allclose(np.ravel(prior.position), positions[image_id].center_m, atol=1e-9)
+            assert prior.position_covariance[0, 0] == pytest.approx(0.01)
+
+
+@pytest.mark.slow
+def test_the_stage_writes_the_block_once(done_site: Site, rendered: Path) -> None:
+    record = json.loads((done_site.work / "orientation" / "adjusted.json").read_text())
+    facts = record["facts"]
+    assert (facts["images"], facts["outside"]) == (IMAGES, {})
+    assert facts["points"] > 80
+    adjusted = read_adjusted(done_site.work / "orientation" / "adjusted.npz")
+    true = load_truth(rendered).poses
+    names = {name.replace(".", "_"): name for name in true}
+    for image_id, pose in adjusted.poses.items():
+        assert angle_between_deg(pose.rotation, true[names[image_id]].world_rotation) < 0.5
+    again = done_site("adjust")
+    assert (again.code, again.done(), again.counts("adjust")) == (0, {}, (0, IMAGES, 0))
+    (done_site.work / "orientation" / "adjusted.npz").unlink()
+    assert done_site("adjust").counts("adjust") == (IMAGES, 0, 0)
+    assert json.loads((done_site.work / "orientation" / "adjusted.json").read_text()) == record
+
+
+@pytest.mark.slow
+def test_matches_are_exported_where_the_adjustment_fails(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stops(*_: object, **__: object) -> None:
+        raise InputError("pycolmap's bundle adjustment stopped with exit code -6: Check failed")
+
+    monkeypatch.setattr(adjust, "refine_block", stops)
+    outcome = done_site("run", "--overwrite")
+    assert outcome.code == 1
+    assert done_site.failures() == [("adjust", "all images")]
+    export = done_site.work / "export" / "colmap"
+    assert (export / "database.db").is_file()
+    assert not (export / "orientation.csv").exists()
+
+
+@pytest.mark.slow
+def test_an_image_without_texture_is_named(site: Site) -> None:
+    import cv2
+
+    shape = cv2.imread(str(site.image(4))).shape
+    cv2.imwrite(str(site.image(4)), np.full(shape, 128, np.uint8))
+    outcome = site("run")
+    reasons = outcome.facts["stages"]["adjust"]["facts"]["outside"]
+    assert list(reasons) == [site.names()[4].replace(".", "_")]
+    assert "no texture, or blurred" in next(iter(reasons.values()))
+    assert "not oriented: " + next(iter(reasons)) in outcome.stdout + outcome.stderr
