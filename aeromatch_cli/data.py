@@ -139,7 +139,7 @@ class Block:
     are absent. crs: authority code of the world frame, or "local". origin_m: (3,) what was subtracted from the
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the ground views, or None where no image has an attitude. tied: pairs (image_id0, image_id1) that a
-    first pass has matched.
+    first pass has matched; similar: pairs that look alike, where that was asked for.
     """
 
     images: tuple[Image, ...]
@@ -151,6 +151,7 @@ class Block:
     ground_source: str
     gsd_m: float | None
     tied: tuple[tuple[str, str], ...] = ()
+    similar: tuple[tuple[str, str], ...] = ()
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]

@@ -162,6 +162,35 @@ def test_outliers_among_the_positions_are_left_out() -> None:
     assert max(attitude_errors(truth, found.rotations(rotations))) < 0.3
 
 
+@pytest.mark.parametrize(
+    ("change", "contradiction"),
+    [
+        (lambda p: p[:, [1, 0, 2]], "mirrored"),
+        (lambda p: np.random.default_rng(4).permutation(p), "scattered"),
+        (lambda p: p * [-1.0, 1.0, 1.0], "mirrored"),
+    ],
+    ids=["x and y exchanged", "lines of other images", "mirrored"],
+)
+def test_positions_of_something_else_are_not_used(change, contradiction: str) -> None:
+    truth = flight()
+    _, points = matches(truth)
+    centers, _, moved = model_of(truth, points)
+    positions = change(np.array([pose.center_m for pose in truth.values()]))
+    found = place(centers, moved, positions, np.full(len(centers), 0.5))
+    assert (found.kind, found.contradiction, found.agreeing.any()) == ("level", contradiction, False)
+    assert np.median(found.points(centers)[:, 2]) == pytest.approx(LOCAL_FLYING_HEIGHT, rel=0.05)
+
+
+@pytest.mark.parametrize("noise_m", [0.5, 5.0, 10.0])
+def test_noise_is_no_contradiction(noise_m: float) -> None:
+    truth = flight()
+    _, points = matches(truth)
+    centers, _, moved = model_of(truth, points)
+    rng = np.random.default_rng(6)
+    positions = np.array([pose.center_m for pose in truth.values()]) + rng.normal(0.0, noise_m, (len(truth), 3))
+    assert place(centers, moved, positions, np.full(len(centers), 5.0)).kind == "positions"
+
+
 def test_one_strip_is_levelled_by_the_terrain() -> None:
     truth = {
         f"i{n}": Pose(np.array([25.0 * n, 0.0, 80.0]), from_omega_phi_kappa(2.0, 1.0, 0.0), 0.1, 0.1) for n in range(6)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.poses import AttitudeKind, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, from_quaternion, from_yaw_pitch_roll
+from aeromatch_cli.geometry.angles import Angles
 
 AngleConvention = Literal["auto", "gimbal", "nadir"]
 
@@ -72,6 +72,19 @@ def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observatio
     return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward, facts.sigma_position_m)
 
 
+class Located(NamedTuple):
+    """Observations in the world frame.
+
+    poses, angles: by image name; angles are the attitudes as they were given. unusable: what is wrong with other
+    positions, in words -> names.
+    """
+
+    frame: WorldFrame
+    poses: dict[str, Pose]
+    angles: dict[str, Angles]
+    unusable: Mapping[str, Sequence[str]]
+
+
 def oriented(
     observations: Mapping[str, Observation],
     crs: str,
@@ -79,8 +92,8 @@ def oriented(
     known_frame: WorldFrame | None,
     sigma_position_m: float,
     sigma_angle_deg: float,
-) -> tuple[WorldFrame, dict[str, Pose], Mapping[str, Sequence[str]]]:
-    """World frame, poses by image name, and what is wrong with other positions, in words -> names.
+) -> Located:
+    """Everything in one world frame.
 
     crs: what the user gave ("auto", "local" or a code); stated_crs: what an input file states, or None. known_frame:
     the frame of an earlier run on a block that has grown since; used again where its CRS is the same, so that old
@@ -112,17 +125,19 @@ def oriented(
     zeros = _grid_zeros(code, grid)
     grid = {name: center_m for name, center_m in grid.items() if name not in zeros}
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
+    stated = {name: _angles(observations[name], turns[name]) for name in grid}
+    angles = {name: one for name, one in stated.items() if one is not None}
     poses = {
         name: Pose(
             center_m=center_m - np.array(frame.origin_m),
-            world_rotation=_rotation(observations[name], turns[name]),
+            world_rotation=angles[name].rotation if name in angles else None,
             sigma_position_m=observations[name].sigma_position_m or sigma_position_m,
             sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
         )
         for name, center_m in grid.items()
     }
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
-    return frame, poses, {words: names for words, names in unusable.items() if names}
+    return Located(frame, poses, angles, {words: names for words, names in unusable.items() if names})
 
 
 def _grid_zeros(crs: str, grid: Mapping[str, FloatArray]) -> list[str]:
@@ -142,14 +157,8 @@ def _origin_m(crs: str, centers_m: list[FloatArray], known: WorldFrame | None) -
     return rounded_origin_m(np.array(centers_m)) if centers_m else (0.0, 0.0, 0.0)
 
 
-def _rotation(observation: Observation, convergence: float) -> FloatArray | None:
-    """cam_from_world rotation; convergence in degrees, 0 where the position was given in the grid."""
-    values = observation.attitude
-    if values is None:
+def _angles(observation: Observation, convergence_deg: float) -> Angles | None:
+    """convergence_deg: 0 where the position was given in the grid."""
+    if observation.attitude is None or observation.attitude_kind == "none":
         return None
-    if observation.attitude_kind == "quaternion":
-        return from_quaternion(*values)
-    if observation.attitude_kind == "omega_phi_kappa":
-        return from_omega_phi_kappa(*values)
-    yaw_deg, pitch_deg, roll_deg = values
-    return from_yaw_pitch_roll(yaw_deg - convergence, pitch_deg, roll_deg, forward=observation.forward)
+    return Angles(observation.attitude_kind, observation.attitude, observation.forward, convergence_deg)

@@ -13,9 +13,10 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
+from aeromatch_cli.blocks.agreement import agreed
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
 from aeromatch_cli.blocks.cameras import CameraAssignment, cameras_from_exif, cameras_from_file, listed
-from aeromatch_cli.blocks.crs import WorldFrame, checked_crs
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
@@ -28,6 +29,7 @@ from aeromatch_cli.blocks.poses import PoseList, PoseRow, read_poses
 from aeromatch_cli.blocks.scan import ScanFailure, image_ids
 from aeromatch_cli.data import Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
+from aeromatch_cli.geometry.angles import Angles
 
 EXIF = "exif"
 FOLDER = "folder"
@@ -45,15 +47,16 @@ class BlockInputs:
     """A block before its ground is known.
 
     images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose in the world (crs - origin_m);
-    images without position are absent. ground_hint_z_m: world height of the ground as the input states it, or None;
-    ground_hint_source: where it came from, in words, "" for None; ground_is_stated: the user's camera file says so,
-    rather than a barometer. focal_sigmas: camera id -> standard deviation of its focal length, as a share of it.
-    warnings: for a person, in order of reading.
+    images without position are absent. angles: image_id -> attitude as it was given. ground_hint_z_m: world height of
+    the ground as the input states it, or None; ground_hint_source: where it came from, in words, "" for None;
+    ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
+    deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
     """
 
     images: tuple[Image, ...]
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
+    angles: Mapping[str, Angles]
     crs: str
     origin_m: tuple[float, float, float]
     ground_hint_z_m: float | None
@@ -131,7 +134,11 @@ def block_inputs(
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
-    frame, named_poses, unusable = oriented(
+    if lists.pose_list is not None:
+        stated_crs = crs if crs != AUTO or camera_file is None else camera_file.crs or crs
+        observations, remarks = agreed(observations, facts, stated_crs, f"pose list {lists.poses}")
+        warnings += remarks
+    frame, named_poses, angles, unusable = oriented(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
@@ -142,6 +149,7 @@ def block_inputs(
         images=_images(ids, facts, assignment.camera_ids),
         cameras=assignment.cameras,
         poses={ids[name]: pose for name, pose in named_poses.items()},
+        angles={ids[name]: one for name, one in angles.items()},
         crs=frame.crs,
         origin_m=frame.origin_m,
         ground_hint_z_m=hint_z_m,

@@ -40,16 +40,19 @@ class BlockSummary:
     unpaired: tuple[str, ...]
     warnings: tuple[str, ...]
 
-    def lines(self) -> list[str]:
-        """The summary for a person, one fact per line, without the warnings."""
-        low, median, high = self.flying_height_m
-        east, north = self.extent_m
-        found = [
+    def given_lines(self) -> list[str]:
+        """What a block brings before it is oriented."""
+        return [
             f"images           {self.images}, {self.positioned} with position, {self.oriented} with attitude, "
             f"{self.cameras} camera{'s' if self.cameras != 1 else ''}",
             f"world            {self.crs}, origin {self.origin_m[0]:.0f} {self.origin_m[1]:.0f} {self.origin_m[2]:.0f}",
-            f"ground           {self.ground_source or 'unknown'}",
         ]
+
+    def lines(self) -> list[str]:
+        """The summary of an oriented block for a person, one fact per line, without the warnings."""
+        low, median, high = self.flying_height_m
+        east, north = self.extent_m
+        found = [f"ground           {self.ground_source or 'unknown'}"]
         if self.positioned:
             found.append(f"extent           {east:.1f} m east-west, {north:.1f} m north-south")
         if np.isfinite(median):

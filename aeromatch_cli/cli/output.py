@@ -78,11 +78,21 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
         typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
         record.error("error: %s", text, exc_info=True)
         return {"error": text, "exit_code": AeromatchError.exit_code}
+    say = said(quiet)
     for line in result.lines:
+        say(line)
+    return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+
+
+def said(quiet: bool) -> Callable[[str], None]:
+    """Prints a line, unless `quiet`, and records it."""
+
+    def say(line: str) -> None:
         record.info("%s", line)
         if not quiet:
             typer.echo(line)
-    return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+
+    return say
 
 
 def _finite(value: Any) -> Any:

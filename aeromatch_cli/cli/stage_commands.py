@@ -28,7 +28,7 @@ from aeromatch_cli.cli.options import (
     ShardText,
     WorkspaceDir,
 )
-from aeromatch_cli.cli.output import as_texts, guarded
+from aeromatch_cli.cli.output import as_texts, guarded, said
 from aeromatch_cli.cli.progress import progress_shown
 
 if TYPE_CHECKING:
@@ -122,7 +122,8 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.stages.run import execute
 
             settings = load(config, set_ or (), as_texts(block), run=as_texts(run), workspace=_absolute(workspace))
-            return execute(name, settings, shard=shard, overwrite=overwrite, progress=progress_shown(quiet))
+            shown = progress_shown(quiet)
+            return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=said(quiet))
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)
 

@@ -142,7 +142,7 @@ def load_reference(folder: Path, images_folder: Path | None = None) -> Reference
         raise InputError(f"{folder / 'block.json'} states no ground height: add ground_z (metres), overlaps rest on it")
     observations = {row.image: observation_of_row(row, "auto") for row in pose_list.rows}
     known = {name: found for name, found in observations.items() if found is not None}
-    frame, poses, _ = oriented(known, "auto", cameras.crs, None, 0.0, 0.0)
+    frame, poses, _, _ = oriented(known, "auto", cameras.crs, None, 0.0, 0.0)
     poses = {name: pose for name, pose in poses.items() if pose.world_rotation is not None}
     if len(poses) < 2:
         raise InputError(f"{folder / 'poses.csv'} gives {len(poses)} images position and attitude: two are needed")

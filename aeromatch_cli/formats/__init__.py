@@ -56,9 +56,11 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
 - `facts`: `method` (`given`: the given poses explain the matches; `pictures`: a mapper oriented the block),
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `wrong_attitudes`
-  (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented).
-- `tied`: pairs that the first pass verified. `groups`: images that were oriented together, the largest group first:
-  `kind` (`given`, `positions`, or `level`: no positions, scale and origin arbitrary), `images`.
+  (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
+  (`world`, or `own`: nothing ties it to the CRS), `remarks` (what is wrong with given positions or angles, sentences).
+- `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for. `groups`:
+  images that were oriented together, the largest group first: `kind` (`given`, `positions`, or `level`: no positions,
+  scale and origin arbitrary), `images`.
 
 ### orientation/cameras.csv, poses.csv
 

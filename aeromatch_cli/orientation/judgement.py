@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, IntArray, Pose
+from aeromatch_cli.data import Camera, FloatArray, Ground, IntArray, Pose
 from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
@@ -102,6 +102,15 @@ def triangulated(
         points[view_angles_deg(first.center_m, second.center_m, points) < _MIN_RAY_ANGLE_DEG] = np.nan
         found[-1] = points
     return found
+
+
+def heights_above_m(given: Ground, terrain: Ground, centers_m: FloatArray) -> tuple[float, float]:
+    """How far a given ground lies above the terrain found, and the flying height above that: medians, metres.
+
+    centers_m: (N, 3) projection centres, below which both are asked.
+    """
+    below = terrain.height_m(centers_m[:, :2])
+    return float(np.median(given.height_m(centers_m[:, :2]) - below)), float(np.median(centers_m[:, 2] - below))
 
 
 def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:

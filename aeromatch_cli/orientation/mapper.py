@@ -46,7 +46,7 @@ def solve(folder: Path) -> None:
         placement = adjusted(pycolmap, model, task["cameras"], priors["positions_m"], priors["sigmas_m"])
         name = f"model{number}.npz"
         np.savez(folder / name, **arrays(model))
-        facts.append({"file": name, "kind": placement.kind, **figures(model)})
+        facts.append({"file": name, "kind": placement.kind, "contradiction": placement.contradiction, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 
 

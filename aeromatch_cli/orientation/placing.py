@@ -21,6 +21,8 @@ _AGREE_SIGMAS = 3.0
 _AGREE_EXTENT = 0.01
 # The error that is allowed doubles until this share of the positions agrees.
 _LEAST_AGREEING = 0.6
+# Positions that do not agree to this share of the extent either are not those of the images.
+_BELIEVED_EXTENT = 0.1
 # Where fewer than this share agree within their standard deviations, errors have a common cause (a delay between GPS
 # and shutter, say), which no average takes away: the block is levelled as if they were larger by this factor.
 _TRUSTED = 0.85
@@ -36,6 +38,8 @@ class Placement:
     kind: "positions" (by positions, and by the terrain as far as these leave it open) or "level" (no positions: level
     by the terrain, scale and origin arbitrary). agreeing: (N,) which positions were used; False where there is none.
     trusted: whether nearly all positions agree with the pictures as well as their standard deviations say.
+    contradiction: why given positions were not used: "mirrored" (they fit only with the ground above the cameras),
+    "scattered" (they do not fit), else "".
     """
 
     scale: float
@@ -44,6 +48,7 @@ class Placement:
     kind: str
     agreeing: BoolArray
     trusted: bool
+    contradiction: str = ""
 
     def points(self, points: FloatArray) -> FloatArray:
         """World points (N, 3) of model points (N, 3)."""
@@ -64,6 +69,11 @@ def place(centers: FloatArray, points: FloatArray, positions_m: FloatArray, sigm
     found = _by_positions(centers[known], positions_m[known], sigmas_m[known]) if known.sum() >= 2 else None
     if found is None:
         return _level(centers, points, known)
+    contradiction = found.contradiction
+    if not contradiction and _upside_down(found, centers[known], points, positions_m[known], sigmas_m[known]):
+        contradiction = "mirrored"
+    if contradiction:
+        return replace(_level(centers, points, known), contradiction=contradiction)
     agreeing = np.zeros(len(centers), dtype=bool)
     agreeing[np.flatnonzero(known)[found.agreeing]] = True
     found = replace(found, agreeing=agreeing)
@@ -104,9 +114,37 @@ def _by_positions(centers: FloatArray, positions_m: FloatArray, sigmas_m: FloatA
         if (again == chosen).all() or again.sum() < 2:
             break
         chosen = again
-    scale, rotation, translation_m = fit
-    share = float((_errors(fit, centers, positions_m) <= limits_m).mean())
-    return Placement(scale, rotation, translation_m, "positions", chosen, share >= _TRUSTED) if scale > 0.0 else None
+    if fit[0] <= 0.0:
+        return None
+    found_m = _errors(fit, centers, positions_m)
+    trusted = float((found_m <= limits_m).mean()) >= _TRUSTED
+    believed = float((found_m <= _loose_m(positions_m, sigmas_m)).mean()) >= _LEAST_AGREEING
+    return Placement(*fit, "positions", chosen, trusted, "" if believed else "scattered")
+
+
+def _upside_down(
+    found: Placement, centers: FloatArray, points: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray
+) -> bool:
+    """Whether positions fit only with the ground above the cameras: seen from below they are mirrored.
+
+    Positions along one line fit either way.
+    """
+    up = _up(centers, points)
+    if (found.rotation @ up)[2] >= 0.0:
+        return False
+    # Points below the centres keep the fit upright.
+    depth = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    down_m = found.scale * depth * np.array([0.0, 0.0, 1.0])
+    fit = similarity(
+        np.concatenate([centers, centers - depth * up]), np.concatenate([positions_m, positions_m - down_m])
+    )
+    return float((_errors(fit, centers, positions_m) <= _loose_m(positions_m, sigmas_m)).mean()) < _LEAST_AGREEING
+
+
+def _loose_m(positions_m: FloatArray, sigmas_m: FloatArray) -> FloatArray:
+    """(N,) errors beyond which positions are not those of the images."""
+    extent_m = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
+    return np.asarray(np.maximum(_AGREE_SIGMAS * sigmas_m, _BELIEVED_EXTENT * extent_m))
 
 
 def _errors(fit: tuple[float, FloatArray, FloatArray], centers: FloatArray, positions_m: FloatArray) -> FloatArray:

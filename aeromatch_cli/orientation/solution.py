@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Pose
+from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.orientation.conventions import Recognised, recognised
 from aeromatch_cli.orientation.dem import Terrain, terrain_of
 from aeromatch_cli.orientation.judgement import (
     PairPoints,
@@ -89,7 +91,9 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     points = _finite(triangulated(pairs, poses, cameras))
     facts = {
         "method": "given",
+        "frame": "world",
         "corrected": sorted(found),
+        "remarks": [],
         "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
         "points": len(points),
         **_judged(block.poses, found),
@@ -98,11 +102,19 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     return Solution(block.cameras, poses, terrain_of(points, _area(poses)), facts)
 
 
-def from_models(block: Block, models: Sequence[Model], before: Mapping[str, Pose]) -> Solution:
+def judged(given: Solution, pictures: Solution) -> Solution:
+    """Given poses as they are, with what the pictures say against them."""
+    against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "remarks")}
+    return replace(given, facts={**given.facts, **against})
+
+
+def from_models(
+    block: Block, models: Sequence[Model], before: Mapping[str, Pose], angles: Mapping[str, Angles]
+) -> Solution:
     """Given poses and cameras, replaced by those of the mapper's models, the largest first.
 
     before: poses that an earlier run found for images that have not changed; models are moved onto them, and where
-    they agree the images keep them.
+    they agree the images keep them. angles: image_id -> attitude as it was given.
     """
     poses, cameras = dict(block.poses), dict(block.cameras)
     points: list[FloatArray] = [np.zeros((0, 3))]
@@ -122,20 +134,58 @@ def from_models(block: Block, models: Sequence[Model], before: Mapping[str, Pose
         found |= kept
         cameras |= model.cameras
         points.append(model.points_m[model.track_lengths >= 3])
+    level = bool(models) and models[0].kind == "level"
+    convention = None if level else _convention(models, angles)
+    given = dict(block.poses)
+    for image_id, one in angles.items():
+        if convention is not None and image_id in given:
+            given[image_id] = replace(given[image_id], world_rotation=convention.rotation(one))
     for image_id in block.poses.keys() - found.keys():
         # An attitude that nothing confirms in a block where others were wrong is not relied on.
-        poses[image_id] = replace(poses[image_id], world_rotation=None)
+        poses[image_id] = given[image_id] if convention else replace(poses[image_id], world_rotation=None)
+        if level:
+            del poses[image_id]  # its position is in another frame than the others'
     poses |= found
     facts = {
         "method": "pictures",
+        "frame": "own" if level else "world",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
         "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
         "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": sum(len(p) for p in points),
-        **_judged(block.poses, found),
-        "outside": _outside(block, poses),
+        **_judged(given, found),
+        "outside": _outside(block, found),
+        "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }
+    if level:
+        facts["wrong_positions"] = facts["wrong_attitudes"] = {}
     return Solution(cameras, poses, terrain_of(np.concatenate(points), _area(poses)), facts)
+
+
+def _convention(models: Sequence[Model], angles: Mapping[str, Angles]) -> Recognised | None:
+    placed = [model.rotations for model in models if model.kind == "positions"]
+    return recognised(angles, {i: rotation for one in placed for i, rotation in one.items()})
+
+
+def _convention_remarks(convention: Recognised | None) -> list[str]:
+    if convention is None:
+        return []
+    return [f"the given angles do not fit the pictures: {convention.words}"]
+
+
+def _position_remarks(models: Sequence[Model]) -> list[str]:
+    contradiction = models[0].figures.get("contradiction") if models else ""
+    if contradiction == "mirrored":
+        return [
+            "the given positions fit the pictures only mirrored: are x and y, or latitude and longitude, exchanged? "
+            "Without them the result is in a frame of its own"
+        ]
+    if contradiction:
+        return [
+            "the given positions do not fit the pictures: are they those of other images, or of another flight? "
+            "Without them the result is in a frame of its own"
+        ]
+    return []
 
 
 def _anchored(model: Model, before: Mapping[str, Pose]) -> tuple[Model, dict[str, Pose]]:

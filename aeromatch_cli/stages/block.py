@@ -22,6 +22,7 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
@@ -43,6 +44,7 @@ class BlockRead:
     block: Block
     image_fingerprints: Mapping[str, str]
     focal_sigmas: Mapping[str, float]
+    angles: Mapping[str, Angles]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
     gsd_before_m: float | None
@@ -71,6 +73,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         block=block,
         image_fingerprints=prints,
         focal_sigmas=inputs.focal_sigmas,
+        angles=inputs.angles,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,

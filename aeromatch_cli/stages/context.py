@@ -12,6 +12,7 @@ from typing import Any
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.workspace import Workspace, fingerprint
@@ -25,7 +26,7 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it.
+    share of it. angles: image_id -> attitude as it was given.
     """
 
     settings: Settings
@@ -36,6 +37,7 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
+    angles: Mapping[str, Angles] = field(default_factory=dict)
     # Stands before the names of stages in what is shown of progress.
     part: str = ""
     shard: Shard | None = None

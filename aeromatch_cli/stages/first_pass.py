@@ -11,9 +11,10 @@ from itertools import combinations
 
 import numpy as np
 
-from aeromatch_cli.data import Block, Pair
+from aeromatch_cli.data import Pair
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.orientation.judgement import PairPoints
+from aeromatch_cli.orientation.retrieval import similar_pairs
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
@@ -22,6 +23,7 @@ from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
+from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 
 # A look at given poses needs less than finding poses does: reduced size, share of the keypoints, neighbours.
@@ -42,7 +44,7 @@ def look(recipe: FirstPass) -> FirstPass:
 
 
 def prepared(context: Context, recipe: FirstPass) -> Context:
-    """The context of the first pass of a block; nothing is run yet."""
+    """The context of the first pass of a block, without pairs; nothing is run yet."""
     settings = context.settings
     limit = settings.block.max_size_px
     size_px = min(recipe.size_px, limit) if limit else recipe.size_px
@@ -66,29 +68,49 @@ def prepared(context: Context, recipe: FirstPass) -> Context:
         settings=own,
         workspace=context.workspace.first_pass,
         block=block,
-        pairs=tuple(_pairs(block, recipe)),
+        pairs=(),
         shard=None,
         part="first pass: ",
     )
 
 
-def run(context: Context) -> None:
-    """Extract, match and filter. Images and pairs that fail are left out here and named by the final pass."""
+def run(context: Context, recipe: FirstPass, *, by_position: bool = True) -> Context:
+    """Extract, choose pairs, match and filter; the context with the pairs.
+
+    by_position: pairs lean on the given positions. Images and pairs that fail are left out here and named by the final
+    pass.
+    """
     context.workspace.create()
     extract.run(context)
-    match.run(context)
-    filter.run(context)
-
-
-def _pairs(block: Block, recipe: FirstPass) -> list[Pair]:
-    """Nearest neighbours by position; images without position with all others while those are few."""
-    ids = sorted(image.image_id for image in block.images)
-    if len(block.poses) < len(ids) and len(ids) * (len(ids) - 1) // 2 <= _MOST_PAIRS:
-        chosen = set(combinations(ids, 2))
-    else:
-        chosen = set(fallback_pairs(block, ids, recipe.neighbours))
+    chosen, similar = _pairs(context, recipe, by_position=by_position)
     nan = float("nan")
-    return [Pair(id0, id1, nan, nan, "first pass") for id0, id1 in sorted(chosen)]
+    pairs = tuple(Pair(id0, id1, nan, nan, "first pass") for id0, id1 in sorted(chosen))
+    context = replace(context, pairs=pairs, block=replace(context.block, similar=similar))
+    if pairs:
+        match.run(context)
+        filter.run(context)
+    return context
+
+
+def _pairs(
+    context: Context, recipe: FirstPass, *, by_position: bool
+) -> tuple[set[tuple[str, str]], tuple[tuple[str, str], ...]]:
+    """Nearest neighbours by position. Of images without position all pairs in a small block, in a large one those that
+    look alike. Second: the pairs that look alike, where pairs=similar asks for them."""
+    block, wanted = context.block, context.settings.pairs
+    ids = sorted(image.image_id for image in block.images)
+    count = len(ids) * (len(ids) - 1) // 2
+    asked = isinstance(wanted, Similar)
+    candidates = wanted.candidates if isinstance(wanted, Similar) else recipe.neighbours
+    placed = [i for i in ids if i in block.poses] if by_position and not asked else []
+    near = set(fallback_pairs(block, placed, recipe.neighbours))
+    if len(placed) == len(ids):
+        return near, ()
+    if count <= (candidates * len(ids) if asked else _MOST_PAIRS):
+        every = set(combinations(ids, 2))
+        return every, tuple(sorted(every)) if asked else ()
+    similar = similar_pairs({i: context.workspace.features(i) for i in ids}, candidates)
+    return near | {pair for pair in similar if not set(pair) <= set(placed)}, tuple(similar) if asked else ()
 
 
 def verified_points(context: Context) -> Iterator[PairPoints]:

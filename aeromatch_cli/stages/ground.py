@@ -1,16 +1,30 @@
-"""The ground of a block as it is stated: a height, a DEM, the camera file, or relative altitudes."""
+"""The ground of a block as it is stated (a height, a DEM, the camera file, altitudes) and as the pictures show it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.ground import ConstantGround, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, open_dem
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Ground
+from aeromatch_cli.data import Block, FloatArray, Ground
+from aeromatch_cli.orientation.dem import Terrain
+from aeromatch_cli.orientation.judgement import heights_above_m
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.strategies.orienters import GivenPoses
 from aeromatch_cli.workspace import image_fingerprint
+
+# A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
+# that differs by more than so many standard deviations of a position, whichever is more.
+_SAID_SHARE, _SAID_SIGMAS = 0.1, 3.0
+# One that differs by this share is wrong: views and footprints of it would miss each other.
+_WRONG_SHARE = 0.3
+# Heights above the take-off point differ from those above ground by more than this only where something is wrong.
+_ALTITUDE_SHARE = 0.25
 
 
 def ground_fingerprint(settings: Settings) -> str:
@@ -33,3 +47,52 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
     if inputs.ground_hint_z_m is not None and inputs.ground_is_stated:
         return ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source, ()
     return None, "", ()
+
+
+def judged_ground(
+    context: Context, terrain: Terrain | None, facts: Mapping[str, Any]
+) -> tuple[Ground | None, str, list[str]]:
+    """The ground that later stages use, where it comes from in words, and what contradicts it.
+
+    terrain: of the pictures, or None. facts: those of the orientation. A stated ground wins, unless it cannot be right.
+    """
+    ground, source = context.block.ground, context.block.ground_source
+    own_frame = facts["frame"] == "own"
+    if terrain is None:
+        return (None, "", []) if own_frame else (ground, source, [])
+    cell = (terrain.cell_m, terrain.cell_m)
+    shown = DemGround(
+        terrain.heights_m, terrain.west_m, terrain.north_m, cell, outside_m=float(np.median(terrain.heights_m))
+    )
+    words = f"terrain from {facts['points']} points of the first pass"
+    if ground is None or own_frame:
+        return shown, words, []
+    off_m, flying_m = heights_above_m(ground, shown, _centers_m(context.block))
+    if abs(off_m) <= max(_SAID_SHARE * flying_m, _SAID_SIGMAS * context.settings.block.sigma_position_m):
+        return ground, source, []
+    remark = (
+        f"the ground ({source}) lies {abs(off_m):.1f} m {'above' if off_m > 0 else 'below'} the terrain that the "
+        f"pictures show, at a flying height of {flying_m:.1f} m: do heights and ground count from the same zero "
+        "(ellipsoid, sea level, take-off point)?"
+    )
+    keeps = isinstance(context.settings.orient, GivenPoses) or abs(off_m) <= _WRONG_SHARE * flying_m
+    return (ground, source, [remark]) if keeps else (shown, words, [f"{remark} The terrain of the pictures is used"])
+
+
+def judged_altitudes(
+    ground: Ground | None, block: Block, facts: Mapping[str, Any], altitudes: tuple[Ground, str] | None
+) -> list[str]:
+    """What the ground says against heights above the take-off point. facts: those of the orientation."""
+    if altitudes is None or ground is None or not block.poses or facts["frame"] == "own":
+        return []
+    off_m, flying_m = heights_above_m(altitudes[0], ground, _centers_m(block))
+    if abs(off_m) <= _ALTITUDE_SHARE * flying_m:
+        return []
+    return [
+        f"{altitudes[1]}: flying height {flying_m - off_m:.1f} m, but {flying_m:.1f} m by the pictures: the take-off "
+        "point lies at another height than the ground, or the focal length is wrong (give --cameras)"
+    ]
+
+
+def _centers_m(block: Block) -> FloatArray:
+    return np.array([pose.center_m for pose in block.poses.values()]).reshape(-1, 3)

@@ -6,25 +6,26 @@ the pictures. Later stages read the result from the workspace's orientation fold
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.ground import DemGround
-from aeromatch_cli.data import Pose
+from aeromatch_cli.data import Ground, Pose
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
-from aeromatch_cli.orientation.mapping import Group, map_block
-from aeromatch_cli.orientation.solution import Evidence, Solution, from_given, from_models, suffices
+from aeromatch_cli.orientation.mapping import Group, Model, map_block
+from aeromatch_cli.orientation.solution import Evidence, Solution, from_given, from_models, judged, suffices
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
+from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.workspace import (
     file_digest,
     fingerprint,
@@ -35,15 +36,21 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 2
+VERSION = 3
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
 _FOUND_FOCAL = 0.01
 
 
-def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
-    """The context with oriented cameras, poses and terrain. dry: only what is on file, nothing is made or written."""
+def run(
+    context: Context, altitudes: tuple[Ground, str] | None = None, *, dry: bool = False
+) -> tuple[Context, StageReport]:
+    """The context with oriented cameras, poses and terrain.
+
+    altitudes: the ground below relative altitudes and its source, which is judged. dry: only what is on file, nothing
+    is made or written.
+    """
     report = StageReport("orient", items=len(context.block.images))
     recipe = context.settings.orient
     if not isinstance(recipe, FirstPass):
@@ -64,14 +71,11 @@ def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
         report.done = report.items
     else:
         report.skipped = report.items
-    report.facts = record["facts"]
     folder = context.workspace.orientation
-    ground, source = context.block.ground, context.block.ground_source
-    if ground is None and (terrain := _terrain(context)) is not None:
-        cell = (terrain.cell_m, terrain.cell_m)
-        median_m = float(np.median(terrain.heights_m))
-        ground = DemGround(terrain.heights_m, terrain.west_m, terrain.north_m, cell, median_m)
-        source = f"terrain from {record['facts']['points']} points of the first pass"
+    terrain = _terrain(context)
+    ground, source, remarks = judged_ground(context, terrain, record["facts"])
+    remarks += judged_altitudes(ground, context.block, record["facts"], altitudes)
+    report.facts = record["facts"] | {"remarks": [*record["facts"]["remarks"], *remarks]}
     block = replace(
         context.block,
         cameras=read_cameras(folder / "cameras.csv"),
@@ -79,6 +83,7 @@ def run(context: Context, *, dry: bool = False) -> tuple[Context, StageReport]:
         ground=ground,
         ground_source=source,
         tied=tuple((id0, id1) for id0, id1 in record["tied"]),
+        similar=tuple((id0, id1) for id0, id1 in record["similar"]),
     )
     found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
     context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
@@ -96,29 +101,53 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     as they were where the new ones agree with them."""
     block = context.block
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
-    first, evidence = _evidence(context, first_pass.look(recipe) if given == len(block.images) else recipe)
+    # Pairs that look alike are chosen once, for all passes.
+    looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
+    first, evidence = _evidence(context, first_pass.look(recipe) if looks else recipe)
     good = evidence.explained()
-    if given == len(block.images) and recipe.replaces and not suffices(evidence, good):
+    if looks and recipe.replaces and not suffices(evidence, good):
         first, evidence = _evidence(context, recipe)
         good = evidence.explained()
-    if not evidence.pairs or not recipe.replaces or suffices(evidence, good):
+    if not evidence.pairs or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
     else:
-        models = map_block(contents_of(first), block.poses, context.focal_sigmas, recipe.mapper)
-        solution = from_models(block, models, _poses_before(context, kept))
+        models, first, evidence = _mapped(context, recipe, first, evidence)
+        solution = from_models(block, models, _poses_before(context, kept), context.angles)
+        if not recipe.replaces:
+            solution = judged(from_given(evidence, good, correct=False), solution)
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
+    facts["similar"] = list(first.block.similar)
     terrain = solution.terrain
     if terrain is not None and kept and (old := _terrain(context)) is not None:
         terrain = continued(old, terrain, np.array([p.center_m for p in solution.poses.values()]))
     return replace(solution, terrain=terrain, facts=facts)
 
 
-def _evidence(context: Context, recipe: FirstPass) -> tuple[Context, Evidence]:
+def _mapped(
+    context: Context, recipe: FirstPass, first: Context, evidence: Evidence
+) -> tuple[tuple[Model, ...], Context, Evidence]:
+    """Models of a first pass, and it; of another one whose pairs do not lean on positions, where these do not fit."""
+    positions = context.block.poses
+    models = map_block(contents_of(first), positions, context.focal_sigmas, recipe.mapper)
+    if not positions or (models and not models[0].figures["contradiction"]):
+        return models, first, evidence
+    other, more = _evidence(context, recipe, by_position=False)
+    if {(p.image_id0, p.image_id1) for p in other.pairs} <= {(p.image_id0, p.image_id1) for p in first.pairs}:
+        return models, first, evidence
+    again = map_block(contents_of(other), positions, context.focal_sigmas, recipe.mapper)
+    better = _oriented(again) > _oriented(models)
+    return (again, other, more) if better else (models, first, evidence)
+
+
+def _oriented(models: Sequence[Model]) -> int:
+    """Images of the largest model."""
+    return max((len(model.rotations) for model in models), default=0)
+
+
+def _evidence(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, Evidence]:
     """The context of a first pass that has been run, and its verified matches."""
-    first = first_pass.prepared(context, recipe)
-    if first.pairs:
-        first_pass.run(first)
+    first = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
     limit = first.settings.block.max_size_px
     sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
@@ -142,7 +171,9 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         place = None if pose is None else (pose.center_m, pose.world_rotation, pose.sigma_position_m)
         taken = context.image_fingerprints[image.image_id], image.time
         images[image.image_id] = fingerprint(taken, image.camera_id, block.camera(image), place)
-    how = settings.orient, settings.block.max_size_px, settings.block.masks
+    how: list[Any] = [settings.orient, settings.block.max_size_px, settings.block.masks]
+    if isinstance(settings.pairs, Similar):
+        how.append(settings.pairs)
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
 
 
@@ -172,7 +203,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
         data = terrain_bytes(terrain.heights_m, *place, np.array(context.block.origin_m), context.block.crs)
         write_atomically(folder / "terrain.tif", lambda stream: stream.write(data))
         names.append("terrain.tif")
-    large = {key: solution.facts[key] for key in ("tied", "groups")}
+    large = {key: solution.facts[key] for key in ("tied", "similar", "groups")}
     facts = {key: value for key, value in solution.facts.items() if key not in large}
     files = {name: file_digest(folder / name) for name in names}
     write_json(path, {**head, "facts": facts, **large, "files": files})

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.lines import orientation_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.orienters import FirstPass
+from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.workspace import Workspace, file_digest, fingerprint, read_json, write_json, write_text
 
 log = logging.getLogger("aeromatch")
@@ -28,6 +31,7 @@ log = logging.getLogger("aeromatch")
 def prepare(
     settings: Settings,
     executor: Executor,
+    say: Callable[[str], None] = lambda _line: None,
     *,
     shard: Shard | None = None,
     overwrite: bool = False,
@@ -35,11 +39,17 @@ def prepare(
 ) -> tuple[Context, StageReport, StageReport]:
     """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
 
-    Returns the context and the reports of orient and pairs.
+    say: gets the lines of the summary as soon as each is known. Returns the context and the reports of orient and
+    pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
     workspace cannot be written.
     """
+    if isinstance(settings.pairs, Similar) and not isinstance(settings.orient, FirstPass):
+        raise ConfigError(
+            "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "
+            "orient, or pairs=exhaustive"
+        )
     report = StageReport("pairs")
     workspace = Workspace(Path(settings.workspace).absolute())
     _check_files(settings)
@@ -48,7 +58,13 @@ def prepare(
     else:
         workspace.create()
     found = read_block(settings, workspace, executor)
-    context, oriented = orient.run(_context(settings, workspace, executor, found, shard, overwrite), dry=dry)
+    before = summarise(found.block).given_lines()
+    for line in before:
+        say(line)
+    for warning in found.warnings:
+        log.warning("warning: %s", warning)
+    given = _context(settings, workspace, executor, found, shard, overwrite)
+    context, oriented = orient.run(given, found.ground_hint, dry=dry)
     context = _with_ground(context, found)
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
@@ -58,10 +74,12 @@ def prepare(
         pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
+    oriented_lines = orientation_lines(oriented.facts, found.block, context.block)
+    judged = oriented.facts.get("remarks", [])
     report.facts = {
-        "summary": [*summary.lines(), *_remarks(settings)],
+        "summary": [*before, *oriented_lines, *summary.lines(), *_remarks(settings)],
         "block": summary.figures(),
-        "warnings": [*found.warnings, *summary.warnings],
+        "warnings": [*found.warnings, *judged, *summary.warnings],
         "images": len(found.block.images),
         "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
@@ -72,7 +90,9 @@ def prepare(
         _write(context, pairs_csv)
         forget_absent(context)
         report.write(workspace)
-    for warning in report.facts["warnings"]:
+    for line in report.facts["summary"]:
+        say(line)
+    for warning in report.facts["warnings"][len(found.warnings) :]:
         log.warning("warning: %s", warning)
     if len(context.block.images) == 1:
         raise InputError(f"only one image can be used ({context.block.images[0].name}): one image makes no pair")
@@ -110,6 +130,7 @@ def _context(
         image_fingerprints=found.image_fingerprints,
         given=found.block,
         focal_sigmas=found.focal_sigmas,
+        angles=found.angles,
         shard=shard,
         overwrite=overwrite,
     )
@@ -136,7 +157,7 @@ def _fingerprint(context: Context) -> str:
     block: Block = context.block
     needs = frozenset({"camera", "pose", "ground"})
     images = [(i.image_id, i.name, i.time, context.geometry_fingerprint(i.image_id, needs)) for i in block.images]
-    return fingerprint(context.settings.pairs, images, block.tied)
+    return fingerprint(context.settings.pairs, images, block.tied, block.similar)
 
 
 def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,14 @@ from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.stages import adjust, check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
 from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
-
-# A focal length that differs more from the given one is said.
-_FOCAL_SAID = 0.02
 
 STAGES: Mapping[str, Callable[[Context], StageReport]] = {
     "enhance": enhance.run,
@@ -56,14 +53,18 @@ def execute(
     shard: str | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Result:
-    """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped."""
+    """Run one command. Raises AeromatchError where nothing can be done, KeyboardInterrupt where it was stopped.
+
+    say: gets the summary of the block before the long stages; without it the summary stands in the result's lines.
+    """
     part = Shard.parse(shard) if shard else None
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     try:
         with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
-            return _repairing(command, settings, executor, part, overwrite)
+            return _repairing(command, settings, executor, part, overwrite, _Said(say))
     except BaseException:
         # Workers are stopped in the middle of what they write.
         if command != "check":
@@ -71,12 +72,29 @@ def execute(
         raise
 
 
-def _repairing(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
+class _Said:
+    """Lines that were said already, each once; all of them wait for the result where nobody listens."""
+
+    def __init__(self, say: Callable[[str], None] | None) -> None:
+        self._say, self._said = say, set[str]()
+
+    def __call__(self, line: str) -> None:
+        if self._say is not None and line not in self._said:
+            self._say(line)
+            self._said.add(line)
+
+    def rest(self, lines: Iterable[str]) -> list[str]:
+        return [line for line in lines if line not in self._said]
+
+
+def _repairing(
+    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
+) -> Result:
     """Repeats the command until it meets no damaged file; each one is deleted, so that it is made again."""
     repaired: set[str] = set()
     while True:
         try:
-            return _attempt(command, settings, executor, part, overwrite)
+            return _attempt(command, settings, executor, part, overwrite, said)
         except BrokenFileError as error:
             if command == "check" or error.path in repaired:
                 raise
@@ -87,10 +105,13 @@ def _repairing(command: str, settings: Settings, executor: Executor, part: Shard
                 Path(error.path).unlink(missing_ok=True)
 
 
-def _attempt(command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool) -> Result:
-    context, *reports = pairs.prepare(settings, executor, shard=part, overwrite=overwrite, dry=command == "check")
+def _attempt(
+    command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
+) -> Result:
+    dry = command == "check"
+    context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":
-        return _check(context, reports[-1])
+        return _check(context, reports[-1], said)
     if command == "run":
         reports += _run_all(context)
     elif command == "match":
@@ -105,7 +126,7 @@ def _attempt(command: str, settings: Settings, executor: Executor, part: Shard |
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
             "(`aeromatch run` does everything)"
         )
-    return _result(command, context, reports)
+    return _result(command, context, reports, said)
 
 
 def _run_all(context: Context) -> list[StageReport]:
@@ -143,20 +164,11 @@ def _to_filter(context: Context) -> list[StageReport]:
     return [features, match.run(context), filter.run(context)]
 
 
-def _result(command: str, context: Context, reports: list[StageReport]) -> Result:
+def _result(command: str, context: Context, reports: list[StageReport], said: _Said) -> Result:
     failures = _all_failures(command, context, reports)
-    lines = list(reports[1].facts["summary"])
+    lines = said.rest(reports[1].facts["summary"])
     for stage in reports:
-        lines.append(
-            f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
-            f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
-        )
-        if stage.stage == "filter":
-            lines += _filter_lines(stage, part=context.shard is not None)
-        elif stage.stage == "orient":
-            lines += _orient_lines(stage, context)
-        else:
-            lines += _adjust_lines(stage) if stage.stage == "adjust" else _picture_lines(stage)
+        lines += stage_lines(stage, part=context.shard is not None)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
@@ -192,85 +204,9 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
     return tuple(sorted(failures))
 
 
-def _picture_lines(stage: StageReport) -> list[str]:
-    """Number and size of the views, and images that are not enhanced."""
-    facts, words = stage.facts, []
-    if "views_per_image" in facts:
-        views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
-        words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
-    if facts.get(enhance.SKIPPED):
-        words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
-    if "remark" in facts:
-        words.append(facts["remark"])
-    return [f"          {'; '.join(words)}"] if words else []
-
-
-def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
-    """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
-    facts = stage.facts
-    states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
-    lines = [f"          pairs: {states}; {facts['verified_matches']} verified matches"]
-    if part:
-        return lines
-    components = facts["components"]
-    if len(components) > 1:
-        shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")
-        lines.append(f"          {len(components)} unconnected groups of images, of sizes {shown}")
-    else:
-        lines.append("          all images are connected")
-    if facts["weakly_tied"]:
-        names = facts["weakly_tied"]
-        lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
-    return lines
-
-
-def _orient_lines(stage: StageReport, context: Context) -> list[str]:
-    """How the block was oriented, and what of that which was given is wrong."""
-    facts = stage.facts
-    if "method" not in facts:
-        return []
-    matched, explained = facts["images_matched"], facts["given_poses_explained"]
-    if facts["method"] == "given":
-        words = [f"given poses explain the matches of {explained} of {matched} images"]
-    else:
-        sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
-        words = [f"given poses explain {explained} of {matched} images; oriented from the pictures: {sizes}"]
-        for camera_id, camera in sorted(context.block.cameras.items()):
-            before = focal_px(context.given.cameras[camera_id])
-            if abs(focal_px(camera) / before - 1.0) > _FOCAL_SAID:
-                words.append(f"focal length of {camera_id}: {focal_px(camera):.0f} px instead of {before:.0f} px")
-    for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
-        if facts[what]:
-            named = _listed([f"{i} ({value:.0f} {unit})" for i, value in facts[what].items()])
-            words.append(f"{what.replace('_', ' ')} given and corrected: {named}")
-    if facts["outside"]:
-        words.append(f"not oriented: {_listed(facts['outside'])}")
-    return [f"          {line}" for line in words]
-
-
-def _adjust_lines(stage: StageReport) -> list[str]:
-    """Figures of the bundle adjustment, and images that it could not tie."""
-    facts = stage.facts
-    if not facts.get("points"):
-        return []
-    words = [
-        f"{facts['images']} of {stage.items} images oriented, {facts['points']} points in {facts['track_length']:.1f} "
-        f"images each, reprojection error {facts['reprojection_error_px']:.2f} px"
-    ]
-    if len(facts["groups"]) > 1:
-        sizes = ", ".join(str(group["images"]) for group in facts["groups"])
-        words.append(f"{len(facts['groups'])} groups of images that nothing ties to each other: {sizes}")
-    words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
-    return [f"          {line}" for line in words]
-
-
-def _listed(names: list[str], shown: int = 10) -> str:
-    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
-
-
-def _check(context: Context, first: StageReport) -> Result:
+def _check(context: Context, first: StageReport, said: _Said) -> Result:
     found = check.run(context, time.perf_counter() - first.started)
-    lines = (*first.facts["summary"], *found.lines)
+    lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
     return Result((*lines, *(f"failed: {item}: {reason}" for _, item, reason in failures)), facts, failures)

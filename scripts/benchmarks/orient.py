@@ -11,10 +11,15 @@ every k-th image (--thin):
   longer     the reference camera's focal length x 2
   shorter    the same x 0.5
   outliers   every tenth position off by 100 m, no attitudes
+  columns    omega and phi exchanged
+  mirrored   x and y exchanged, no attitudes
+  shuffled   every line is that of another image
+  ground     a ground height that is wrong by the flying height
 
 Attitude error: median and maximum over the oriented images, after one common turn. Focal: against the reference
 camera. Within 3 px: verified matches, by symmetric epipolar distance from the reference poses, and as a share of those
-of the case `reference`. Named: images whose attitude was made wrong and is named so, and those named without cause.
+of the case `reference`. Named: images whose attitude was made wrong and is named so, or all where a fault of the whole
+list is named, and those named without cause. Said: what the summary says of the fault.
 """
 
 from __future__ import annotations
@@ -40,9 +45,14 @@ from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.tables import Row, markdown
 
-CASES = ("reference", "noise", "nothing", "third", "yaw", "longer", "shorter", "outliers")
+CASES = ("reference", "noise", "nothing", "third", "yaw", "longer", "shorter", "outliers", "columns", "mirrored",
+         "shuffled", "ground")  # fmt: skip
+POSITIONS_ONLY = ("noise", "outliers", "mirrored")
 NOISE_M, OUTLIER_M = 5.0, 100.0
 ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+
+# Characters of a remark in the table.
+_SAID = 80
 
 
 def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> tuple[list[str], set[str]]:
@@ -51,7 +61,7 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
     with (reference / "poses.csv").open(encoding="utf-8", newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["image"] in set(names)]
     camera = json.loads((reference / "block.json").read_text(encoding="utf-8"))
-    camera.pop("ground_z", None)  # the terrain is to be found
+    ground_z = camera.pop("ground_z", None)  # the terrain is to be found
     rng = np.random.default_rng(len(names))
     wrong = _worsen(case, rows, rng)
     for lens in camera["cameras"].values():
@@ -60,22 +70,35 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
         lens["params"][:count] = [value * factor for value in lens["params"][:count]]
     (folder / "block.json").write_text(json.dumps(camera), encoding="utf-8")
     poses = folder / "poses.csv"
-    keep = [key for key in rows[0] if case not in ("noise", "outliers") or key not in ANGLES]
+    keep = [key for key in rows[0] if case not in POSITIONS_ONLY or key not in ANGLES]
     with poses.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, keep, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)
     crs = [] if camera["crs"] == "local" else ["--crs", camera["crs"]]
+    if case == "ground":
+        flying_m = float(np.median([float(row["z"]) for row in rows])) - ground_z["p50"]
+        crs += ["--ground", repr(ground_z["p50"] - flying_m)]
     if case == "nothing":
         return ["--poses", "none"], wrong
-    cameras = ["--cameras", "exif" if case in ("noise", "outliers") else str(folder / "block.json")]
+    cameras = ["--cameras", "exif" if case in POSITIONS_ONLY else str(folder / "block.json")]
     return ["--poses", str(poses), *cameras, *(crs or ["--crs", "local"])], wrong
 
 
 def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator) -> set[str]:
     """Change the rows of a pose list in place; names of images whose attitude is wrong now."""
     wrong = set()
+    if case == "shuffled":
+        order = rng.permutation(len(rows))
+        lines = [{k: v for k, v in rows[n].items() if k != "image"} for n in order]
+        for row, line in zip(rows, lines, strict=True):
+            row.update(line)
     for number, row in enumerate(rows):
+        if case == "mirrored":
+            row["x"], row["y"] = row["y"], row["x"]
+        if case == "columns":
+            row[ANGLES[0]], row[ANGLES[1]] = row[ANGLES[1]], row[ANGLES[0]]
+            wrong.add(str(row["image"]))
         off_m = np.zeros(3)
         if case in ("noise", "outliers"):
             off_m = NOISE_M * rng.normal(size=3) if case == "noise" else off_m
@@ -116,9 +139,11 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     errors = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
     lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
     focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
-    record = work / "orientation" / "orientation.json"
+    record = work / "reports" / "orient.json"
     facts = read_json(record)["facts"] if record.is_file() else {}
-    named = {name_of[i] for i in facts.get("wrong_attitudes", {})}
+    remarks = facts.get("remarks", [])
+    whole = any("angles" in remark for remark in remarks)
+    named = wrong if whole else {name_of[i] for i in facts.get("wrong_attitudes", {})}
     return {
         "oriented": len(common),
         "attitude_deg": float(np.median(errors)) if len(errors) else float("nan"),
@@ -128,6 +153,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "named": len(named & wrong),
         "wrong": len(wrong),
         "named_without_cause": len(named - wrong),
+        "said": remarks,
     }
 
 
@@ -180,12 +206,26 @@ def rows_of(args: Any) -> Iterator[Row]:
 
 def table_of(rows: Sequence[Row]) -> str:
     """One line per run."""
-    header = ("block", "case", "oriented", "attitude error", "focal", "named", "pairs", "within 3 px", "share", "s")
+    header = (
+        "block",
+        "case",
+        "oriented",
+        "attitude error",
+        "focal",
+        "named",
+        "pairs",
+        "within 3 px",
+        "share",
+        "s",
+        "said",
+    )
     lines = []
     for row in rows:
         block = row["block"] if row["every"] == 1 else f"{row['block']} / {row['every']}"
         if "correct" not in row:
-            lines.append((block, row["case"], f"exit {row['exit']}", "", "", "", "", "", "", f"{row['seconds']:.0f}"))
+            lines.append(
+                (block, row["case"], f"exit {row['exit']}", "", "", "", "", "", "", f"{row['seconds']:.0f}", "")
+            )
             continue
         named = f"{row['named']} of {row['wrong']}" + (f" + {n}" if (n := row["named_without_cause"]) else "")
         lines.append(
@@ -200,6 +240,7 @@ def table_of(rows: Sequence[Row]) -> str:
                 str(row["correct"]),
                 f"{100 * row['share']:.0f} %" if "share" in row else "",
                 f"{row['seconds']:.0f} ({row['orient_s']:.0f})",
+                "; ".join(remark[:_SAID] for remark in row["said"]),
             )
         )
     return markdown(header, lines)

@@ -14,10 +14,12 @@ from aeromatch_cli.strategies.pairings.exhaustive import Exhaustive
 from aeromatch_cli.strategies.pairings.file import PairFile
 from aeromatch_cli.strategies.pairings.overlap import Overlap
 from aeromatch_cli.strategies.pairings.sequential import Sequential
+from aeromatch_cli.strategies.pairings.similar import Similar
 
 PAIRINGS: Mapping[str, type[Strategy]] = {
     "overlap": Overlap,
     "exhaustive": Exhaustive,
     "sequential": Sequential,
     "file": PairFile,
+    "similar": Similar,
 }

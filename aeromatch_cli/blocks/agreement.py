@@ -1,0 +1,105 @@
+"""Whether a pose list and the GPS of the images tell of the same places.
+
+The GPS of a camera is good to some metres, which is enough to find columns that are exchanged, another zone, lines of
+other images and lists of other flights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from aeromatch_cli.blocks.crs import AUTO, LOCAL, checked_crs, grid_from_geographic, utm_crs
+from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.observations import Observation
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+
+# A camera's GPS without correction, and a pose list in another datum, are off by no more.
+_SAME_M = 100.0
+# Fewer positions tell of no list.
+_MIN_IMAGES = 3
+# Lines are those of other images where they are off by this share of the block's extent, and lie nearer to some other
+# image by this factor.
+_MIXED_EXTENT, _MIXED_SHARE = 0.2, 0.25
+_METRES_PER_DEG = 111_320.0
+
+
+def agreed(
+    observations: Mapping[str, Observation], facts: Mapping[str, ExifFacts], crs: str, source: str
+) -> tuple[dict[str, Observation], list[str]]:
+    """The observations of a pose list, with exchanged coordinates put right, and remarks.
+
+    observations, facts: by image name. crs: what x and y count in, "auto" or "local" where nobody said. source: the
+    list's name, for messages.
+    """
+    found = dict(observations)
+    names = [name for name in found if facts[name].latitude_deg is not None]
+    if len(names) < _MIN_IMAGES:
+        return found, []
+    gps = np.array([(facts[name].latitude_deg, facts[name].longitude_deg) for name in names], dtype=np.float64)
+    listed = np.array([found[name].position[:2] for name in names])
+    if len({found[name].position_kind for name in names}) > 1:
+        return found, []
+    grid = found[names[0]].position_kind == "grid"
+    if grid and crs in (AUTO, LOCAL, ""):
+        return found, _zone_of_local(listed, gps, source)
+    places = _grid_places(crs, gps) if grid else gps
+    to_metres = np.ones(2) if grid else _METRES_PER_DEG * np.array([1.0, np.cos(np.deg2rad(np.median(gps[:, 0])))])
+    if _of_other_images(listed * to_metres, places * to_metres):
+        return found, [f"{source}: the lines look like those of other images, as the GPS of the images shows"]
+    if _median_m(listed, places, to_metres) <= _SAME_M:
+        return found, []
+    if _median_m(listed[:, ::-1], places, to_metres) <= _SAME_M:
+        for name, observation in observations.items():
+            first, second, height = observation.position
+            found[name] = replace(observation, position=(second, first, height))
+        both = "x and y" if grid else "lat and lon"
+        return found, [f"{source}: {both} are exchanged, as the GPS of the images shows: they were put right"]
+    away_km = _median_m(listed, places, to_metres) / 1000.0
+    remark = f"{source} and the GPS of {len(names)} images are {away_km:,.1f} km apart"
+    zone = _fitting_zone(listed, gps) if grid else None
+    if zone:
+        return found, [f"{remark}: x and y fit {zone}; give --crs {zone}"]
+    return found, [f"{remark}: is it the list of another flight, or of another CRS?"]
+
+
+def _median_m(listed: FloatArray, places: FloatArray, to_metres: FloatArray) -> float:
+    return float(np.median(np.linalg.norm((listed - places) * to_metres, axis=1)))
+
+
+def _grid_places(crs: str, gps: FloatArray) -> FloatArray:
+    try:
+        return grid_from_geographic(checked_crs(crs), gps[:, 0], gps[:, 1])
+    except ConfigError:
+        return np.full(gps.shape, np.nan)  # an unknown CRS is refused later, in its own words
+
+
+def _fitting_zone(listed: FloatArray, gps: FloatArray) -> str | None:
+    """The UTM zone in which x and y are where the GPS is, None where neither the own nor a neighbouring one is."""
+    own = utm_crs(gps[:, 0], gps[:, 1])
+    for step in (0, -1, 1):
+        code = f"{own[:-2]}{(int(own[-2:]) + step - 1) % 60 + 1:02d}"
+        if _median_m(listed, grid_from_geographic(code, gps[:, 0], gps[:, 1]), np.ones(2)) <= _SAME_M:
+            return code
+    return None
+
+
+def _zone_of_local(listed: FloatArray, gps: FloatArray, source: str) -> list[str]:
+    zone = _fitting_zone(listed, gps)
+    return [f"{source}: by the GPS of the images, x and y are {zone}: give --crs {zone}"] if zone else []
+
+
+def _of_other_images(listed_m: FloatArray, places_m: FloatArray) -> bool:
+    """Whether the lines fit the places of other images clearly better than those of their own."""
+    from scipy.spatial import cKDTree
+
+    if not np.isfinite(places_m).all():
+        return False
+    moved_m = listed_m + np.median(places_m, axis=0) - np.median(listed_m, axis=0)
+    own_m = float(np.median(np.linalg.norm(moved_m - places_m, axis=1)))
+    nearest_m = float(np.median(cKDTree(places_m).query(moved_m)[0]))
+    extent_m = float(np.linalg.norm(np.ptp(places_m, axis=0)))
+    return own_m > _MIXED_EXTENT * extent_m and nearest_m < _MIXED_SHARE * own_m

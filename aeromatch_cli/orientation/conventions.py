@@ -1,0 +1,163 @@
+"""Which other reading of the given angles agrees with the attitudes that the pictures show.
+
+Angles that are wrong as a whole are seldom random: columns are exchanged, a sign or a zero is another, degrees are
+gon. Each such reading is tried on all images at once; the first that fits nearly as well as the best is what happened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.geometry.rotations import rotation_z
+
+Reading = Callable[[Angles], FloatArray]
+
+# Attitudes agree where the median angle between them is no larger; the frame of a short block is no more exact.
+_AGREE_DEG = 5.0
+# Another reading must be better by this factor than the angles as they were read.
+_BETTER = 0.4
+# Among readings that fit, the first whose median is at most this factor and these degrees above the best.
+_NEARLY, _NEARLY_DEG = 1.3, 0.2
+# A turn of all yaws that is smaller is no fault.
+_LEAST_TURN_DEG = 1.0
+# A turn this near to the meridian convergence is that of grid against true north.
+_CONVERGENCE_DEG = 0.5
+_SMALL_TURN_DEG = 10.0
+_MIN_IMAGES = 5
+# More images say no more of a convention.
+_MOST_IMAGES = 500
+_GON_DEG = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Recognised:
+    """words: what is wrong and what to do. rotation: the attitude that given angles stand for. error_deg: median."""
+
+    words: str
+    rotation: Reading
+    error_deg: float
+
+
+def recognised(given: Mapping[str, Angles], found: Mapping[str, FloatArray]) -> Recognised | None:
+    """The reading of the given angles that explains the attitudes found; None where they agree as they are, or none
+    does.
+
+    found: image_id -> (3, 3) cam_from_world, in the world frame by positions.
+    """
+    ids = sorted(given.keys() & found.keys())
+    if len(ids) < _MIN_IMAGES:
+        return None
+    ids = ids[:: 1 + len(ids) // _MOST_IMAGES]
+    angles = [given[i] for i in ids]
+    true = np.array([found[i] for i in ids])
+    as_read = _median_deg(np.array([one.rotation for one in angles]), true)
+    limit_deg = min(_AGREE_DEG, _BETTER * as_read)
+    fits = [fit for fit in _fits(angles, true) if fit.error_deg <= limit_deg]
+    if not fits:
+        return None
+    near_deg = _NEARLY * min(fit.error_deg for fit in fits) + _NEARLY_DEG
+    return next(fit for fit in fits if fit.error_deg <= near_deg)
+
+
+def _fits(angles: list[Angles], true: FloatArray) -> Iterator[Recognised]:
+    """Every reading and how well it fits, single faults before two at once."""
+    readings = [("", _as_read), *_readings(angles)]
+    for words, reading in readings[1:]:
+        yield Recognised(words, reading, _median_deg(np.array([reading(one) for one in angles]), true))
+    for words, reading in readings:
+        rotations = np.array([reading(one) for one in angles])
+        turn_deg = _heading_deg(true.transpose(0, 2, 1) @ rotations)
+        if abs(turn_deg) > _LEAST_TURN_DEG:
+            error_deg = _median_deg(rotations @ rotation_z(turn_deg).T, true)
+            said = _turn_words("yaws" if angles[0].kind == "yaw_pitch_roll" else "headings", turn_deg, angles)
+            yield Recognised(" and ".join(filter(None, (words, said))), _turned(reading, turn_deg), error_deg)
+        if not words:
+            turn_deg = _heading_deg(true @ rotations.transpose(0, 2, 1))
+            error_deg = _median_deg(rotation_z(turn_deg) @ rotations, true)
+            said = _turn_words("kappas", turn_deg, angles) if angles[0].kind == "omega_phi_kappa" else (
+                f"the images are turned by {_rounded(turn_deg)} degrees in the camera")  # fmt: skip
+            if abs(turn_deg) > _LEAST_TURN_DEG:
+                yield Recognised(said, partial(_turned_in_camera, turn_deg), error_deg)
+
+
+def _as_read(angles: Angles) -> FloatArray:
+    return angles.rotation
+
+
+def _readings(angles: list[Angles]) -> Iterator[tuple[str, Reading]]:
+    """What may be wrong, in words, and the right reading; the most usual faults first."""
+    kind = angles[0].kind
+    if kind == "yaw_pitch_roll":
+        other = "nadir" if angles[0].forward else "gimbal"
+        zero = "straight down" if angles[0].forward else "the horizon"
+        yield (
+            f"pitch counts from {zero}: give --set block.angles={other}",
+            lambda one: replace(one, forward=not one.forward).rotation,
+        )
+        yield "yaw counts counter-clockwise: change its sign", lambda one: _changed(one, signs=(-1, 1, 1))
+        yield "pitch has the other sign", lambda one: _changed(one, signs=(1, -1, 1))
+        yield "roll has the other sign", lambda one: _changed(one, signs=(1, 1, -1))
+        yield "pitch and roll are exchanged", lambda one: _changed(one, order=(0, 2, 1))
+    elif kind == "omega_phi_kappa":
+        yield "omega and phi are exchanged", lambda one: _changed(one, order=(1, 0, 2))
+        yield "kappa counts clockwise: change its sign", lambda one: _changed(one, signs=(1, 1, -1))
+        yield "omega and phi have the other sign", lambda one: _changed(one, signs=(-1, -1, 1))
+        yield "omega has the other sign", lambda one: _changed(one, signs=(-1, 1, 1))
+        yield "phi has the other sign", lambda one: _changed(one, signs=(1, -1, 1))
+    else:
+        yield "the quaternions are camera to world, not world to camera", lambda one: one.rotation.T
+        yield "the quaternions are x, y, z, w, not w, x, y, z", lambda one: _changed(one, order=(3, 0, 1, 2))
+    if kind != "quaternion":
+        yield "the angles are gon, not degrees", lambda one: _changed(one, signs=(_GON_DEG,) * 3)
+        yield "the angles are radians, not degrees", lambda one: _changed(one, signs=(180.0 / np.pi,) * 3)
+
+
+def _changed(
+    angles: Angles, signs: tuple[float, ...] | None = None, order: tuple[int, ...] | None = None
+) -> FloatArray:
+    values = angles.values if order is None else tuple(angles.values[k] for k in order)
+    if signs is not None:
+        values = tuple(sign * value for sign, value in zip(signs, values, strict=True))
+    return replace(angles, values=values).rotation
+
+
+def _turned_in_camera(quarter_deg: float, angles: Angles) -> FloatArray:
+    return rotation_z(quarter_deg) @ angles.rotation
+
+
+def _turned(reading: Reading, turn_deg: float) -> Reading:
+    turn = rotation_z(turn_deg).T
+    return lambda one: reading(one) @ turn
+
+
+def _turn_words(name: str, turn_deg: float, angles: list[Angles]) -> str:
+    said = f"all {name} are off by {_rounded(abs(turn_deg))} degrees"
+    convergence = float(np.median([abs(one.convergence_deg) for one in angles]))
+    if convergence > _LEAST_TURN_DEG and abs(abs(turn_deg) - convergence) < _CONVERGENCE_DEG:
+        return f"{said}, which is the meridian convergence: they count from grid north, not from true north"
+    return said
+
+
+def _rounded(turn_deg: float) -> str:
+    return f"{turn_deg:.1f}" if abs(turn_deg) < _SMALL_TURN_DEG else f"{turn_deg:.0f}"
+
+
+def _heading_deg(turns: FloatArray) -> float:
+    """Angle about z, degrees, that most turns (N, 3, 3) have."""
+    headings = np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])
+    # The median on the circle: the heading that lies nearest to most others.
+    away = np.abs((headings[:, None] - headings[None] + np.pi) % (2.0 * np.pi) - np.pi)
+    middle = headings[int(np.argmin(away.sum(axis=1)))]
+    near = (headings - middle + np.pi) % (2.0 * np.pi) - np.pi
+    return float(np.rad2deg(middle + np.median(near)))
+
+
+def _median_deg(rotations: FloatArray, true: FloatArray) -> float:
+    cosines = (np.einsum("nij,nij->n", rotations, true) - 1.0) / 2.0
+    return float(np.median(np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))))

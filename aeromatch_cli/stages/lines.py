@@ -1,0 +1,100 @@
+"""What stages have found, in lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from aeromatch_cli.data import Block
+from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.stages import enhance, filter  # noqa: A004
+from aeromatch_cli.stages.stage_report import StageReport
+
+# A focal length that differs more from the given one is said.
+_FOCAL_SAID = 0.02
+
+
+def stage_lines(stage: StageReport, *, part: bool) -> list[str]:
+    """Counts and time of a stage, and what it found. part: of a shard."""
+    counts = (
+        f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
+        f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
+    )
+    if stage.stage == "filter":
+        return [counts, *_filter_lines(stage, part=part)]
+    return [counts, *(_adjust_lines(stage) if stage.stage == "adjust" else _picture_lines(stage))]
+
+
+def _picture_lines(stage: StageReport) -> list[str]:
+    """Number and size of the views, and images that are not enhanced."""
+    facts, words = stage.facts, []
+    if "views_per_image" in facts:
+        views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
+        words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
+    if facts.get(enhance.SKIPPED):
+        words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
+    if "remark" in facts:
+        words.append(facts["remark"])
+    return [f"          {'; '.join(words)}"] if words else []
+
+
+def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
+    """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
+    facts = stage.facts
+    states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
+    lines = [f"          pairs: {states}; {facts['verified_matches']} verified matches"]
+    if part:
+        return lines
+    components = facts["components"]
+    if len(components) > 1:
+        shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")
+        lines.append(f"          {len(components)} unconnected groups of images, of sizes {shown}")
+    else:
+        lines.append("          all images are connected")
+    if facts["weakly_tied"]:
+        names = facts["weakly_tied"]
+        lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
+    return lines
+
+
+def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> list[str]:
+    """How the block was oriented, and what of that which was given is wrong. facts: of the stage orient."""
+    if "method" not in facts:
+        return []
+    matched, explained = facts["images_matched"], facts["given_poses_explained"]
+    if facts["method"] == "given":
+        words = [f"given poses explain the matches of {explained} of {matched} images"]
+    else:
+        sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
+        words = [f"given poses explain {explained} of {matched} images; oriented from the pictures: {sizes}"]
+        for camera_id, camera in sorted(block.cameras.items()):
+            before = focal_px(given.cameras[camera_id])
+            if abs(focal_px(camera) / before - 1.0) > _FOCAL_SAID:
+                words.append(f"focal length of {camera_id}: {focal_px(camera):.0f} px instead of {before:.0f} px")
+    for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
+        if facts[what]:
+            named = _listed([f"{i} ({value:.0f} {unit})" for i, value in facts[what].items()])
+            words.append(f"{what.replace('_', ' ')} given and corrected: {named}")
+    if facts["outside"]:
+        words.append(f"not oriented: {_listed(facts['outside'])}")
+    return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
+
+
+def _adjust_lines(stage: StageReport) -> list[str]:
+    """Figures of the bundle adjustment, and images that it could not tie."""
+    facts = stage.facts
+    if not facts.get("points"):
+        return []
+    words = [
+        f"{facts['images']} of {stage.items} images oriented, {facts['points']} points in {facts['track_length']:.1f} "
+        f"images each, reprojection error {facts['reprojection_error_px']:.2f} px"
+    ]
+    if len(facts["groups"]) > 1:
+        sizes = ", ".join(str(group["images"]) for group in facts["groups"])
+        words.append(f"{len(facts['groups'])} groups of images that nothing ties to each other: {sizes}")
+    words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
+    return [f"          {line}" for line in words]
+
+
+def _listed(names: list[str], shown: int = 10) -> str:
+    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
