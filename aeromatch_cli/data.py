@@ -78,6 +78,19 @@ class AdjustedBlock:
     tracks: Mapping[str, IntArray]
 
 
+@dataclass(frozen=True, eq=False)
+class ControlPoint:
+    """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in transformations.
+
+    pixels: image_id -> (2,) stored pixel.
+    """
+
+    name: str
+    position_m: FloatArray
+    check: bool
+    pixels: Mapping[str, FloatArray]
+
+
 @dataclass(frozen=True)
 class Image:
     """One stored raster of the block.

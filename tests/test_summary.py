@@ -58,7 +58,7 @@ def test_clean_block_has_figures_and_no_warning() -> None:
     # Best neighbours: 0.8, 0.8, 0.6, unknown, 0.5, 0.5.
     assert summary.best_overlap == pytest.approx((0.8 + 0.8 + 0.6 + 0.5 + 0.5) / 5)
     assert summary.pairs_by_reason == (("overlap", 3), ("position", 1))
-    text = "\n".join(summary.lines())
+    text = "\n".join([*summary.given_lines(), *summary.lines()])
     for part in ("6, 6 with position", "EPSG:32617", "given: 120 m", "102.5 m (100.0 to 105.0)", "100.0 m east-west"):
         assert part in text
 
@@ -147,7 +147,7 @@ def test_block_without_any_pose_is_summed_up() -> None:
     summary = summarise(bare, [Pair("img0", "img1", float("nan"), float("nan"), "name")])
     assert (summary.positioned, summary.oriented) == (0, 0)
     assert np.isnan(summary.flying_height_m).all()
-    text = "\n".join(summary.lines())
+    text = "\n".join([*summary.given_lines(), *summary.lines()])
     assert "without position 6: paired by name and time" in text
     assert "nan" not in text
 

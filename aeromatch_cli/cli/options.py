@@ -34,6 +34,12 @@ Ground = Annotated[
 Masks = Annotated[
     Path | None, typer.Option("--masks", metavar="DIR|FILE", help="Masks in COLMAP naming, 0 = ignore; or one mask.")
 ]
+ControlFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--gcp", metavar="FILE", help="Ground control points (ODM's gcp_list.txt) to compare the result with."
+    ),
+]
 WorkspaceDir = Annotated[
     Path | None,
     typer.Option("--workspace", metavar="DIR", help="Folder for every result (default aeromatch-work)."),

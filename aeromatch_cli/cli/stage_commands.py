@@ -11,6 +11,7 @@ import typer
 from aeromatch_cli.cli.options import (
     Cameras,
     Config,
+    ControlFile,
     Crs,
     ExecutorName,
     Ground,
@@ -101,6 +102,7 @@ def stage_command(name: str) -> Callable[..., None]:
         crs: Crs = None,
         ground: Ground = None,
         masks: Masks = None,
+        gcp: ControlFile = None,
         workspace: WorkspaceDir = None,
         set_: Set = None,
         max_size: MaxSize = None,
@@ -114,7 +116,7 @@ def stage_command(name: str) -> Callable[..., None]:
         quiet: Quiet = False,
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
-        block |= {"masks": masks, "max_size_px": max_size}
+        block |= {"masks": masks, "gcp": gcp, "max_size_px": max_size}
         run = {"jobs": jobs, "executor": executor, "keep_images": keep_images or None}
 
         def call() -> Result:

@@ -70,6 +70,11 @@ class BlockSettings(_Section):
         description="Folder of masks in COLMAP's naming (a/1.jpg.png masks a/1.jpg; 0 = ignore), or one mask for all "
         "images.",
     )
+    gcp: str = Field(
+        "",
+        description="Ground control points in the layout of ODM's gcp_list.txt; the adjusted block is compared with "
+        "them.",
+    )
     angles: Literal["auto", "gimbal", "nadir"] = Field(
         "auto",
         description="Convention of yaw, pitch, roll: at zero the camera looks forward (gimbal, DJI) or down (nadir, "

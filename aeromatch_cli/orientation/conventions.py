@@ -29,6 +29,8 @@ _LEAST_TURN_DEG = 1.0
 # A turn this near to the meridian convergence is that of grid against true north.
 _CONVERGENCE_DEG = 0.5
 _SMALL_TURN_DEG = 10.0
+# A turn this near to one of 90 or 180 degrees is that: the frame of the pictures is no more exact.
+_NEAR_QUARTER_DEG = 3.0
 _MIN_IMAGES = 5
 # More images say no more of a convention.
 _MOST_IMAGES = 500
@@ -155,7 +157,9 @@ def _heading_deg(turns: FloatArray) -> float:
     away = np.abs((headings[:, None] - headings[None] + np.pi) % (2.0 * np.pi) - np.pi)
     middle = headings[int(np.argmin(away.sum(axis=1)))]
     near = (headings - middle + np.pi) % (2.0 * np.pi) - np.pi
-    return float(np.rad2deg(middle + np.median(near)))
+    turn_deg = float(np.rad2deg(middle + np.median(near)))
+    quarter_deg = 90.0 * round(turn_deg / 90.0)
+    return quarter_deg if quarter_deg and abs(turn_deg - quarter_deg) < _NEAR_QUARTER_DEG else turn_deg
 
 
 def _median_deg(rotations: FloatArray, true: FloatArray) -> float:

@@ -22,6 +22,7 @@ from aeromatch_cli.orientation.judgement import (
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.placing import similarity
 from aeromatch_cli.orientation.resection import resected
+from aeromatch_cli.orientation.strips import predicted
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
 _MOST = 0.6
@@ -140,9 +141,11 @@ def from_models(
     for image_id, one in angles.items():
         if convention is not None and image_id in given:
             given[image_id] = replace(given[image_id], world_rotation=convention.rotation(one))
+    by_strip = {} if level or convention else predicted(block, found)
     for image_id in block.poses.keys() - found.keys():
         # An attitude that nothing confirms in a block where others were wrong is not relied on.
-        poses[image_id] = given[image_id] if convention else replace(poses[image_id], world_rotation=None)
+        unknown = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
+        poses[image_id] = given[image_id] if convention else unknown
         if level:
             del poses[image_id]  # its position is in another frame than the others'
     poses |= found

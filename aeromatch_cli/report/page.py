@@ -87,6 +87,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
         summary=input_facts.get("summary", []),
+        adjusted=_adjusted_facts(_facts(context, "adjust")),
+        residuals=(_facts(context, "adjust").get("control") or {}).get("residuals", {}),
         block=_block_facts(context),
         map=_map(context, images, pairs, wrong),
         histograms=[
@@ -206,6 +208,33 @@ def _block_facts(context: Context) -> list[tuple[str, str]]:
         ("Cameras", "\n".join(cameras[:10] + more)),
         ("Images in", context.settings.block.images),
     ]
+
+
+def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Figures of the bundle adjustment, and of the control points."""
+    if not facts.get("points"):
+        return []
+    found = [
+        ("Oriented images", f"{facts['images']:,}"),
+        ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
+        ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
+    ]
+    if facts["sigma_position_m"] is not None:
+        sigmas = f"{facts['sigma_position_m']:.3g} m, {facts['sigma_angle_deg']:.2g}°"
+        found.append(("Standard deviations of the poses", f"{sigmas}, median"))
+    if facts["outside"]:
+        found.append(("Not oriented", "\n".join(f"{i}: {reason}" for i, reason in facts["outside"].items())))
+    control = facts["control"]
+    if control and control["control_rmse_m"]:
+        found.append(("Control points", f"{control['control']}, RMSE {_metres(control['control_rmse_m'])}"))
+        if control["check_rmse_m"]:
+            kind = "Check points" if control["check"] else "Control points, each left out once"
+            found.append((kind, f"{control['check'] or control['control']}, RMSE {_metres(control['check_rmse_m'])}"))
+    return found
+
+
+def _metres(errors_m: Sequence[float]) -> str:
+    return " / ".join(f"{error:.3f}" for error in errors_m) + " m (x / y / z)"
 
 
 def _settings_text(context: Context) -> str:

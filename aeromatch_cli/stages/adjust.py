@@ -16,6 +16,7 @@ from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
@@ -34,7 +35,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 1
+VERSION = 2
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 
@@ -88,7 +89,9 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
-    return fingerprint(versions, context.settings.orient, held, state, sorted(context.focal_sigmas.items()), pairs)
+    control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
+    focal = sorted(context.focal_sigmas.items())
+    return fingerprint(versions, context.settings.orient, held, state, focal, pairs, control)
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:
@@ -132,7 +135,15 @@ def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[
         "sigma_angle_deg": float(np.nanmedian(sigmas[:, 1])) if known else None,
         "groups": [dict(one) for one in figures],
         "outside": _reasons(context, adjusted),
+        "control": _control(context, adjusted),
     }
+
+
+def _control(context: Context, adjusted: AdjustedBlock) -> dict[str, Any] | None:
+    if not context.control:
+        return None
+    cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
+    return control_figures(adjusted, cameras, context.control)
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:

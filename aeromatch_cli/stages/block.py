@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Ground, Image
+from aeromatch_cli.data import Block, ControlPoint, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.angles import Angles
@@ -45,6 +46,7 @@ class BlockRead:
     image_fingerprints: Mapping[str, str]
     focal_sigmas: Mapping[str, float]
     angles: Mapping[str, Angles]
+    control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
     gsd_before_m: float | None
@@ -59,6 +61,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints = _read_inputs(settings, workspace, executor, before)
     ground, source, remarks = given_ground(settings, inputs)
+    control, absent = read_control(settings.block.gcp, inputs.images, inputs.crs, inputs.origin_m)
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,
@@ -74,7 +77,8 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         image_fingerprints=prints,
         focal_sigmas=inputs.focal_sigmas,
         angles=inputs.angles,
-        warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks),
+        control=control,
+        warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
         ground_hint=None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints
@@ -26,7 +26,7 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it. angles: image_id -> attitude as it was given.
+    share of it. angles: image_id -> attitude as it was given. control: surveyed points.
     """
 
     settings: Settings
@@ -38,6 +38,7 @@ class Context:
     given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
+    control: tuple[ControlPoint, ...] = ()
     # Stands before the names of stages in what is shown of progress.
     part: str = ""
     shard: Shard | None = None

@@ -92,8 +92,26 @@ def _adjust_lines(stage: StageReport) -> list[str]:
     if len(facts["groups"]) > 1:
         sizes = ", ".join(str(group["images"]) for group in facts["groups"])
         words.append(f"{len(facts['groups'])} groups of images that nothing ties to each other: {sizes}")
+    words += _control_words(facts["control"])
     words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
     return [f"          {line}" for line in words]
+
+
+def _control_words(control: Mapping[str, Any] | None) -> list[str]:
+    """Errors at surveyed points."""
+    if control is None:
+        return []
+    counts = f"control: {control['control']} control points, {control['check']} check points"
+    if control["control_rmse_m"] is None:
+        return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare"]
+
+    def shown(errors_m: list[float]) -> str:
+        return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
+
+    words = [f"{counts}; RMSE of the fit {shown(control['control_rmse_m'])} m"]
+    if control["check_rmse_m"] is not None:
+        words.append(f"RMSE at {control['check_kind']}: {shown(control['check_rmse_m'])} m")
+    return words
 
 
 def _listed(names: list[str], shown: int = 10) -> str:

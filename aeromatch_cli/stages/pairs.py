@@ -131,6 +131,7 @@ def _context(
         given=found.block,
         focal_sigmas=found.focal_sigmas,
         angles=found.angles,
+        control=found.control,
         shard=shard,
         overwrite=overwrite,
     )

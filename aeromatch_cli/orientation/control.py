@@ -1,0 +1,119 @@
+"""How well an adjusted block lies on surveyed points: a similarity, and its errors at points that it does not use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
+from aeromatch_cli.geometry.cameras import project, world_rays
+from aeromatch_cli.orientation.placing import similarity
+
+# A similarity has seven unknowns: three points determine it, a fourth tells how well.
+_LEAST_POINTS = 3
+
+
+def control_figures(
+    adjusted: AdjustedBlock, cameras: Mapping[str, Camera], points: Sequence[ControlPoint]
+) -> dict[str, Any]:
+    """Transformation from the adjusted block to the points, and root mean square errors; JSON-ready.
+
+    cameras: image_id -> adjusted camera. `check_rmse_m` (x, y, z) is of the check points; without any, of every control
+    point under the transformation of the others (leave-one-out). None where points are too few.
+    """
+    found = {point.name: _intersected(adjusted, cameras, point) for point in points}
+    seen = [point for point in points if found[point.name] is not None]
+    control = [point for point in seen if not point.check]
+    checks = [point for point in seen if point.check]
+    figures: dict[str, Any] = {
+        "points": len(points),
+        "control": len(control),
+        "check": len(checks),
+        "not_measured_in_two_images": sorted(point.name for point in points if found[point.name] is None),
+    }
+    if len(control) < _LEAST_POINTS:
+        return figures | {"transformation": None, "control_rmse_m": None, "check_rmse_m": None, "check_kind": None}
+    in_block = {name: place for name, place in found.items() if place is not None}
+    fit = _fit(control, in_block)
+    own = _errors(fit, control, in_block)
+    if checks:
+        kind, independent = "check points", _errors(fit, checks, in_block)
+    elif len(control) > _LEAST_POINTS:
+        kind = "leave one out"
+        others = [[one for one in control if one is not point] for point in control]
+        independent = np.concatenate(
+            [_errors(_fit(rest, in_block), [point], in_block) for rest, point in zip(others, control, strict=True)]
+        )
+    else:
+        kind, independent = None, np.zeros((0, 3))
+    return figures | {
+        "transformation": _described(fit),
+        "control_rmse_m": _rmse(own),
+        "check_rmse_m": _rmse(independent),
+        "check_kind": kind,
+        "residuals": {
+            point.name: [round(float(v), 4) for v in error]
+            for point, error in zip([*control, *checks], _errors(fit, [*control, *checks], in_block), strict=True)
+        },
+        "reprojection_error_px": _pixel_error(adjusted, cameras, seen, in_block),
+    }
+
+
+def _intersected(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: ControlPoint) -> FloatArray | None:
+    """World point (3,) nearest to the rays of all oriented images that measure it; None below two."""
+    rays, centers = [], []
+    for image_id, pixel in point.pixels.items():
+        pose = adjusted.poses.get(image_id)
+        if pose is not None:
+            rays.append(world_rays(cameras[image_id], pose.rotation, pixel[None])[0])
+            centers.append(pose.center_m)
+    if len(rays) < 2:
+        return None
+    across = np.eye(3) - np.einsum("ni,nj->nij", np.array(rays), np.array(rays))
+    normal = across.sum(axis=0)
+    if np.linalg.cond(normal) > 1e10:
+        return None
+    return np.asarray(np.linalg.solve(normal, np.einsum("nij,nj->i", across, np.array(centers))))
+
+
+def _fit(points: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> tuple[float, FloatArray, FloatArray]:
+    return similarity(np.array([found[p.name] for p in points]), np.array([p.position_m for p in points]))
+
+
+def _errors(
+    fit: tuple[float, FloatArray, FloatArray], points: Sequence[ControlPoint], found: Mapping[str, FloatArray]
+) -> FloatArray:
+    """(N, 3) transformed minus surveyed, metres."""
+    scale, rotation, shift_m = fit
+    moved = np.array([scale * rotation @ found[p.name] + shift_m for p in points]).reshape(-1, 3)
+    return np.asarray(moved - np.array([p.position_m for p in points]).reshape(-1, 3))
+
+
+def _described(fit: tuple[float, FloatArray, FloatArray]) -> dict[str, Any]:
+    from scipy.spatial.transform import Rotation
+
+    scale, rotation, shift_m = fit
+    turn_deg = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+    return {"scale": scale, "rotation_vector_deg": turn_deg.tolist(), "shift_m": shift_m.tolist()}
+
+
+def _rmse(errors: FloatArray) -> list[float] | None:
+    return [round(float(v), 4) for v in np.sqrt((errors**2).mean(axis=0))] if len(errors) else None
+
+
+def _pixel_error(
+    adjusted: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    points: Sequence[ControlPoint],
+    found: Mapping[str, FloatArray],
+) -> float | None:
+    """Root mean square distance of the measured pixels from those of the intersected points."""
+    off = []
+    for point in points:
+        for image_id, pixel in point.pixels.items():
+            pose = adjusted.poses.get(image_id)
+            if pose is not None:
+                off.append(project(cameras[image_id], pose.rotation, pose.center_m, found[point.name][None])[0] - pixel)
+    return round(float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean())), 3) if off else None

@@ -1,0 +1,158 @@
+"""Ground control: ODM's list read into a block, and errors at points with known ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Site
+from test_export_colmap import ORIGIN_M, Truth, make_truth
+
+from aeromatch_cli.blocks.control import read_control
+from aeromatch_cli.blocks.crs import grid_from_geographic
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, ControlPoint, FloatArray, Image
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.synthetic import load_truth
+
+IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return make_truth()
+
+
+def adjusted_truth(truth: Truth) -> AdjustedBlock:
+    nan = np.full(3, np.nan)
+    poses = {i: AdjustedPose(p.center_m, p.world_rotation, nan, nan) for i, p in truth.block.poses.items()}
+    return AdjustedBlock(truth.block.cameras, poses, np.zeros((0, 3)), np.zeros(0), {})
+
+
+def surveyed(truth: Truth, rows: list[int], offsets_m: FloatArray, checks: set[int]) -> list[ControlPoint]:
+    """Points of the truth measured exactly in every image, surveyed with some offsets."""
+    points = []
+    for row, offset_m in zip(rows, offsets_m, strict=True):
+        place = truth.points_m[row]
+        pixels = {
+            image.image_id: project(truth.block.camera(image), pose.world_rotation, pose.center_m, place[None])[0]
+            for image in truth.block.images
+            for pose in [truth.block.poses[image.image_id]]
+        }
+        points.append(ControlPoint(f"p{row}", place + offset_m, row in checks, pixels))
+    return points
+
+
+def cameras(truth: Truth) -> dict:
+    return {image.image_id: truth.block.camera(image) for image in truth.block.images}
+
+
+def test_check_points_show_their_own_error(truth: Truth) -> None:
+    rows = list(range(0, 400, 40))
+    offsets_m = np.zeros((10, 3))
+    offsets_m[7:] = [0.03, -0.04, 0.12]  # the check points are surveyed wrong by this
+    points = surveyed(truth, rows, offsets_m, set(rows[7:]))
+    figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+    assert (figures["control"], figures["check"], figures["check_kind"]) == (7, 3, "check points")
+    assert figures["check_rmse_m"] == [0.03, 0.04, 0.12]
+    assert max(figures["control_rmse_m"]) < 1e-6
+    assert figures["transformation"]["scale"] == pytest.approx(1.0, abs=1e-9)
+    assert figures["residuals"][f"p{rows[9]}"] == [-0.03, 0.04, -0.12]
+    assert figures["reprojection_error_px"] < 1e-3
+
+
+def test_without_check_points_each_is_left_out_once(truth: Truth) -> None:
+    rows = list(range(0, 400, 40))
+    rng = np.random.default_rng(0)
+    points = surveyed(truth, rows, rng.normal(0.0, 0.05, (10, 3)), set())
+    figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+    assert figures["check_kind"] == "leave one out"
+    assert all(left > fit for left, fit in zip(figures["check_rmse_m"], figures["control_rmse_m"], strict=True))
+    assert 0.03 < np.mean(figures["check_rmse_m"]) < 0.1
+
+
+def test_a_block_in_another_frame_is_transformed(truth: Truth) -> None:
+    rows = list(range(0, 400, 50))
+    turn = from_omega_phi_kappa(180.0, 0.0, 30.0)
+    points = [
+        ControlPoint(p.name, 2.0 * turn @ p.position_m + [5.0, 6.0, 7.0], False, p.pixels)
+        for p in surveyed(truth, rows, np.zeros((8, 3)), set())
+    ]
+    figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+    assert figures["transformation"]["scale"] == pytest.approx(2.0)
+    assert max(figures["check_rmse_m"]) < 1e-6
+
+
+def test_two_points_determine_nothing(truth: Truth) -> None:
+    figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, [0, 40], np.zeros((2, 3)), set()))
+    assert (figures["control"], figures["transformation"], figures["check_rmse_m"]) == (2, None, None)
+
+
+@pytest.mark.parametrize("head", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
+def test_a_list_is_read_into_the_block(tmp_path: Path, head: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(
+        f"{head}\n# a comment\n500010.5 4100020.25 12.5 50.5 40.5 a.jpg north\n"
+        "500010.5 4100020.25 12.5 10 20 b.jpg north\n500030 4100040 13 1 2 b.jpg south check\n"
+        "500030 4100040 13 1 2 c.jpg south check\n"
+    )
+    points, remarks = read_control(str(path), IMAGES, "EPSG:32633", ORIGIN_M)
+    assert [(p.name, p.check, sorted(p.pixels)) for p in points] == [
+        ("north", False, ["a_jpg", "b_jpg"]),
+        ("south", True, ["b_jpg"]),
+    ]
+    np.testing.assert_allclose(points[0].position_m, [10.5, 20.25, 12.5], atol=1e-6)
+    np.testing.assert_array_equal(points[0].pixels["a_jpg"], [50.0, 40.0])
+    assert remarks == ["gcp_list.txt names 1 images that are not in the block: c.jpg"]
+
+
+def test_geographic_points_are_brought_to_the_blocks_crs(tmp_path: Path) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("EPSG:4326\n15.01 37.02 12.5 50.5 40.5 a.jpg\n15.02 37.03 12.5 50.5 40.5 a.jpg\n")
+    points, _ = read_control(str(path), IMAGES, "EPSG:32633", ORIGIN_M)
+    expected = grid_from_geographic("EPSG:32633", np.array([37.02]), np.array([15.01]))[0] - ORIGIN_M[:2]
+    np.testing.assert_allclose(points[0].position_m[:2], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no control points"),
+        ("EPSG:32633\n1 2 3 4 5\n", "line 2: 5 columns"),
+        ("EPSG:32633\n1 2 x 4 5 a.jpg\n", "line 2: could not convert"),
+        ("nowhere\n1 2 3 4 5 a.jpg\n", "line 1: 'nowhere' is no CRS"),
+        ("EPSG:32633\n1 2 3 4 5 a.jpg p\n1 2 9 4 5 b.jpg p\n", "line 3: p has other coordinates"),
+    ],
+)
+def test_a_malformed_list_is_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_control(str(path), IMAGES, "EPSG:32633", ORIGIN_M)
+
+
+@pytest.mark.slow
+def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
+    truth = load_truth(rendered)
+    names = sorted(truth.poses)
+    rng = np.random.default_rng(3)
+    lines = ["local"]
+    for number, pixel in enumerate(rng.uniform([60, 60], [260, 180], (12, 2))):
+        place = truth.surface_points(names[0], pixel[None])[0]
+        for name in names:
+            found, hidden = truth.transfer(names[0], pixel[None], name)
+            if not hidden[0]:
+                x, y = found[0] + 0.5
+                lines.append(" ".join(map(str, (*place, x, y, name, f"p{number}"))))
+    path = done_site.root / "gcp_list.txt"
+    path.write_text("\n".join(lines) + "\n")
+    outcome = done_site("run", "--gcp", path)
+    assert outcome.code == 0
+    control = outcome.facts["stages"]["adjust"]["facts"]["control"]
+    assert control["control"] >= 6
+    assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
+    assert "RMSE at leave one out" in outcome.stdout
+    assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()

@@ -1,0 +1,74 @@
+"""What was given against what the pictures show, on a rendered block: named before the long stages, and put right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import IMAGES, Site
+
+from aeromatch_cli.formats.tables import read_poses
+from aeromatch_cli.geometry.rotations import angle_between_deg
+from aeromatch_cli.synthetic import load_truth
+from aeromatch_cli.workspace import read_json
+
+pytestmark = pytest.mark.slow
+
+
+def attitude_errors(site: Site, truth: Path) -> list[float]:
+    true = {name.replace(".", "_"): pose for name, pose in load_truth(truth).poses.items()}
+    found = read_poses(site.work / "poses.csv")
+    return [angle_between_deg(pose.world_rotation, true[i].world_rotation) for i, pose in found.items()]
+
+
+def turned(rows, degrees: float):
+    for row in rows:
+        row["kappa_deg"] = repr(float(row["kappa_deg"]) + degrees)
+        yield row
+
+
+def test_kappas_off_by_180_degrees_are_named_and_replaced(site: Site, rendered: Path) -> None:
+    site.rewrite_poses(lambda rows: turned(rows, 180.0))
+    outcome = site("run")
+    assert outcome.code == 0
+    warning = "warning: the given angles do not fit the pictures: all kappas are off by 180 degrees"
+    assert warning in outcome.stderr
+    errors = attitude_errors(site, rendered)
+    assert len(errors) == IMAGES
+    assert max(errors) < 10.0  # five positions with 5 m errors level a block of 50 m no better
+    page = (site.work / "report" / "index.html").read_text()
+    assert "all kappas are off by 180 degrees" in page
+
+
+def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:
+    site.rewrite_poses(lambda rows: turned(rows, 180.0))
+    outcome = site("orient", "--set", "orient=given")
+    assert outcome.code == 0
+    assert "all kappas are off by 180 degrees" in outcome.stderr
+    errors = attitude_errors(site, rendered)
+    assert min(errors) > 179.0
+
+
+def ground_of(site: Site) -> float:
+    return float(np.median([p.center_m[2] for p in read_poses(site.work / "poses.csv").values()]))
+
+
+@pytest.mark.parametrize(("share", "used"), [(0.05, "given"), (0.15, "given"), (0.6, "terrain")])
+def test_a_stated_ground_is_held_against_the_terrain(site: Site, share: float, used: str) -> None:
+    assert site("orient").code == 0
+    flying_m = ground_of(site) - np.median(read_json(site.work / "block.json")["ground_z_m"] or 0.0)
+    outcome = site("pairs", "--ground", -share * flying_m, "--set", "block.sigma_position_m=1")
+    assert outcome.code == 0
+    said = "below the terrain that the pictures show" in outcome.stderr
+    assert said == (share > 0.1)
+    assert ("The terrain of the pictures is used" in outcome.stderr) == (used == "terrain")
+    assert read_json(site.work / "block.json")["ground_source"].startswith(used)
+
+
+def test_the_summary_stands_before_the_stages(site: Site) -> None:
+    outcome = site("run")
+    lines = outcome.stdout.splitlines()
+    starts = [line.split()[0] for line in lines if line.strip()]
+    assert starts.index("images") < starts.index("orientation") < starts.index("ground") < starts.index("orient")
+    assert starts.count("images") == starts.count("pairs") - 1 == 1
