@@ -1,6 +1,7 @@
-"""What a consumer gets from an exported database: pycolmap's incremental mapping, in a process of its own.
+"""What a consumer gets from an exported database: pycolmap's mapping, incremental or global.
 
-Run as a module: DATABASE IMAGES OUT.json. A process of its own, since pycolmap stops the whole process on a fault.
+Run as a module: DATABASE IMAGES OUT.json MAPPER. A process of its own, since pycolmap stops the whole process on a
+fault.
 """
 
 from __future__ import annotations
@@ -10,13 +11,22 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+Mapper = Literal["incremental", "global"]
 
 
-def map_database(database: Path, images_folder: Path | None) -> dict[str, Any]:
-    """Figures of the largest model: registered, models, points, track_length, reprojection_error_px.
+def map_both(database: Path, images_folder: Path | None) -> dict[str, Any]:
+    """Figures of incremental mapping, and under `global` those of global mapping."""
+    found = map_database(database, images_folder)
+    return found if "skipped" in found else found | {"global": map_database(database, images_folder, "global")}
+
+
+def map_database(database: Path, images_folder: Path | None, mapper: Mapper = "incremental") -> dict[str, Any]:
+    """Figures of the largest model: registered, models, points, track_length, reprojection_error_px; and seconds.
 
     The database is copied first. {"skipped": reason} where there is no database or mapping fails.
     """
@@ -25,7 +35,7 @@ def map_database(database: Path, images_folder: Path | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as scratch:
         copy, out = Path(scratch) / "database.db", Path(scratch) / "mapping.json"
         shutil.copy(database, copy)
-        command = [sys.executable, "-m", __name__, str(copy), str(images_folder or scratch), str(out)]
+        command = [sys.executable, "-m", __name__, str(copy), str(images_folder or scratch), str(out), mapper]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         if done.returncode or not out.is_file():
             said = (done.stderr or done.stdout).strip().splitlines()[-1:]
@@ -34,22 +44,30 @@ def map_database(database: Path, images_folder: Path | None) -> dict[str, Any]:
     return found
 
 
-def _map(database: Path, images_folder: Path, out: Path) -> None:
+def _map(database: Path, images_folder: Path, out: Path, mapper: str) -> None:
     zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
     import pycolmap
 
     pycolmap.logging.minloglevel = 3
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = 0
     sparse = out.with_name("sparse")
     sparse.mkdir()
-    models = pycolmap.incremental_mapping(database, images_folder, sparse, options=options)
-    facts: dict[str, Any] = {"registered": 0, "models": len(models)}
+    started = time.perf_counter()
+    if mapper == "global":
+        options = pycolmap.GlobalPipelineOptions()
+        options.random_seed = options.mapper.random_seed = 0
+        models = pycolmap.global_mapping(database, images_folder, sparse, options)
+    else:
+        one_by_one = pycolmap.IncrementalPipelineOptions()
+        one_by_one.random_seed = 0
+        models = pycolmap.incremental_mapping(database, images_folder, sparse, options=one_by_one)
+    seconds = time.perf_counter() - started
+    facts: dict[str, Any] = {"registered": 0, "models": len(models), "seconds": seconds}
     if models:
         best = max(models.values(), key=lambda model: model.num_reg_images())
         facts = {
             "registered": best.num_reg_images(),
             "models": len(models),
+            "seconds": seconds,
             "points": best.num_points3D(),
             "track_length": best.compute_mean_track_length(),
             "reprojection_error_px": best.compute_mean_reprojection_error(),
@@ -58,4 +76,4 @@ def _map(database: Path, images_folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    _map(*map(Path, sys.argv[1:4]))
+    _map(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4])

@@ -9,6 +9,7 @@ WORK/evaluation/*.png             plots.py
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -103,16 +104,20 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("correct in shadow", _shown(figures["correct_in_shadow"])),
         ("wrong at its border", _shown(figures["wrong_at_border"])),
     ]
+    rows += _mapping_rows("mapping", consumer, evaluation.images)
+    if "global" in consumer:
+        rows += _mapping_rows("global mapping", consumer["global"], evaluation.images)
+    return rows
+
+
+def _mapping_rows(name: str, consumer: Mapping[str, Any], images: int) -> list[tuple[str, str]]:
     if "skipped" in consumer:
-        rows.append(("mapping", f"skipped: {consumer['skipped']}"))
-    else:
-        why = (
-            "" if consumer["registered"] else ": COLMAP found no pair to begin with (points of two images do not count)"
-        )
-        rows.append(("mapping", f"{consumer['registered']} of {evaluation.images} images in one model{why}"))
-        if "points" in consumer:
-            length, error = _shown(consumer["track_length"]), _shown(consumer["reprojection_error_px"])
-            rows.append(("mapped points", f"{consumer['points']}, track length {length}, error {error} px"))
+        return [(name, f"skipped: {consumer['skipped']}")]
+    why = "" if consumer["registered"] else ": COLMAP found no pair to begin with (points of two images do not count)"
+    rows = [(name, f"{consumer['registered']} of {images} images in one model{why}")]
+    if "points" in consumer:
+        length, error = _shown(consumer["track_length"]), _shown(consumer["reprojection_error_px"])
+        rows.append((f"{name}, points", f"{consumer['points']}, track length {length}, error {error} px"))
     return rows
 
 

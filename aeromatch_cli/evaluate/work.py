@@ -14,7 +14,7 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.evaluate.mapping import map_database
+from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
@@ -83,7 +83,7 @@ def evaluate_workspace(
         progress.stop()
     consumer: Mapping[str, Any] = {"skipped": "not asked for"}
     if mapping:
-        consumer = map_database(workspace.export("colmap") / "database.db", truth.images_folder)
+        consumer = map_both(workspace.export("colmap") / "database.db", truth.images_folder)
     seconds = time.monotonic() - started
     return Evaluation(work, truth_folder, truth.kind, len(images), left_out, tuple(rows), consumer, seconds)
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 # More images than this would need too much memory: each is taken by itself then, its neighbours as known.
 _MAX_TOGETHER = 1500
-# Where no position is known the frame is held by weak observations of all centres, as a share of the flying height.
-_FREE_SHARE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,8 @@ def pose_sigmas(
     """Standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees; NaN without points.
 
     sigmas_position_m, sigmas_angle_deg: (N,) of the observed positions and attitudes, inf where there is none.
-    sigmas_focal: (K,) of the focal lengths before the adjustment, as a share.
+    sigmas_focal: (K,) of the focal lengths before the adjustment, as a share. Without any position they are those of
+    the block's shape, whatever its place and scale.
     """
     from scipy import sparse
 
@@ -56,9 +55,6 @@ def pose_sigmas(
     images = len(seen.centers_m)
     size = 6 * images
     weights = 1.0 / np.where(np.isfinite(sigmas_position_m), sigmas_position_m, np.inf) ** 2
-    if not weights.any():
-        height_m = float(np.abs(np.median(seen.centers_m[:, 2]) - np.median(seen.points_m[:, 2])))
-        weights[:] = 1.0 / max(_FREE_SHARE * height_m, 1e-9) ** 2
     diagonal = np.zeros(normal.shape[0])
     for axis in range(3):
         diagonal[axis:size:6] = 1.0 / np.deg2rad(sigmas_angle_deg) ** 2
@@ -66,7 +62,7 @@ def pose_sigmas(
     diagonal[size:] = 1.0 / (seen.focal_px * sigmas_focal) ** 2
     normal = normal + sparse.diags(diagonal)
     if images <= _MAX_TOGETHER:
-        inverse = np.linalg.pinv(normal.toarray(), hermitian=True)
+        inverse = _inverse(normal.toarray(), None if weights.any() else _free_movements(seen))
         blocks = np.array([inverse[k : k + 6, k : k + 6] for k in range(0, size, 6)])
     else:
         rows = normal.tocsr()
@@ -111,6 +107,38 @@ def _reduced(seen: Observations) -> sparse.csr_matrix:
     blocks = sparse.bsr_matrix((inverses, np.arange(points), np.arange(points + 1)), shape=(3 * points, 3 * points))
     coupling = first.T @ second
     return sparse.csr_matrix(first.T @ first - coupling @ blocks @ coupling.T)
+
+
+def _free_movements(seen: Observations) -> FloatArray:
+    """(6 N + K, 7) changes of poses that no picture sees: three shifts, three turns and the scale of the world."""
+    away_m = seen.centers_m - seen.centers_m.mean(axis=0)
+    columns = np.zeros((len(away_m), 6, 7))
+    columns[:, 3:, :3] = np.eye(3)
+    columns[:, :3, 3:6] = -seen.rotations
+    for axis in range(3):
+        columns[:, 3:, 3 + axis] = np.cross(np.eye(3)[axis], away_m)
+    columns[:, 3:, 6] = away_m
+    return np.concatenate([columns.reshape(-1, 7), np.zeros((len(seen.focal_px), 7))])
+
+
+def _inverse(normal: FloatArray, free: FloatArray | None) -> FloatArray:
+    """Covariance of normal equations; with movements that they leave free, that of a free network.
+
+    Errors count from the shape that fits best then, which no movement of the whole changes (inner constraints: Meissl
+    1969; Triggs et al. 2000, section 9).
+    """
+    if free is None:
+        return np.asarray(np.linalg.pinv(normal, hermitian=True))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # radians, metres and pixels alike
+    basis, _ = np.linalg.qr(free / scale[:, None])
+    scaled = scale[:, None] * normal * scale
+    covariance = np.linalg.inv(scaled + basis @ basis.T) - basis @ basis.T
+    covariance = scale[:, None] * covariance * scale
+    # From the shape that fits best in the scaled unknowns to that in the projection centres.
+    at_centers = np.zeros(len(normal))
+    at_centers[: 6 * (len(normal) // 6)].reshape(-1, 6)[:, 3:] = 1.0
+    onto = np.eye(len(normal)) - free @ np.linalg.pinv(free * at_centers[:, None]) * at_centers
+    return np.asarray(onto @ covariance @ onto.T)
 
 
 def _stacked(values: FloatArray, columns: IntArray, width: int) -> sparse.csr_matrix:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +33,10 @@ from aeromatch_cli.orientation.adjusting import (
 _WORTH_AGAIN = 0.1
 _MAX_ROUNDS = 3
 _MIN_OBSERVATIONS = 12
+# With fewer points of three images or more, those of two count as well.
+_FEW_OBSERVATIONS = 50
+# An image is tied by so many points of those that it shares with the block, a quarter of them at least.
+_FEWEST_INLIERS = 8
 # Elements of rotations that were written and read again.
 _SAME = 1e-6
 _NONE = np.zeros(0)
@@ -50,34 +55,50 @@ def refine(folder: Path) -> None:
     facts = []
     for number, group in enumerate(task["groups"]):
         model = _posed(pycolmap, folder, set(group["images"]))
-        model = _triangulated(pycolmap, model, folder, not task["fixed"])
-        registered: list[int] = []
-        if number == 0 and task["more"] and not task["fixed"]:
-            model, registered = _grown(pycolmap, model, folder)
-        positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
+        model = _triangulated(pycolmap, model, folder, rough=not task["fixed"])
         attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
+        registered: list[int] = []
         if not task["fixed"]:
-            for _ in range(_MAX_ROUNDS):
-                if model.num_points3D() < _MIN_OBSERVATIONS:
-                    break
-                before = model.compute_mean_reprojection_error()
-                if group["kind"] == "positions":
-                    adjusted(pycolmap, model, task["cameras"], positions_m, sigmas_m)
-                else:
-                    adjust_in_place(pycolmap, model, task["cameras"], positions_m, sigmas_m, attitudes)
-                model.update_point_3d_errors()
-                if model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
-                    break
-                model = _triangulated(pycolmap, model, folder, rough=False)
+            if number == 0 and task["more"]:
+                model, registered = _grown(pycolmap, model, folder)
+                model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
+            model = _refined(pycolmap, model, folder, group["kind"], task["cameras"], priors, attitudes)
         model.update_point_3d_errors()
+        _drop_weak_points(model)
         _drop_weak_images(model)
         if not image_numbers(model):
             continue
         name = f"model{number}.npz"
-        deviations = sigmas_of(model, sigmas_m, task["cameras"], attitudes)
+        deviations = sigmas_of(model, priors["sigmas_m"], task["cameras"], attitudes)
         np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+
+
+def _refined(
+    pycolmap: ModuleType,
+    model: Any,
+    folder: Path,
+    kind: str,
+    cameras: dict[str, Any],
+    priors: Mapping[str, FloatArray],
+    attitudes: Attitudes,
+) -> Any:
+    """The model adjusted and triangulated in turn, while that makes it better."""
+    positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
+    for _ in range(_MAX_ROUNDS):
+        if model.num_points3D() < _MIN_OBSERVATIONS:
+            break
+        before = model.compute_mean_reprojection_error()
+        if kind == "positions":
+            adjusted(pycolmap, model, cameras, positions_m, sigmas_m)
+        else:
+            adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes)
+        model.update_point_3d_errors()
+        if model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
+            break
+        model = _triangulated(pycolmap, model, folder, rough=False)
+    return model
 
 
 def _posed(pycolmap: ModuleType, folder: Path, numbers: set[int]) -> Any:
@@ -101,9 +122,8 @@ def _attitudes(model: Any, priors: Mapping[str, FloatArray]) -> Attitudes:
 
 
 def _triangulated(pycolmap: ModuleType, model: Any, folder: Path, rough: bool) -> Any:
+    """The model with points of three images and more, and of two where an image has few others."""
     options = _options(pycolmap)
-    # Points in two images only are weak: they count where there are no others.
-    options.triangulation.ignore_two_view_tracks = len(image_numbers(model)) > 2
     if rough:
         options.mapper.filter_max_reproj_error = _FIRST_ERROR_PX
         options.triangulation.create_max_angle_error *= 3.0
@@ -113,7 +133,30 @@ def _triangulated(pycolmap: ModuleType, model: Any, folder: Path, rough: bool) -
     # The poses stand: `adjusted` weighs them with the given positions.
     out = folder / "triangulated"
     out.mkdir(exist_ok=True)
-    return pycolmap.triangulate_points(model, folder / "database.db", out, out, True, options, False)
+    model = pycolmap.triangulate_points(model, folder / "database.db", out, out, True, options, False)
+    if _weak_images(model):
+        options.triangulation.ignore_two_view_tracks = False
+        model = pycolmap.triangulate_points(model, folder / "database.db", out, out, True, options, False)
+    return model
+
+
+def _weak_images(model: Any) -> set[int]:
+    """Numbers of images with few points that three images see."""
+    strong: Counter[int] = Counter()
+    for point in model.points3D.values():
+        seen = [element.image_id for element in point.track.elements]
+        if len(seen) > 2:
+            strong.update(seen)
+    return {number for number in image_numbers(model) if strong[number] < _FEW_OBSERVATIONS}
+
+
+def _drop_weak_points(model: Any) -> None:
+    """Points of two images hold only images that have few others."""
+    weak = _weak_images(model)
+    for number, point in list(model.points3D.items()):
+        seen = {element.image_id for element in point.track.elements}
+        if len(seen) < 3 and not seen & weak:
+            model.delete_point3D(number)
 
 
 def _grown(pycolmap: ModuleType, model: Any, folder: Path) -> tuple[Any, list[int]]:
@@ -126,6 +169,7 @@ def _grown(pycolmap: ModuleType, model: Any, folder: Path) -> tuple[Any, list[in
     options = _options(pycolmap)
     options.fix_existing_frames = True  # the frame of the world, and the time
     options.multiple_models = False
+    options.mapper.abs_pose_min_num_inliers = _FEWEST_INLIERS
     found = pycolmap.incremental_mapping(folder / "database.db", out, out, options=options, input_path=start)
     grown = max(found.values(), key=lambda one: one.num_reg_images(), default=model)
     return grown, sorted({i.image_id for i in grown.images.values() if i.has_pose} - before)

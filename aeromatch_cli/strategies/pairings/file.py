@@ -35,20 +35,25 @@ class PairFile(Strategy):
 
         Raises ConfigError where the file cannot be read, names an unknown image or holds no pair.
         """
+        keys = self._parse(self._lines(), {image.name: image.image_id for image in block.images})
+        if not keys:
+            raise ConfigError(f"the pair list {self.path} holds no pair; write two image names on each line")
+        return measured_pairs(block, dict.fromkeys(keys, self.name), block_footprints(block))
+
+    def check_files(self, descriptor_length: int) -> None:
+        self._lines()
+
+    def _lines(self) -> list[str]:
         if not self.path:
             raise ConfigError(
                 "pairs by file need the list's path: set pairs.path to a file with two names on each line"
             )
         try:
-            lines = Path(self.path).read_text(encoding="utf-8-sig").splitlines()
+            return Path(self.path).read_text(encoding="utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(
                 f"cannot read the pair list {self.path}: {error}; set pairs.path to a text file"
             ) from error
-        keys = self._parse(lines, {image.name: image.image_id for image in block.images})
-        if not keys:
-            raise ConfigError(f"the pair list {self.path} holds no pair; write two image names on each line")
-        return measured_pairs(block, dict.fromkeys(keys, self.name), block_footprints(block))
 
     def _parse(self, lines: list[str], id_of: dict[str, str]) -> set[tuple[str, str]]:
         keys = set()

@@ -20,7 +20,7 @@ import numpy as np
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.data import Block, FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate.mapping import map_database
+from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.metrics import GRID_CELLS, thin
 from aeromatch_cli.evaluate.reference import load_reference
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX
@@ -93,7 +93,7 @@ def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
     found: Answer = read_json(facts)
     if case.mapping:
         if not mapped.is_file():
-            write_json(mapped, map_database(database, case.images))
+            write_json(mapped, map_both(database, case.images))
         found |= read_json(mapped)
     return found, database
 

@@ -6,10 +6,11 @@ brackets as in `--set` and a label before it where the name gets long ('plain=fu
 SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
 
   blocks    every k-th image (--thin); extraction, matching and verification are timed, start-up and export are not;
-            then pycolmap's incremental mapping from each database. COLMAP matches all pairs, a preset those it chooses
+            then both of pycolmap's mappings from each database. COLMAP matches all pairs, a preset those it chooses
   thinned   the same where ordinary matching falls apart
   cross     only pairs across a block's darker and brighter series that share a fifth of the smaller footprint
   easy      wall clock of `aeromatch run`, everything included, against the first method
+  orient    whole chains from pictures to an oriented block: `scripts/bench blocks orient --help`
 
 Every step runs in a process of its own. The budget is exact for all, in COLMAP's sense of a keypoint (a place with two
 orientations counts twice). pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. It is
@@ -31,6 +32,7 @@ from pathlib import Path
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic.presets import PRESETS
 from benchmarks import options, stamps
+from benchmarks.blocks import chains
 from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, count_matches, cross_pairs
 from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
 from benchmarks.peers.table import Named, check_method, named_methods, settings_of
@@ -111,8 +113,11 @@ def make_options(section: str) -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str]) -> None:
     first = options.make_parser("blocks", __doc__)
-    first.add_argument("section", choices=tuple(SECTIONS))
+    first.add_argument("section", choices=(*SECTIONS, "orient"))
     section = first.parse_args(arguments[:1]).section
+    if section == "orient":
+        chains.main(arguments[1:])
+        return
     parser = make_options(section)
     args = options.parse(parser, arguments[1:], QUICK)
     methods = named_methods(args.methods)

@@ -28,6 +28,7 @@ _BLOCKS: tuple[Column[Row], ...] = (
     ("within 5 px", lambda row: row["within_5px"]),
     ("cells filled", lambda row: percent(row["filled_cells"]) if "filled_cells" in row else "-"),
     ("registered", lambda row: f"{row['registered']} of {row['images']}" if "registered" in row else "-"),
+    ("by global mapping", lambda row: f"{row['global']['registered']}" if "global" in row else "-"),
     ("points", lambda row: row.get("points", "-")),
     ("track length", _known("track_length", 2)),
     ("error px", _known("reprojection_error_px", 2)),
