@@ -1,7 +1,7 @@
 """Orientation from the pictures: reference poses made worse, what `aeromatch run` finds then, beside the references.
 
-DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}. Every case is one run of the preset on
-every k-th image (--thin):
+DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}; SCENE:FLIGHT is rendered, with exact
+truth and a camera file. Every case is one run of the preset on every k-th image (--thin):
 
   reference  the reference poses and camera as they are: what the others are measured against
   noise      positions with 5 m noise in each coordinate, no attitudes, camera from EXIF
@@ -19,7 +19,8 @@ every k-th image (--thin):
 Attitude error: median and maximum over the oriented images, after one common turn. Focal: against the reference
 camera. Within 3 px: verified matches, by symmetric epipolar distance from the reference poses, and as a share of those
 of the case `reference`. Named: images whose attitude was made wrong and is named so, or all where a fault of the whole
-list is named, and those named without cause. Said: what the summary says of the fault.
+list is named, and those named without cause. Said: what the summary says of the fault. Terrain, of rendered blocks:
+median distance of the terrain found from the surface that the images show, as a share of the flying height.
 """
 
 from __future__ import annotations
@@ -36,10 +37,14 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.ground import DemGround
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
+from aeromatch_cli.formats.terrain import read_terrain
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
+from aeromatch_cli.orientation.placing import similarity
+from aeromatch_cli.synthetic import load_truth, render_block
 from aeromatch_cli.workspace import read_json, write_json
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images
@@ -49,6 +54,9 @@ CASES = ("reference", "noise", "nothing", "third", "yaw", "longer", "shorter", "
          "shuffled", "ground")  # fmt: skip
 POSITIONS_ONLY = ("noise", "outliers", "mirrored")
 NOISE_M, OUTLIER_M = 5.0, 100.0
+RENDERED_PX = 1600, 1200
+# Places in every image where the terrain is asked.
+_SAMPLES = 60
 ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 
 # Characters of a remark in the table.
@@ -77,12 +85,14 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
         writer.writerows(rows)
     crs = [] if camera["crs"] == "local" else ["--crs", camera["crs"]]
     if case == "ground":
-        flying_m = float(np.median([float(row["z"]) for row in rows])) - ground_z["p50"]
-        crs += ["--ground", repr(ground_z["p50"] - flying_m)]
+        below_m = ground_z["p50"] if isinstance(ground_z, dict) else ground_z
+        flying_m = float(np.median([float(row["z"]) for row in rows])) - below_m
+        crs += ["--ground", repr(below_m - flying_m)]
+    exact = (reference / "truth.json").is_file()  # rendered images have no EXIF
+    lens = ["--cameras", str(folder / "block.json") if exact or case not in (*POSITIONS_ONLY, "nothing") else "exif"]
     if case == "nothing":
-        return ["--poses", "none"], wrong
-    cameras = ["--cameras", "exif" if case in POSITIONS_ONLY else str(folder / "block.json")]
-    return ["--poses", str(poses), *cameras, *(crs or ["--crs", "local"])], wrong
+        return ["--poses", "none", *lens], wrong
+    return ["--poses", str(poses), *lens, *(crs or ["--crs", "local"])], wrong
 
 
 def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator) -> set[str]:
@@ -154,17 +164,51 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "wrong": len(wrong),
         "named_without_cause": len(named - wrong),
         "said": remarks,
+        "terrain_share": terrain_error(work, reference) if (reference / "truth.json").is_file() else None,
     }
+
+
+def terrain_error(work: Path, rendered: Path) -> float:
+    """Median height of the terrain found above the rendered surface, without sign, as a share of the flying height.
+
+    Asked at places that the images show. A block in a frame of its own is brought to the truth by its projection
+    centres.
+    """
+    path = work / "orientation" / "terrain.tif"
+    if not path.is_file():
+        return float("nan")
+    truth = load_truth(rendered)
+    name_of = {image.image_id: image.name for image in read_images(work / "images.csv")}
+    found = read_poses(work / "poses.csv")
+    ids = sorted(found)
+    own = np.array([found[i].center_m for i in ids])
+    origin_m = np.array(read_json(work / "block.json")["origin_m"])
+    true = np.array([truth.poses[name_of[i]].center_m for i in ids]) - origin_m
+    if read_json(work / "reports" / "orient.json")["facts"].get("frame") == "world":
+        scale, rotation, shift_m = 1.0, np.eye(3), np.zeros(3)
+    else:
+        scale, rotation, shift_m = similarity(true, own)
+    rng = np.random.default_rng(0)
+    camera = next(iter(truth.cameras.values()))
+    pixels = rng.uniform([0, 0], [camera.width_px - 1, camera.height_px - 1], (_SAMPLES, 2))
+    seen = np.concatenate([truth.surface_points(name_of[i], pixels) for i in ids]) - origin_m
+    seen = seen[np.isfinite(seen).all(axis=1)]
+    seen = seen[np.abs(seen[:, :2] - true[:, :2].mean(axis=0)).max(axis=1) <= np.ptp(true[:, :2], axis=0).max()]
+    moved = scale * seen @ rotation.T + shift_m
+    heights, west_m, north_m, cell_m = read_terrain(path, origin_m)
+    ground = DemGround(heights, west_m, north_m, (cell_m, cell_m), float(np.median(heights)))
+    off_m = np.abs(ground.height_m(moved[:, :2]) - moved[:, 2]) / scale
+    return float(np.median(off_m) / (np.median(true[:, 2]) - np.median(seen[:, 2])))
 
 
 def run_case(args: Any, block: str, every: int, case: str) -> Row:
     """One run of the command and its figures; kept in OUT, so that a killed benchmark goes on there."""
-    folder = args.out / f"{block}-{every}-{case}"
+    folder = args.out / f"{block.replace(':', '-')}-{every}-{case}"
     answer = folder / "answer.json"
     if answer.is_file() and not args.again:
         return read_json(answer)
-    source, reference = args.data / block / "images", args.data / block / "reference"
-    images = chosen_images(source, every, 0, args.out / "images" / f"{block}-{every}")
+    source, reference = _folders(args, block)
+    images = chosen_images(source, every, 0, args.out / "images" / f"{block.replace(':', '-')}-{every}")
     names = sorted(path.name for path in images.iterdir())
     extra, wrong = worsened(case, reference, names, folder)
     work = folder / "work"
@@ -190,6 +234,20 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     write_json(answer, row)
     shutil.rmtree(work, ignore_errors=not args.keep)
     return row
+
+
+def _folders(args: Any, block: str) -> tuple[Path, Path]:
+    """Images and reference of a block of DATA, or of SCENE:FLIGHT, which is rendered where it has not been."""
+    scene, _, flight = block.partition(":")
+    if not flight:
+        return args.data / block / "images", args.data / block / "reference"
+    width_px, height_px = RENDERED_PX
+    folder = args.out / "rendered" / f"{scene}-{flight}-{args.seed}-{args.rendered}"
+    render_block(
+        folder, scene, seed=args.seed, width_px=width_px, height_px=height_px, images=args.rendered, flight=flight,
+        jobs=args.jobs,
+    )  # fmt: skip
+    return folder / "images", folder
 
 
 def rows_of(args: Any) -> Iterator[Row]:
@@ -239,6 +297,7 @@ def table_of(rows: Sequence[Row]) -> str:
                 str(row["pairs"]),
                 str(row["correct"]),
                 f"{100 * row['share']:.0f} %" if "share" in row else "",
+                "" if row.get("terrain_share") is None else f"{100 * row['terrain_share']:.1f} %",
                 f"{row['seconds']:.0f} ({row['orient_s']:.0f})",
                 "; ".join(remark[:_SAID] for remark in row["said"]),
             )
@@ -249,8 +308,10 @@ def table_of(rows: Sequence[Row]) -> str:
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("orient", __doc__)
     add = parser.add_argument
-    add("--data", type=Path, required=True, metavar="DIR", help="folder of blocks")
-    add("--blocks", type=options.names, default="lewis,seneca", help="names, comma-separated")
+    add("--data", type=Path, default=Path(), metavar="DIR", help="folder of blocks")
+    add("--blocks", type=options.names, default="lewis,seneca", help="names or SCENE:FLIGHT, comma-separated")
+    add("--rendered", type=options.positive, default=24, help="images of a rendered block")
+    add("--seed", type=int, default=0, help="of rendered blocks")
     add("--thin", type=options.numbers, default="1", help="keep every k-th image; several k comma-separated")
     add("--cases", type=options.names, default=",".join(CASES), help="comma-separated")
     add("--preset", default="baseline", help="preset of every run")
