@@ -72,3 +72,36 @@ def test_the_summary_stands_before_the_stages(site: Site) -> None:
     starts = [line.split()[0] for line in lines if line.strip()]
     assert starts.index("images") < starts.index("orientation") < starts.index("ground") < starts.index("orient")
     assert starts.count("images") == starts.count("pairs") - 1 == 1
+
+
+def test_identical_pictures_are_named(site: Site) -> None:
+    first = site.image(0).read_bytes()
+    for number in range(1, IMAGES):
+        site.image(number).write_bytes(first)
+    outcome = site("orient", "--poses", "none")
+    assert outcome.code == 0
+    assert "no image could be oriented from the pictures: they show the same from the same place" in outcome.stderr
+    assert "from the pictures: none of 5 images" in outcome.stdout
+
+
+def test_equal_positions_are_named_and_not_used(site: Site) -> None:
+    def same(rows):
+        first = rows[0]
+        return [{"image": row["image"], "camera": row["camera"], **{k: first[k] for k in "xyz"}} for row in rows]
+
+    site.rewrite_poses(lambda rows: [{k: v for k, v in row.items() if not k.endswith("_deg")} for row in same(rows)])
+    outcome = site("orient")
+    assert outcome.code == 0
+    assert "all 5 positions are identical" in outcome.stderr
+    facts = outcome.facts["stages"]["orient"]["facts"]
+    assert facts["frame"] == "own"
+    assert len(read_poses(site.work / "poses.csv")) == facts["models"][0]["images"] >= 3
+
+
+def test_two_images_are_matched_without_orientation(site: Site) -> None:
+    for _ in range(2, IMAGES):
+        site.image(2).unlink()
+    outcome = site("run", "--poses", "none")
+    assert outcome.code == 0
+    assert "at least 3 images must show the same ground, 2 do" in outcome.stderr
+    assert (site.work / "export" / "colmap" / "database.db").is_file()

@@ -32,6 +32,10 @@ _SIGMA_POSITION_SHARE = 0.005
 # Beyond this a given attitude is wrong and not just inexact; and a position beyond so many standard deviations.
 _WRONG_DEG = 30.0
 _WRONG_SIGMAS = 5.0
+# Fewer images make no model.
+_FEWEST_IMAGES = 3
+# Pictures of one place differ by less, in pixels of the stored images.
+_STANDING_PX = 2.0
 # A model of a grown block is moved onto the poses that it had before, where these agree to a share of its extent.
 _SAME_SHARE = 0.01
 
@@ -101,6 +105,17 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
         "outside": _outside(block, poses),
     }
     return Solution(block.cameras, poses, terrain_of(points, _area(poses)), facts)
+
+
+def unoriented_remark(evidence: Evidence) -> str:
+    """Why no image could be oriented from its matches."""
+    said = "no image could be oriented from the pictures"
+    if len(evidence.matched) < _FEWEST_IMAGES:
+        return f"{said}: at least {_FEWEST_IMAGES} images must show the same ground, {len(evidence.matched)} do"
+    moved_px = [np.median(np.linalg.norm(p.points0_px - p.points1_px, axis=1)) for p in evidence.pairs]
+    if float(np.median(moved_px)) < _STANDING_PX:
+        return f"{said}: they show the same from the same place"
+    return f"{said}: their matches do not agree on one orientation"
 
 
 def judged(given: Solution, pictures: Solution) -> Solution:

@@ -82,7 +82,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
         ground_hint=None
-        if inputs.ground_hint_z_m is None
+        if inputs.ground_hint_z_m is None or inputs.ground_is_stated
         else (ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source),
     )
 

@@ -62,11 +62,13 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     if "method" not in facts:
         return []
     matched, explained = facts["images_matched"], facts["given_poses_explained"]
+    attitudes = sum(pose.world_rotation is not None for pose in given.poses.values())
+    explains = f"given poses explain the matches of {explained} of {matched} images"
     if facts["method"] == "given":
-        words = [f"given poses explain the matches of {explained} of {matched} images"]
+        words = [explains if matched else "no matches to judge the given poses by"]
     else:
         sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
-        words = [f"given poses explain {explained} of {matched} images; oriented from the pictures: {sizes}"]
+        words = [f"from the pictures: {sizes} of {len(block.images)} images", *([explains] if attitudes else [])]
         for camera_id, camera in sorted(block.cameras.items()):
             before = focal_px(given.cameras[camera_id])
             if abs(focal_px(camera) / before - 1.0) > _FOCAL_SAID:

@@ -17,7 +17,15 @@ from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras,
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.mapping import Group, Model, map_block
-from aeromatch_cli.orientation.solution import Evidence, Solution, from_given, from_models, judged, suffices
+from aeromatch_cli.orientation.solution import (
+    Evidence,
+    Solution,
+    from_given,
+    from_models,
+    judged,
+    suffices,
+    unoriented_remark,
+)
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -36,7 +44,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 3
+VERSION = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -113,6 +121,8 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     else:
         models, first, evidence = _mapped(context, recipe, first, evidence)
         solution = from_models(block, models, _poses_before(context, kept), context.angles)
+        if not models:
+            solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
             solution = judged(from_given(evidence, good, correct=False), solution)
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}

@@ -58,10 +58,11 @@ def prepare(
     else:
         workspace.create()
     found = read_block(settings, workspace, executor)
-    before = summarise(found.block).given_lines()
-    for line in before:
+    as_given = summarise(found.block)
+    for line in as_given.given_lines():
         say(line)
-    for warning in found.warnings:
+    known = [*found.warnings, *as_given.warnings]
+    for warning in known:
         log.warning("warning: %s", warning)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
@@ -75,11 +76,11 @@ def prepare(
         report.items = report.done = len(pairs)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     oriented_lines = orientation_lines(oriented.facts, found.block, context.block)
-    judged = oriented.facts.get("remarks", [])
+    said_later = [*oriented.facts.get("remarks", []), *(w for w in summary.warnings if w not in known)]
     report.facts = {
-        "summary": [*before, *oriented_lines, *summary.lines(), *_remarks(settings)],
+        "summary": [*as_given.given_lines(), *oriented_lines, *summary.lines(), *_remarks(settings)],
         "block": summary.figures(),
-        "warnings": [*found.warnings, *judged, *summary.warnings],
+        "warnings": [*known, *said_later],
         "images": len(found.block.images),
         "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
@@ -92,7 +93,7 @@ def prepare(
         report.write(workspace)
     for line in report.facts["summary"]:
         say(line)
-    for warning in report.facts["warnings"][len(found.warnings) :]:
+    for warning in said_later:
         log.warning("warning: %s", warning)
     if len(context.block.images) == 1:
         raise InputError(f"only one image can be used ({context.block.images[0].name}): one image makes no pair")

@@ -274,6 +274,7 @@ def table_of(rows: Sequence[Row]) -> str:
         "pairs",
         "within 3 px",
         "share",
+        "terrain",
         "s",
         "said",
     )
