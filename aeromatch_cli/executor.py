@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -203,6 +204,19 @@ class Executor:
         finally:
             self.progress.stop()
             record.info("%s: %d of %d tried in %.1f s", label, self._tried, len(tasks), time.monotonic() - started)
+
+    @contextmanager
+    def step(self, label: str) -> Iterator[None]:
+        """Shows a part that this process waits for, as one item."""
+        started = time.monotonic()
+        record.info("%s: started", label)
+        self.progress.start(label, 1)
+        try:
+            yield
+            self.progress.advance()
+        finally:
+            self.progress.stop()
+            record.info("%s: %.1f s", label, time.monotonic() - started)
 
     def _advance(self) -> None:
         self._tried += 1

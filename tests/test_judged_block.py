@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site
+from conftest import IMAGES, Site, contents
 
 from aeromatch_cli.formats.tables import read_poses
 from aeromatch_cli.geometry.rotations import angle_between_deg
@@ -48,6 +49,32 @@ def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:
     assert "all kappas are off by 180 degrees" in outcome.stderr
     errors = attitude_errors(site, rendered)
     assert min(errors) > 179.0
+
+
+def test_a_third_of_the_attitudes_wrong_settles_in_one_run(site: Site, rendered: Path) -> None:
+    """Every verified pair is exported, and the same command again does nothing: byte by byte."""
+    wrong = (1, 4)
+
+    def change(rows):
+        for number, row in enumerate(rows):
+            if number in wrong:
+                row |= {"omega_deg": "35", "phi_deg": "-50", "kappa_deg": "140"}
+            yield row
+
+    site.rewrite_poses(change)
+    outcome = site("run")
+    assert outcome.code == 0
+    named = outcome.facts["stages"]["orient"]["facts"]["wrong_attitudes"]
+    assert sorted(named) == [site.names()[number].replace(".", "_") for number in wrong]
+    assert max(attitude_errors(site, rendered)) < 1.0
+    verified = outcome.facts["stages"]["filter"]["facts"]["pairs"]["verified"]
+    with sqlite3.connect(site.work / "export" / "colmap" / "database.db") as database:
+        exported = database.execute("SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0").fetchone()[0]
+    assert exported == verified == IMAGES * (IMAGES - 1) // 2
+    before = contents(site.work)
+    again = site("run")
+    assert (again.code, again.done()) == (0, {})
+    assert contents(site.work) == before
 
 
 def ground_of(site: Site) -> float:

@@ -28,6 +28,8 @@ def map_both(database: Path, images_folder: Path | None) -> dict[str, Any]:
 def map_database(database: Path, images_folder: Path | None, mapper: Mapper = "incremental") -> dict[str, Any]:
     """Figures of the largest model: registered, models, points, track_length, reprojection_error_px; and seconds.
 
+    registered: images that see a point. Global mapping places others, too, by a single pair, at any distance.
+
     The database is copied first. {"skipped": reason} where there is no database or mapping fails.
     """
     if not database.is_file():
@@ -65,7 +67,7 @@ def _map(database: Path, images_folder: Path, out: Path, mapper: str) -> None:
     if models:
         best = max(models.values(), key=lambda model: model.num_reg_images())
         facts = {
-            "registered": best.num_reg_images(),
+            "registered": sum(image.has_pose and image.num_points3D > 0 for image in best.images.values()),
             "models": len(models),
             "seconds": seconds,
             "points": best.num_points3D(),

@@ -75,8 +75,8 @@ def _fits(angles: list[Angles], true: FloatArray) -> Iterator[Recognised]:
     for words, reading in readings:
         rotations = np.array([reading(one) for one in angles])
         turn_deg = _heading_deg(true.transpose(0, 2, 1) @ rotations)
-        if abs(turn_deg) > _LEAST_TURN_DEG:
-            error_deg = _median_deg(rotations @ rotation_z(turn_deg).T, true)
+        error_deg = _median_deg(rotations @ rotation_z(turn_deg).T, true)
+        if abs(turn_deg) > _LEAST_TURN_DEG and error_deg < _BETTER * _median_deg(rotations, true):
             said = _turn_words("yaws" if angles[0].kind == "yaw_pitch_roll" else "headings", turn_deg, angles)
             yield Recognised(" and ".join(filter(None, (words, said))), _turned(reading, turn_deg), error_deg)
         if not words:

@@ -57,13 +57,14 @@ def run(context: Context) -> StageReport:
         return report.write(context.workspace)
     _remove(context)
     try:
-        adjusted, figures = refine_block(
-            contents_of(context),
-            context.given.poses,
-            context.focal_sigmas,
-            groups,
-            fixed=isinstance(recipe, FirstPass) and not recipe.replaces,
-        )
+        with context.executor.step("adjust"):
+            adjusted, figures = refine_block(
+                contents_of(context),
+                context.given.poses,
+                context.focal_sigmas,
+                groups,
+                fixed=isinstance(recipe, FirstPass) and not recipe.replaces,
+            )
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
         return report.write(context.workspace)

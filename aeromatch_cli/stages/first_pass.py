@@ -109,7 +109,8 @@ def _pairs(
     if count <= (candidates * len(ids) if asked else _MOST_PAIRS):
         every = set(combinations(ids, 2))
         return every, tuple(sorted(every)) if asked else ()
-    similar = similar_pairs({i: context.workspace.features(i) for i in ids}, candidates)
+    with context.executor.step("first pass: image retrieval"):
+        similar = similar_pairs({i: context.workspace.features(i) for i in ids}, candidates)
     return near | {pair for pair in similar if not set(pair) <= set(placed)}, tuple(similar) if asked else ()
 
 

@@ -139,13 +139,18 @@ def _mapped(
 ) -> tuple[tuple[Model, ...], Context, Evidence]:
     """Models of a first pass, and it; of another one whose pairs do not lean on positions, where these do not fit."""
     positions = context.block.poses
-    models = map_block(contents_of(first), positions, context.focal_sigmas, recipe.mapper)
+
+    def mapped(one: Context) -> tuple[Model, ...]:
+        with context.executor.step("first pass: mapping"):
+            return map_block(contents_of(one), positions, context.focal_sigmas, recipe.mapper)
+
+    models = mapped(first)
     if not positions or (models and not models[0].figures["contradiction"]):
         return models, first, evidence
     other, more = _evidence(context, recipe, by_position=False)
     if {(p.image_id0, p.image_id1) for p in other.pairs} <= {(p.image_id0, p.image_id1) for p in first.pairs}:
         return models, first, evidence
-    again = map_block(contents_of(other), positions, context.focal_sigmas, recipe.mapper)
+    again = mapped(other)
     better = _oriented(again) > _oriented(models)
     return (again, other, more) if better else (models, first, evidence)
 
