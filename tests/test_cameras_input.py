@@ -5,6 +5,8 @@ import math
 from pathlib import Path
 
 import pytest
+from make_images import write_image
+from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.cameras import cameras_from_exif, cameras_from_file, fitted, focal_from_exif_px
@@ -154,3 +156,11 @@ def test_cameras_of_a_file_by_only_one_column_folder_and_size() -> None:
     by_column = cameras_from_file(twins, {"a": (4000, 3000), "b": (4000, 3000)}, {"a": "right", "b": "middle"})
     assert by_column.camera_ids == {"a": "right"}
     assert "'middle' of the pose list is not in the camera file, which has left, right" in by_column.reasons["b"]
+
+
+@pytest.mark.parametrize(("focal_35mm", "fisheye"), [(15, True), (20, False), (24, False)])
+def test_a_fisheye_lens_is_named(tmp_path: Path, focal_35mm: int, fisheye: bool) -> None:
+    for number in range(2):
+        write_image(tmp_path / f"{number}.jpg", (400, 300), exif={37386: 2.7, 41989: focal_35mm})
+    warnings = read_inputs(tmp_path).warnings
+    assert any("probably a fisheye lens" in warning for warning in warnings) == fisheye

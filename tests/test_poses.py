@@ -112,9 +112,9 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 
 
 def test_unknown_columns_are_ignored_with_a_warning(tmp_path: Path) -> None:
-    poses = read_poses(write(tmp_path, "image,x,y,z,accuracy,note\na,1,2,3,0.5,hello\n"))
+    poses = read_poses(write(tmp_path, "image,x,y,z,hdop,note\na,1,2,3,0.5,hello\n"))
     assert poses.rows[0].position == (1.0, 2.0, 3.0)
-    assert poses.warnings == ("poses.csv: unknown columns ignored: accuracy, note",)
+    assert poses.warnings == ("poses.csv: unknown columns ignored: hdop, note",)
 
 
 @settings(max_examples=40, deadline=None)
@@ -127,3 +127,14 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, values: list[tuple
     lines = [separator.join([f"{row}.jpg", *map(repr, numbers)]) for row, numbers in enumerate(values)]
     poses = read_poses(write(tmp_path_factory.mktemp("poses"), "\n".join([header, *lines])))
     assert [(*row.position, *row.attitude) for row in poses.rows if row.position and row.attitude] == values
+
+
+def test_the_largest_deviation_of_an_axis_counts(tmp_path: Path) -> None:
+    rows = read_poses(
+        write(tmp_path, "image,lat,lon,alt,sdn(m),sde(m),sdu(m)\na.jpg,48,12,300,0.011,0.012,0.03\n")
+    ).rows
+    assert rows[0].sigma_position_m == 0.03
+    rows = read_poses(write(tmp_path, "image,x,y,z,accuracy,sigma_z_m\na.jpg,1,2,3,0.5,0.03\n")).rows
+    assert rows[0].sigma_position_m == 0.5
+    with pytest.raises(ConfigError, match="a standard deviation is positive"):
+        read_poses(write(tmp_path, "image,x,y,z,sigma_z_m\na.jpg,1,2,3,-1\n"))

@@ -30,6 +30,9 @@ FOCAL_SIGMAS: Mapping[str, float] = {
 # Two statements of the focal length that differ by more than this factor cannot both be meant.
 _CONTRADICTION = 1.25
 
+# Shorter focal lengths, as a share of the longer side, are those of fisheye lenses (16 mm on 35-mm film).
+_FISHEYE_FOCAL = 0.45
+
 
 @dataclass(frozen=True)
 class CameraAssignment:
@@ -109,7 +112,7 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
         else ()
     )
     sigmas = {camera_ids[name]: FOCAL_SIGMAS[source] for name, source in sources.items()}
-    return CameraAssignment(cameras, camera_ids, {}, (*warnings, *_contradictions(facts)), sigmas)
+    return CameraAssignment(cameras, camera_ids, {}, (*warnings, *_contradictions(facts), *_fisheyes(facts)), sigmas)
 
 
 def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
@@ -125,6 +128,23 @@ def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
     return (
         f"EXIF of {len(odd)} of {len(facts)} images states two focal lengths ({odd[0]}): the latter is used; the "
         "pictures were probably reduced by a program that kept the resolution of the original",
+    )
+
+
+def _fisheyes(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
+    """One sentence where a field of view is wider than those of other lenses."""
+    wide = []
+    for name, fact in facts.items():
+        longer_px = max(fact.width_px, fact.height_px)
+        if fact.calibrated is None and focal_from_exif_px(fact)[0] < _FISHEYE_FOCAL * longer_px:
+            wide.append(name)
+    if not wide:
+        return ()
+    degrees = 2.0 * math.degrees(math.atan(0.5 / _FISHEYE_FOCAL))
+    return (
+        f"the field of view of {len(wide)} of {len(facts)} images ({listed(wide)}) is wider than {degrees:.0f} degrees "
+        "by EXIF: probably a fisheye lens, which no camera model here describes; give undistorted images, and their "
+        "camera with --cameras",
     )
 
 

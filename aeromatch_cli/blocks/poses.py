@@ -9,7 +9,8 @@ Columns, in any order and case (aliases in brackets):
   yaw_deg pitch_deg roll_deg [yaw pitch roll]     yaw against grid north with x y z, true north with lat lon alt, or
   qw qx qy qz                   cam_from_world, relative to the grid, or no attitude at all
   camera                        name of the camera (optional)
-  sigma_position_m sigma_angle_deg                standard deviations (optional)
+  sigma_position_m sigma_angle_deg                standard deviations (optional), or of the position for each axis
+  sigma_x_m sigma_y_m sigma_z_m [sde sdn sdu, std_e std_n std_u]     as PPK results have them; the largest counts
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
 header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose coordinates are
@@ -39,11 +40,16 @@ _ATTITUDES: dict[AttitudeKind, tuple[str, ...]] = {
     "quaternion": ("qw", "qx", "qy", "qz"),
 }
 _SIGMAS = ("sigma_position_m", "sigma_angle_deg")
-_KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", *_SIGMAS)
+_AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+_KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", *_SIGMAS, *_AXIS_SIGMAS)
 _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
+    **dict.fromkeys(("sde", "std_e", "sigma_x"), "sigma_x_m"),
+    **dict.fromkeys(("sdn", "std_n", "sigma_y"), "sigma_y_m"),
+    **dict.fromkeys(("sdu", "std_u", "sigma_z"), "sigma_z_m"),
+    **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
 }
 # Columns that might be meant as z or alt, and might as well be heights above ground.
@@ -249,6 +255,9 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         return tuple(_number(path, number, name, record[name], decimal_comma) for name in names)
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
+    axes = [numbers((name,))[0] for name in _AXIS_SIGMAS if name in record]
+    if sigmas[0] is None and axes and None not in axes:
+        sigmas[0] = max(axis for axis in axes if axis is not None)
     position = numbers(_POSITIONS[layout.position_kind])
     attitude = numbers(_ATTITUDES[layout.attitude_kind]) if layout.attitude_kind != "none" else ()
     x, y, z = position
@@ -296,6 +305,6 @@ def _number(path: Path, line: int, column: str, cell: str, decimal_comma: bool) 
     if math.isinf(value) or abs(value) > largest:
         limits = f" between {-largest:g} and {largest:g}" if largest < math.inf else ""
         raise ConfigError(f"{where}: {cell} is out of range: expected a number{limits}")
-    if column in _SIGMAS and value <= 0:
+    if column in (*_SIGMAS, *_AXIS_SIGMAS) and value <= 0:
         raise ConfigError(f"{where}: {cell} is out of range: a standard deviation is positive")
     return value
