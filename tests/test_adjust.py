@@ -20,7 +20,7 @@ from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.orientation.mapping import Group, refine_block
+from aeromatch_cli.orientation.mapping import Group, Observed, refine_block
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
 from aeromatch_cli.synthetic import load_truth
@@ -65,7 +65,7 @@ def refined(
 ) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
     positions = given_positions(truth, seed + 100, 0.1)
     groups = [Group("positions", images)]
-    return refine_block(disturbed(truth, seed), positions, FOCAL_SIGMAS, groups, fixed=fixed)
+    return refine_block(disturbed(truth, seed), Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=fixed)
 
 
 def errors(truth: Truth, adjusted: AdjustedBlock) -> tuple[FloatArray, FloatArray]:
@@ -111,7 +111,7 @@ def test_standard_deviations_are_those_of_repeated_measurements(truth: Truth) ->
 def test_surveyed_poses_stay_and_get_points(truth: Truth) -> None:
     contents = replace(disturbed(truth, 0), block=truth.block)
     groups = [Group("given", IMAGE_IDS)]
-    adjusted, _ = refine_block(contents, truth.block.poses, FOCAL_SIGMAS, groups, fixed=True)
+    adjusted, _ = refine_block(contents, Observed(truth.block.poses, FOCAL_SIGMAS, {}), groups, fixed=True)
     off_m, off_deg = errors(truth, adjusted)
     assert np.abs(off_m).max() < 1e-9
     assert off_deg.max() < 1e-5
@@ -133,9 +133,8 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     sides = {i: n % 3 == 2 for n, i in enumerate(IMAGE_IDS)}
     apart = [p for p in truth.pairs if sides[p.pair.image_id0] == sides[p.pair.image_id1]]
     groups = [Group("positions", ("img0", "img1", "img3", "img4")), Group("positions", ("img2", "img5"))]
-    adjusted, figures = refine_block(
-        replace(contents, pairs=apart), given_positions(truth, 1, 0.1), FOCAL_SIGMAS, groups, fixed=False
-    )
+    observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
+    adjusted, figures = refine_block(replace(contents, pairs=apart), observed, groups, fixed=False)
     assert [one["images"] for one in figures] == [4, 2]
     assert sorted(adjusted.poses) == list(IMAGE_IDS)
     seen = np.concatenate([track[:, 1] for track in adjusted.tracks.values()])

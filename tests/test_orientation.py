@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
@@ -160,6 +161,44 @@ def test_outliers_among_the_positions_are_left_out() -> None:
     assert np.flatnonzero(~found.agreeing).tolist() == [3]
     assert found.trusted
     assert max(attitude_errors(truth, found.rotations(rotations))) < 0.3
+
+
+def tilted_block(noise_deg: float) -> tuple[dict[str, Pose], FloatArray, FloatArray, FloatArray, FloatArray]:
+    """A flight over ground that falls by 10 degrees: centres, rotations and points of a model, and measured ups."""
+    truth = flight()
+    _, points = matches(truth)
+    points = points + np.column_stack([np.zeros((len(points), 2)), np.tan(np.deg2rad(10.0)) * points[:, 0]])
+    centers, rotations, moved = model_of(truth, points)
+    rng = np.random.default_rng(2)
+    turns = Rotation.from_rotvec(rng.normal(0.0, noise_deg, (len(truth), 3)), degrees=True).as_matrix()
+    measured = [turn @ pose.world_rotation[:, 2] for turn, pose in zip(turns, truth.values(), strict=True)]
+    ups = np.einsum("nji,nj->ni", rotations, np.array(measured))
+    return truth, centers, rotations, moved, ups
+
+
+def tilts_off(truth: dict[str, Pose], rotations: FloatArray) -> float:
+    """Largest angle between up in the block and true up, degrees: turns about the vertical do not count."""
+    pairs = zip(truth.values(), rotations, strict=True)
+    return max(np.rad2deg(np.arccos(np.clip(r[:, 2] @ p.world_rotation[:, 2], -1, 1))) for p, r in pairs)
+
+
+def test_measured_tilts_level_a_block_over_a_slope() -> None:
+    truth, centers, rotations, points, ups = tilted_block(0.5)
+    nowhere = np.full((len(centers), 3), np.nan)
+    by_terrain = place(centers, points, nowhere, np.full(len(centers), np.nan))
+    assert tilts_off(truth, by_terrain.rotations(rotations)) > 8.0
+    by_tilts = place(centers, points, nowhere, np.full(len(centers), np.nan), ups)
+    assert tilts_off(truth, by_tilts.rotations(rotations)) < 0.6
+
+
+def test_tilts_that_contradict_each_other_or_the_terrain_do_not_count() -> None:
+    _, centers, _, points, ups = tilted_block(0.5)
+    nowhere, none = np.full((len(centers), 3), np.nan), np.full(len(centers), np.nan)
+    expected = place(centers, points, nowhere, none).rotation
+    rng = np.random.default_rng(3)
+    for wrong in (rng.normal(size=ups.shape), -ups, np.roll(ups, 1, axis=1)):
+        unit = wrong / np.linalg.norm(wrong, axis=1, keepdims=True)
+        np.testing.assert_allclose(place(centers, points, nowhere, none, unit).rotation, expected)
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,15 @@ class Located(NamedTuple):
     unusable: Mapping[str, Sequence[str]]
 
 
+def angles_of_exif(facts: ExifFacts, angles: AngleConvention) -> Angles | None:
+    """Attitude that an image's header states, whether or not it states a position; yaw as it counts there."""
+    found = facts.angles
+    if found is None:
+        return None
+    convention = found.convention if angles == "auto" else angles
+    return Angles("yaw_pitch_roll", (found.yaw_deg, found.pitch_deg, found.roll_deg), convention == "gimbal")
+
+
 def oriented(
     observations: Mapping[str, Observation],
     crs: str,

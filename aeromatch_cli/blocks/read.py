@@ -21,6 +21,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Observation,
+    angles_of_exif,
     observation_of_exif,
     observation_of_row,
     oriented,
@@ -144,6 +145,9 @@ def block_inputs(
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
     stated = _stated_ground(camera_file, frame, Path(lists.cameras).name)
     hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
+    if lists.poses == EXIF:  # tilts of images without a position
+        alone = {name: angles_of_exif(fact, lists.angles) for name, fact in facts.items() if name not in angles}
+        angles |= {name: one for name, one in alone.items() if one is not None}
     ids = image_ids(facts)
     return BlockInputs(
         images=_images(ids, facts, assignment.camera_ids),

@@ -34,18 +34,24 @@ _PRIOR_LOSS_SIGMAS = 3.0
 
 
 def adjusted(
-    pycolmap: ModuleType, model: Any, cameras: dict[str, Any], positions_m: FloatArray, sigmas_m: FloatArray
+    pycolmap: ModuleType,
+    model: Any,
+    cameras: dict[str, Any],
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    ups: FloatArray,
 ) -> Placement:
     """Place a model in the world, adjust it with the given positions as observations, and place it once more.
 
-    The adjustment takes what the positions say of the model's shape; how it is levelled is for `place` to weigh.
+    The adjustment takes what the positions say of the model's shape; how it is levelled is for `place` to weigh. ups:
+    one row per image number, unit vectors upwards in the camera's frame by its measured tilt, NaN where there is none.
     """
     ids = image_numbers(model)
     rows = np.array(ids) - 1
-    placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows])
+    placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
     used = [] if placement.kind == "level" else [i for i, agrees in zip(ids, placement.agreeing, strict=True) if agrees]
     _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m)
-    return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows])
+    return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
 
 
 def adjust_in_place(
@@ -144,9 +150,11 @@ def _with_prior_focal_lengths(
 
 
 def _placed(
-    pycolmap: ModuleType, model: Any, ids: list[int], positions_m: FloatArray, sigmas_m: FloatArray
+    pycolmap: ModuleType, model: Any, ids: list[int], positions_m: FloatArray, sigmas_m: FloatArray, ups: FloatArray
 ) -> Placement:
-    placement = place(_centers(model, ids), _points(model), positions_m, sigmas_m)
+    rotations = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])
+    in_model = np.einsum("nji,nj->ni", rotations, ups)
+    placement = place(_centers(model, ids), _points(model), positions_m, sigmas_m, in_model)
     rotation = pycolmap.Rotation3d(placement.rotation)
     model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.translation_m))
     return placement

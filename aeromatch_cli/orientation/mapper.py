@@ -43,7 +43,7 @@ def solve(folder: Path) -> None:
         _drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
-        placement = adjusted(pycolmap, model, task["cameras"], priors["positions_m"], priors["sigmas_m"])
+        placement = adjusted(pycolmap, model, task["cameras"], priors["positions_m"], priors["sigmas_m"], priors["ups"])
         name = f"model{number}.npz"
         np.savez(folder / name, **arrays(model))
         facts.append({"file": name, "kind": placement.kind, "contradiction": placement.contradiction, **figures(model)})

@@ -21,6 +21,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents
@@ -48,17 +49,26 @@ class Model:
     figures: Mapping[str, Any]
 
 
-def map_block(
-    contents: ExportContents, positions: Mapping[str, Pose], focal_sigmas: Mapping[str, float], mapper: Mapper
-) -> tuple[Model, ...]:
-    """Models of a block's verified pairs, the largest first.
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What was given of a block, as observations.
 
-    positions: image_id -> pose whose centre and sigma_position_m are observations; its rotation is not used.
-    focal_sigmas: camera_id -> standard deviation of its focal length, as a share of it.
+    poses: image_id -> pose whose centre is one, with sigma_position_m. focal_sigmas: camera_id -> standard deviation of
+    its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt counts.
+    """
+
+    poses: Mapping[str, Pose]
+    focal_sigmas: Mapping[str, float]
+    angles: Mapping[str, Angles]
+
+
+def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> tuple[Model, ...]:
+    """Models of a block's verified pairs, the largest first; given rotations are not used, but for their tilts.
+
     Raises InputError where the mapper stops; no model is no error.
     """
     block = contents.block
-    with _task(contents, positions, focal_sigmas) as folder:
+    with _task(contents, observed) as folder:
         facts = _solved(folder, "mapper", {"mapper": mapper}, f"pycolmap's {mapper} mapping")
         return tuple(_read(folder, one, block) for one in facts)
 
@@ -72,18 +82,13 @@ class Group:
 
 
 def refine_block(
-    contents: ExportContents,
-    given: Mapping[str, Pose],
-    focal_sigmas: Mapping[str, float],
-    groups: Sequence[Group],
-    *,
-    fixed: bool,
+    contents: ExportContents, observed: Observed, groups: Sequence[Group], *, fixed: bool
 ) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
     """The block adjusted from its poses and verified pairs, and figures of every group.
 
-    given: image_id -> pose whose centre is an observation; its rotation is one in groups of kind "given", where the
-    block still has it. groups: the largest first; images of none are tied to the first where they share enough of its
-    points. fixed: poses and cameras stay, points are triangulated all the same. Raises InputError where pycolmap stops.
+    A given rotation is an observation in groups of kind "given", where the block still has it. groups: the largest
+    first; images of none are tied to the first where they share enough of its points. fixed: poses and cameras stay,
+    points are triangulated all the same. Raises InputError where pycolmap stops.
     """
     block = contents.block
     number = {image_id: row for row, image_id in enumerate(_image_ids(block), start=1)}
@@ -93,7 +98,7 @@ def refine_block(
         "more": len(grouped) < len(block.images),
         "fixed": fixed,
     }
-    with _task(contents, given, focal_sigmas) as folder:
+    with _task(contents, observed) as folder:
         facts = _solved(folder, "refiner", task, "pycolmap's bundle adjustment")
         archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
     for one in facts:
@@ -132,8 +137,9 @@ def _image_ids(block: Block) -> list[str]:
 
 
 @contextmanager
-def _task(contents: ExportContents, positions: Mapping[str, Pose], focal_sigmas: Mapping[str, float]) -> Iterator[Path]:
+def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
     """A folder with database.db, sparse/, priors.npz and task.json for a process of its own."""
+    positions = observed.poses
     image_ids = _image_ids(contents.block)
     with tempfile.TemporaryDirectory(prefix="aeromatch-") as scratch:
         folder = Path(scratch) / "task"
@@ -142,17 +148,19 @@ def _task(contents: ExportContents, positions: Mapping[str, Pose], focal_sigmas:
             str(number): {
                 "params": colmap_params(contents.block.cameras[k]),
                 "focal_px": focal_px(contents.block.cameras[k]),
-                "sigma": focal_sigmas[k],
+                "sigma": observed.focal_sigmas[k],
             }
             for number, k in enumerate(sorted(contents.block.cameras), start=1)
         }
         (folder / "task.json").write_text(json.dumps({"cameras": cameras}), encoding="utf-8")
         nowhere, untold = np.full(3, np.nan), np.full((3, 3), np.nan)
+        ups = {i: one.rotation[:, 2] for i, one in observed.angles.items()}
         turns = {i: pose.world_rotation for i, pose in positions.items() if pose.world_rotation is not None}
         np.savez(
             folder / "priors.npz",
             positions_m=np.array([positions[i].center_m if i in positions else nowhere for i in image_ids]),
             sigmas_m=np.array([positions[i].sigma_position_m if i in positions else np.nan for i in image_ids]),
+            ups=np.array([ups.get(i, nowhere) for i in image_ids]),
             rotations=np.array([turns.get(i, untold) for i in image_ids]),
             sigmas_deg=np.array([positions[i].sigma_angle_deg if i in positions else np.nan for i in image_ids]),
         )

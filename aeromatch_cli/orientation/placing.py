@@ -2,8 +2,8 @@
 
 A mapper gives poses and points up to a similarity. Positions that are spread in two directions determine it, the
 worse the closer they lie together; positions along one line leave the turn about the line open; without positions the
-whole orientation and the scale are open. What is open is taken from the terrain: its plane of best fit is about level,
-and the cameras are above it.
+whole orientation and the scale are open. What is open is taken from the tilts that the cameras have measured, where
+these agree with each other, else from the terrain: its plane of best fit is about level, the cameras are above it.
 """
 
 from __future__ import annotations
@@ -29,6 +29,11 @@ _TRUSTED = 0.85
 _DOUBTFUL = 5.0
 # How far from level the plane of best fit of a terrain usually is.
 _LEVEL_SIGMA_DEG = 3.0
+# Measured tilts are good to this, and count where they agree to so many degrees with each other, and with the terrain
+# to so many.
+_TILT_SIGMA_DEG = 1.0
+_TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG = 3.0, 30.0
+_LEAST_TILTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,25 +64,57 @@ class Placement:
         return np.asarray(cam_from_model @ self.rotation.T)
 
 
-def place(centers: FloatArray, points: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray) -> Placement:
+def place(
+    centers: FloatArray,
+    points: FloatArray,
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    ups: FloatArray | None = None,
+) -> Placement:
     """The similarity from a model to the world.
 
     centers: (N, 3) projection centres in the model; points: (P, 3) its points; positions_m: (N, 3) given positions in
-    the world, NaN where there is none; sigmas_m: (N,) their standard deviations.
+    the world, NaN where there is none; sigmas_m: (N,) their standard deviations. ups: (N, 3) unit vectors upwards in
+    the model by the tilt that each camera has measured, NaN where it has none.
     """
+    vertical = _vertical(centers, points, ups)
     known: BoolArray = np.asarray(np.isfinite(positions_m).all(axis=1))
     found = _by_positions(centers[known], positions_m[known], sigmas_m[known]) if known.sum() >= 2 else None
     if found is None:
-        return _level(centers, points, known)
+        return _level(centers, points, known, vertical)
     contradiction = found.contradiction
-    if not contradiction and _upside_down(found, centers[known], points, positions_m[known], sigmas_m[known]):
+    if not contradiction and _upside_down(found, centers[known], positions_m[known], sigmas_m[known], vertical):
         contradiction = "mirrored"
     if contradiction:
-        return replace(_level(centers, points, known), contradiction=contradiction)
+        return replace(_level(centers, points, known, vertical), contradiction=contradiction)
     agreeing = np.zeros(len(centers), dtype=bool)
     agreeing[np.flatnonzero(known)[found.agreeing]] = True
     found = replace(found, agreeing=agreeing)
-    return _levelled(found, centers, points, positions_m[agreeing], float(np.median(sigmas_m[agreeing])))
+    return _levelled(found, centers, positions_m[agreeing], float(np.median(sigmas_m[agreeing])), vertical)
+
+
+@dataclass(frozen=True, eq=False)
+class _Vertical:
+    """up: (3,) unit vector in the model, with its standard deviation."""
+
+    up: FloatArray
+    sigma_deg: float
+
+
+def _vertical(centers: FloatArray, points: FloatArray, ups: FloatArray | None) -> _Vertical:
+    """Up by the measured tilts, where these agree, else by the terrain."""
+    by_terrain = _Vertical(_up(centers, points), _LEVEL_SIGMA_DEG)
+    measured = np.zeros((0, 3)) if ups is None else ups[np.isfinite(ups).all(axis=1)]
+    if len(measured) < _LEAST_TILTS:
+        return by_terrain
+    up = np.median(measured, axis=0)
+    for _ in range(10):
+        apart_deg = np.rad2deg(np.arccos(np.clip(measured @ up / np.linalg.norm(up), -1.0, 1.0)))
+        up = np.average(measured, axis=0, weights=1.0 / (1.0 + (apart_deg / _TILTS_AGREE_DEG) ** 2))
+    up = up / np.linalg.norm(up)
+    apart_deg = np.rad2deg(np.arccos(np.clip(measured @ up, -1.0, 1.0)))
+    plausible = up @ by_terrain.up > np.cos(np.deg2rad(_TILTS_PLAUSIBLE_DEG))
+    return _Vertical(up, _TILT_SIGMA_DEG) if plausible and np.median(apart_deg) < _TILTS_AGREE_DEG else by_terrain
 
 
 def similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -123,13 +160,13 @@ def _by_positions(centers: FloatArray, positions_m: FloatArray, sigmas_m: FloatA
 
 
 def _upside_down(
-    found: Placement, centers: FloatArray, points: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray
+    found: Placement, centers: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray, vertical: _Vertical
 ) -> bool:
     """Whether positions fit only with the ground above the cameras: seen from below they are mirrored.
 
     Positions along one line fit either way.
     """
-    up = _up(centers, points)
+    up = vertical.up
     if (found.rotation @ up)[2] >= 0.0:
         return False
     # Points below the centres keep the fit upright.
@@ -152,9 +189,9 @@ def _errors(fit: tuple[float, FloatArray, FloatArray], centers: FloatArray, posi
     return np.asarray(np.linalg.norm(scale * centers @ rotation.T + translation_m - positions_m, axis=1))
 
 
-def _level(centers: FloatArray, points: FloatArray, known: BoolArray) -> Placement:
-    """Level by the terrain, the median flying height LOCAL_FLYING_HEIGHT, the middle of the cameras at x = y = 0."""
-    up = _up(centers, points)
+def _level(centers: FloatArray, points: FloatArray, known: BoolArray, vertical: _Vertical) -> Placement:
+    """Level, the median flying height LOCAL_FLYING_HEIGHT, the middle of the cameras at x = y = 0."""
+    up = vertical.up
     east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
     east /= np.linalg.norm(east)
     rotation = np.array([east, np.cross(up, east), up])
@@ -166,13 +203,13 @@ def _level(centers: FloatArray, points: FloatArray, known: BoolArray) -> Placeme
 
 
 def _levelled(
-    found: Placement, centers: FloatArray, points: FloatArray, used_m: FloatArray, sigma_m: float
+    found: Placement, centers: FloatArray, used_m: FloatArray, sigma_m: float, vertical: _Vertical
 ) -> Placement:
     """Turned about the middle of the positions used (N, 3) to the most probable attitude of the block.
 
     Positions with standard deviation s that lie at r_i from their middle determine a small turn w with the information
-    sum [r_i]x^T [r_i]x / s^2, along a line none about it. The terrain's plane of best fit says that the block is level
-    with a standard deviation of _LEVEL_SIGMA_DEG. Both are weighed against each other.
+    sum [r_i]x^T [r_i]x / s^2, along a line none about it. Tilts or terrain say where up is, with their own standard
+    deviation. Both are weighed against each other.
     """
     from scipy.spatial.transform import Rotation
 
@@ -184,10 +221,10 @@ def _levelled(
     arms = used_m - middle_m
     spread = np.eye(3) * (arms**2).sum() - arms.T @ arms
     information = spread / max(sigma_m, 1e-9) ** 2
-    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(_LEVEL_SIGMA_DEG) ** 2
+    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(vertical.sigma_deg) ** 2
     total = np.eye(3)
     for _ in range(20):
-        up = total @ _up(found.points(centers), found.points(points))
+        up = total @ found.rotation @ vertical.up
         to_level = np.cross(up, [0.0, 0.0, 1.0])
         if up[2] < 0.0:
             to_level = to_level / max(float(np.linalg.norm(to_level)), 1e-9)

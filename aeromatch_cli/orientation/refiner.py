@@ -91,7 +91,7 @@ def _refined(
             break
         before = model.compute_mean_reprojection_error()
         if kind == "positions":
-            adjusted(pycolmap, model, cameras, positions_m, sigmas_m)
+            adjusted(pycolmap, model, cameras, positions_m, sigmas_m, priors["ups"])
         else:
             adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes)
         model.update_point_3d_errors()

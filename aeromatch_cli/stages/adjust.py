@@ -35,7 +35,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 4
+VERSION = 5
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 
@@ -58,13 +58,8 @@ def run(context: Context) -> StageReport:
     _remove(context)
     try:
         with context.executor.step("adjust"):
-            adjusted, figures = refine_block(
-                contents_of(context),
-                context.given.poses,
-                context.focal_sigmas,
-                groups,
-                fixed=isinstance(recipe, FirstPass) and not recipe.replaces,
-            )
+            fixed = isinstance(recipe, FirstPass) and not recipe.replaces
+            adjusted, figures = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
         return report.write(context.workspace)
@@ -91,8 +86,8 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
-    focal = sorted(context.focal_sigmas.items())
-    return fingerprint(versions, context.settings.orient, held, state, focal, pairs, control)
+    known = sorted(context.focal_sigmas.items()), sorted(context.angles.items())
+    return fingerprint(versions, context.settings.orient, held, state, known, pairs, control)
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:

@@ -14,6 +14,7 @@ from aeromatch_cli.data import Block, ControlPoint, Image, Neighbour, Pair, Pair
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.workspace import Workspace, fingerprint
 
@@ -46,6 +47,11 @@ class Context:
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
     known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
     known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def observed(self) -> Observed:
+        """What was given, for mapping and adjustment."""
+        return Observed(self.given.poses, self.focal_sigmas, self.angles)
 
     @property
     def guessed_cameras(self) -> frozenset[str]:

@@ -44,7 +44,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 4
+VERSION = 5
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -142,7 +142,7 @@ def _mapped(
 
     def mapped(one: Context) -> tuple[Model, ...]:
         with context.executor.step("first pass: mapping"):
-            return map_block(contents_of(one), positions, context.focal_sigmas, recipe.mapper)
+            return map_block(contents_of(one), context.observed, recipe.mapper)
 
     models = mapped(first)
     if not positions or (models and not models[0].figures["contradiction"]):
@@ -185,7 +185,9 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         pose = block.poses.get(image.image_id)
         place = None if pose is None else (pose.center_m, pose.world_rotation, pose.sigma_position_m)
         taken = context.image_fingerprints[image.image_id], image.time
-        images[image.image_id] = fingerprint(taken, image.camera_id, block.camera(image), place)
+        images[image.image_id] = fingerprint(
+            taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id)
+        )
     how: list[Any] = [settings.orient, settings.block.max_size_px, settings.block.masks]
     if isinstance(settings.pairs, Similar):
         how.append(settings.pairs)
