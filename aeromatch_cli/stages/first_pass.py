@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from aeromatch_cli.data import Pair
+from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.orientation.judgement import PairPoints
 from aeromatch_cli.orientation.retrieval import similar_pairs
@@ -26,17 +26,21 @@ from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
 from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 
-# A look at given poses needs less than finding poses does: reduced size, share of the keypoints, neighbours.
-_LOOK_SIZE_PX, _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 1200, 0.5, 8
+# A look at given poses needs less than finding poses does: reduced size (in pixels, and as a share of the images, but
+# no less than so many pixels), share of the keypoints, neighbours.
+_LOOK_SIZE_PX, _LOOK_SHARE, _LOOK_LEAST_PX = 1200, 0.6, 400
+_LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 0.5, 8
 # Up to so many pairs of images without position are all compared: less than two minutes on two cores.
 _MOST_PAIRS = 12_000
 
 
-def look(recipe: FirstPass) -> FirstPass:
+def look(recipe: FirstPass, block: Block) -> FirstPass:
     """The cheaper first pass by which given poses are judged before they are found anew."""
+    longest_px = max(max(image.width_px, image.height_px) for image in block.images)
+    size_px = max(_LOOK_LEAST_PX, min(_LOOK_SIZE_PX, round(_LOOK_SHARE * longest_px)))
     return recipe.model_copy(
         update={
-            "size_px": min(recipe.size_px, _LOOK_SIZE_PX),
+            "size_px": min(recipe.size_px, size_px),
             "keypoints": max(100, round(_LOOK_KEYPOINTS * recipe.keypoints)),
             "neighbours": min(recipe.neighbours, _LOOK_NEIGHBOURS),
         }

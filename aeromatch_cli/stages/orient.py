@@ -111,7 +111,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
     looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
-    first, evidence = _evidence(context, first_pass.look(recipe) if looks else recipe)
+    first, evidence = _evidence(context, first_pass.look(recipe, block) if looks else recipe)
     good = evidence.explained()
     if looks and recipe.replaces and not suffices(evidence, good):
         first, evidence = _evidence(context, recipe)
