@@ -125,15 +125,15 @@ def judged(given: Solution, pictures: Solution) -> Solution:
 
 
 def from_models(
-    block: Block, models: Sequence[Model], before: Mapping[str, Pose], angles: Mapping[str, Angles]
+    evidence: Evidence, models: Sequence[Model], before: Mapping[str, Pose], angles: Mapping[str, Angles]
 ) -> Solution:
     """Given poses and cameras, replaced by those of the mapper's models, the largest first.
 
     before: poses that an earlier run found for images that have not changed; models are moved onto them, and where
     they agree the images keep them. angles: image_id -> attitude as it was given.
     """
+    block = evidence.block
     poses, cameras = dict(block.poses), dict(block.cameras)
-    points: list[FloatArray] = [np.zeros((0, 3))]
     found: dict[str, Pose] = {}
     offset_m = 0.0
     for model in reversed(models):  # the largest model's cameras count
@@ -149,7 +149,6 @@ def from_models(
             found[image_id] = Pose(model.centers_m[image_id], rotation, sigma_m, _SIGMA_ANGLE_DEG)
         found |= kept
         cameras |= model.cameras
-        points.append(model.points_m[model.track_lengths >= 3])
     level = bool(models) and models[0].kind == "level"
     convention = None if level else _convention(models, angles)
     given = dict(block.poses)
@@ -164,20 +163,23 @@ def from_models(
         if level:
             del poses[image_id]  # its position is in another frame than the others'
     poses |= found
+    # The mapper's own points are few: it leans on the longest tracks.
+    lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
+    points = _finite(triangulated(evidence.pairs, found, lenses))
     facts = {
         "method": "pictures",
         "frame": "own" if level else "world",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
         "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
         "calibrated": sorted({k for model in models for k in model.cameras}),
-        "points": sum(len(p) for p in points),
+        "points": len(points),
         **_judged(given, found),
         "outside": _outside(block, found),
         "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }
     if level:
         facts["wrong_positions"] = facts["wrong_attitudes"] = {}
-    return Solution(cameras, poses, terrain_of(np.concatenate(points), _area(poses)), facts)
+    return Solution(cameras, poses, terrain_of(points, _area(poses)), facts)
 
 
 def _convention(models: Sequence[Model], angles: Mapping[str, Angles]) -> Recognised | None:

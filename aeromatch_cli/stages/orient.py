@@ -44,7 +44,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 5
+VERSION = 6
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -120,7 +120,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
         solution = from_given(evidence, good, correct=recipe.replaces)
     else:
         models, first, evidence = _mapped(context, recipe, first, evidence)
-        solution = from_models(block, models, _poses_before(context, kept), context.angles)
+        solution = from_models(evidence, models, _poses_before(context, kept), context.angles)
         if not models:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
