@@ -81,6 +81,19 @@ def test_the_zero_of_pitch_is_recognised(forward: bool, remedy: str) -> None:
     assert max(angle_between_deg(found.rotation(wrong[i]), true[i].rotation) for i in true) < 1.0
 
 
+@pytest.mark.parametrize(
+    ("kind", "change", "words"), FAULTS[:2] + FAULTS[5:8], ids=[w for _, _, w in FAULTS[:2] + FAULTS[5:8]]
+)
+def test_a_tilted_frame_does_not_change_the_verdict(kind: str, change, words: str) -> None:
+    from scipy.spatial.transform import Rotation
+
+    true = flown(kind)
+    frame = Rotation.from_euler("xy", [2.5, -2.0], degrees=True).as_matrix()
+    found = recognised(written(true, change), {i: r @ frame for i, r in attitudes(true).items()})
+    assert found is not None
+    assert found.words.startswith(words) or words in found.words.split(" and ")[0]
+
+
 def test_a_transposed_quaternion_is_named() -> None:
     from aeromatch_cli.geometry.rotations import to_quaternion
 

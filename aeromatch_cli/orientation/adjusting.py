@@ -21,9 +21,6 @@ from aeromatch_cli.orientation.precision import Observations, pose_sigmas
 
 # A prior focal length is taken where the cost with it is larger by no more than this share.
 _SAME_COST = 0.05
-# An adjustment has converged when a step lowers the cost by a smaller share: poses are exact to 0.3 % of their standard
-# deviations then, in a third of the time that 1e-6 takes.
-_COST_TOLERANCE = 1e-4
 # No coordinate of a keypoint is measured more exactly, in pixels.
 _LEAST_ERROR_PX = 0.03
 # Fewer images do not determine a camera's distortion: it stays as it was given or as mapping left it.
@@ -41,17 +38,19 @@ def adjusted(
     positions_m: FloatArray,
     sigmas_m: FloatArray,
     ups: FloatArray,
+    tolerance: float,
 ) -> Placement:
     """Place a model in the world, adjust it with the given positions as observations, and place it once more.
 
     The adjustment takes what the positions say of the model's shape; how it is levelled is for `place` to weigh. ups:
     one row per image number, unit vectors upwards in the camera's frame by its measured tilt, NaN where there is none.
+    tolerance: it ends when a step lowers the cost by a smaller share.
     """
     ids = image_numbers(model)
     rows = np.array(ids) - 1
     placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
     used = [] if placement.kind == "level" else [i for i, agrees in zip(ids, placement.agreeing, strict=True) if agrees]
-    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m)
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
     return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
 
 
@@ -62,6 +61,7 @@ def adjust_in_place(
     positions_m: FloatArray,
     sigmas_m: FloatArray,
     attitudes: Attitudes,
+    tolerance: float,
 ) -> None:
     """Adjust a model whose poses are in the world frame already; it stays there.
 
@@ -70,7 +70,7 @@ def adjust_in_place(
     """
     used = [i for i in image_numbers(model) if np.isfinite(positions_m[i - 1]).all()]
     used = used if len(used) >= _HOLDING else []
-    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m)
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
     rows = np.array(used, dtype=int) - 1
     arms_m = positions_m[rows] - positions_m[rows].mean(axis=0) if used else np.zeros((0, 3))
     weights = 1.0 / sigmas_m[rows] ** 2
@@ -112,11 +112,12 @@ def _adjust(
     used: list[int],
     positions_m: FloatArray,
     sigmas_m: FloatArray,
+    tolerance: float,
 ) -> None:
     """used: numbers of the images whose positions are observations; without any the frame is held by two images."""
 
     def adjuster(which: Any, fixed_cameras: bool) -> Any:
-        return _adjuster(pycolmap, which, used, positions_m, sigmas_m, fixed_cameras)
+        return _adjuster(pycolmap, which, used, positions_m, sigmas_m, fixed_cameras, tolerance)
 
     if not _with_prior_focal_lengths(pycolmap, model, cameras, adjuster):
         adjuster(model, False).solve()
@@ -168,11 +169,12 @@ def _adjuster(
     positions_m: FloatArray,
     sigmas_m: FloatArray,
     fixed_cameras: bool,
+    tolerance: float,
 ) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance = _COST_TOLERANCE
+    options.ceres.solver_options.function_tolerance = tolerance
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.refine_extra_params = _determines_distortion(model)
     config = pycolmap.BundleAdjustmentConfig()

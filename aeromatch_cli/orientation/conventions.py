@@ -20,6 +20,8 @@ Reading = Callable[[Angles], FloatArray]
 
 # Attitudes agree where the median angle between them is no larger; the frame of a short block is no more exact.
 _AGREE_DEG = 5.0
+# How far from level the frame of the pictures may be: positions with errors level a small block no better.
+_FRAME_DEG = 5.0
 # Another reading must be better by this factor than the angles as they were read.
 _BETTER = 0.4
 # Among readings that fit, the first whose median is at most this factor and these degrees above the best.
@@ -163,5 +165,11 @@ def _heading_deg(turns: FloatArray) -> float:
 
 
 def _median_deg(rotations: FloatArray, true: FloatArray) -> float:
-    cosines = (np.einsum("nij,nij->n", rotations, true) - 1.0) / 2.0
-    return float(np.median(np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))))
+    """Median angle between attitudes, degrees, but for a small tilt that all have in common: the frame's own error."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(true.transpose(0, 2, 1) @ rotations)
+    tilts = np.median(turns.as_rotvec(degrees=True), axis=0) * [1.0, 1.0, 0.0]
+    if np.linalg.norm(tilts) > _FRAME_DEG:
+        tilts = np.zeros(3)
+    return float(np.median(np.rad2deg((Rotation.from_rotvec(-tilts, degrees=True) * turns).magnitude())))

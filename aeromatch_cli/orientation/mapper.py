@@ -26,6 +26,7 @@ _MIN_IMAGES = 3
 # take 13 s with 100, 36 s with 300. Small blocks need them: lewis 0.5 degrees with 100, 0.1 with 300. Points after that
 # are left to the adjustment of the final matches.
 _TRACKS_PER_IMAGE, _LEAST_TRACKS, _TRACKS = 300, 100, 30_000
+# Adjustments end when a step lowers the cost by a smaller share: exact enough for views and search.
 _COST_TOLERANCE = 1e-4
 # Images with fewer points than this in their model are taken out of it.
 _MIN_OBSERVATIONS = 12
@@ -45,7 +46,8 @@ def solve(folder: Path) -> None:
         _drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
-        placement = adjusted(pycolmap, model, task["cameras"], priors["positions_m"], priors["sigmas_m"], priors["ups"])
+        observed = priors["positions_m"], priors["sigmas_m"], priors["ups"]
+        placement = adjusted(pycolmap, model, task["cameras"], *observed, _COST_TOLERANCE)
         name = f"model{number}.npz"
         np.savez(folder / name, **arrays(model))
         facts.append({"file": name, "kind": placement.kind, "contradiction": placement.contradiction, **figures(model)})

@@ -32,6 +32,9 @@ from aeromatch_cli.orientation.adjusting import (
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
 _WORTH_AGAIN = 0.1
 _MAX_ROUNDS = 3
+# An adjustment ends when a step lowers the cost by a smaller share. With 1e-4 it takes a third of the time, and heights
+# of check points come out four times as bad.
+_COST_TOLERANCE = 1e-6
 _MIN_OBSERVATIONS = 12
 # With fewer points of three images or more, those of two count as well.
 _FEW_OBSERVATIONS = 50
@@ -91,9 +94,9 @@ def _refined(
             break
         before = model.compute_mean_reprojection_error()
         if kind == "positions":
-            adjusted(pycolmap, model, cameras, positions_m, sigmas_m, priors["ups"])
+            adjusted(pycolmap, model, cameras, positions_m, sigmas_m, priors["ups"], _COST_TOLERANCE)
         else:
-            adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes)
+            adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
         model.update_point_3d_errors()
         if model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
             break

@@ -44,7 +44,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 6
+VERSION = 7
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
