@@ -58,7 +58,7 @@ def refine(folder: Path) -> None:
     facts = []
     for number, group in enumerate(task["groups"]):
         model = _posed(pycolmap, folder, set(group["images"]))
-        model = _triangulated(pycolmap, model, folder, rough=not task["fixed"])
+        model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and not task["fixed"])
         attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
         registered: list[int] = []
         if not task["fixed"]:
@@ -89,7 +89,7 @@ def _refined(
 ) -> Any:
     """The model adjusted and triangulated in turn, while that makes it better."""
     positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
-    for _ in range(_MAX_ROUNDS):
+    for number in range(_MAX_ROUNDS):
         if model.num_points3D() < _MIN_OBSERVATIONS:
             break
         before = model.compute_mean_reprojection_error()
@@ -98,10 +98,16 @@ def _refined(
         else:
             adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
         model.update_point_3d_errors()
-        if model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
+        made_roughly = number == 0 and _found(kind)
+        if not made_roughly and model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
             break
         model = _triangulated(pycolmap, model, folder, rough=False)
     return model
+
+
+def _found(kind: str) -> bool:
+    """Whether the poses of a group come from the first pass, and are less exact than matches of the final one."""
+    return kind != "given"
 
 
 def _posed(pycolmap: ModuleType, folder: Path, numbers: set[int]) -> Any:
