@@ -201,6 +201,16 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+def whole_record(path: Path) -> dict[str, Any]:
+    """A JSON record whose `files`, name -> digest, lie beside it as they were written; else nothing."""
+    if not path.is_file():
+        return {}
+    record = read_json(path)
+    folder = path.parent
+    whole = all((folder / n).is_file() and file_digest(folder / n) == d for n, d in record["files"].items())
+    return record if whole else {}
+
+
 def remove_stale_temporaries(root: Path) -> None:
     """Delete what a killed process of this machine left behind; files of live processes stay."""
     # os.walk passes over folders that another process removes meanwhile; Path.rglob raises.

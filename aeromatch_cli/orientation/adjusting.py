@@ -25,6 +25,8 @@ _SAME_COST = 0.05
 _LEAST_ERROR_PX = 0.03
 # Fewer images do not determine a camera's distortion: it stays as it was given or as mapping left it.
 _DISTORTION_IMAGES = 10
+# Images with fewer points than this in their model are taken out of it.
+MIN_OBSERVATIONS = 12
 # So many positions hold a model in the world frame.
 _HOLDING = 3
 # Position priors beyond this many standard deviations pull less and less (Cauchy).
@@ -230,11 +232,9 @@ def arrays(model: Any) -> dict[str, Any]:
         "images": np.array(ids),
         "rotations": np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
         "centers_m": _centers(model, ids),
-        "observations": np.array([model.images[i].num_points3D for i in ids]),
         "cameras": np.array(cameras),
         "points_m": _points(model),
         "errors_px": np.array([point.error for point in points]),
-        "track_lengths": np.array([point.track.length() for point in points]),
         **{f"params{i}": np.array(model.cameras[i].params) for i in cameras},
     }
 
@@ -290,6 +290,13 @@ def _error_px(model: Any) -> float:
     taken = np.sqrt(coordinates / max(coordinates - unknowns, 1))
     spread_px = model.compute_mean_reprojection_error() / np.sqrt(np.pi / 2.0)
     return max(float(spread_px * taken), _LEAST_ERROR_PX)
+
+
+def drop_weak_images(model: Any) -> None:
+    """Take images with few points out of a model."""
+    for image in list(model.images.values()):
+        if image.has_pose and image.num_points3D < MIN_OBSERVATIONS:
+            model.deregister_frame(image.frame_id)
 
 
 def figures(model: Any) -> dict[str, Any]:

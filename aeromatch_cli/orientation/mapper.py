@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import json
 import sys
-import zlib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.orientation.adjusting import adjusted, arrays, figures
+from aeromatch_cli.orientation.adjusting import adjusted, arrays, drop_weak_images, figures
+from aeromatch_cli.orientation.process import quiet_pycolmap
 
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
 _FOCAL_CHANGE = 0.1
@@ -28,22 +28,17 @@ _MIN_IMAGES = 3
 _TRACKS_PER_IMAGE, _LEAST_TRACKS, _TRACKS = 300, 100, 30_000
 # Adjustments end when a step lowers the cost by a smaller share: exact enough for views and search.
 _COST_TOLERANCE = 1e-4
-# Images with fewer points than this in their model are taken out of it.
-_MIN_OBSERVATIONS = 12
 
 
 def solve(folder: Path) -> None:
     """Map the database of `folder` and write every model in the world frame."""
-    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
+    pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     priors = np.load(folder / "priors.npz")
     models = _mapped(pycolmap, folder, task["mapper"])
     facts = []
     for number, model in enumerate(models):
-        _drop_weak_images(model)
+        drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
         observed = priors["positions_m"], priors["sigmas_m"], priors["ups"]
@@ -111,12 +106,6 @@ def _incremental(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, A
     options.extract_colors = False
     found: dict[int, Any] = pycolmap.incremental_mapping(database, out, out, options=options)
     return found
-
-
-def _drop_weak_images(model: Any) -> None:
-    for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < _MIN_OBSERVATIONS:
-            model.deregister_frame(image.frame_id)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ the given positions and adjusted with them as observations (`placing`, `mapper`)
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,9 +18,9 @@ from typing import Any, Literal
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
-from aeromatch_cli.errors import InputError
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
+from aeromatch_cli.orientation.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
@@ -34,17 +32,13 @@ class Model:
     """Images that were oriented together, in the world frame.
 
     rotations: image_id -> (3, 3) cam_from_world; centers_m: image_id -> (3,). cameras: camera_id -> Camera as
-    calibrated. points_m: (P, 3), errors_px: (P,) mean reprojection errors, track_lengths: (P,) images that see each.
-    observations: image_id -> points that it sees. kind: how it was placed (`placing.Placement`). figures: counts.
+    calibrated. points_m: (P, 3). kind: how it was placed (`placing.Placement`). figures: counts.
     """
 
     rotations: Mapping[str, FloatArray]
     centers_m: Mapping[str, FloatArray]
     cameras: Mapping[str, Camera]
     points_m: FloatArray
-    errors_px: FloatArray
-    track_lengths: IntArray
-    observations: Mapping[str, int]
     kind: str
     figures: Mapping[str, Any]
 
@@ -171,12 +165,7 @@ def _solved(folder: Path, process: str, task: Mapping[str, Any], what: str) -> l
     """Facts of the models that a process of its own makes in `folder`. InputError where it stops."""
     path = folder / "task.json"
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | task), encoding="utf-8")
-    command = [sys.executable, "-m", f"aeromatch_cli.orientation.{process}", str(folder)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    result = folder / "result.json"
-    if done.returncode or not result.is_file():
-        said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
-        raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")
+    result = run_process(process, folder, "result.json", what)
     return list(json.loads(result.read_text(encoding="utf-8"))["models"])
 
 
@@ -191,9 +180,6 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
         centers_m=dict(zip(names, arrays["centers_m"], strict=True)),
         cameras=cameras,
         points_m=arrays["points_m"],
-        errors_px=arrays["errors_px"],
-        track_lengths=arrays["track_lengths"],
-        observations=dict(zip(names, (int(n) for n in arrays["observations"]), strict=True)),
         kind=str(facts.pop("kind")),
         figures=facts,
     )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import sys
-import zlib
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,15 +18,18 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.adjusting import (
+    MIN_OBSERVATIONS,
     Attitudes,
     adjust_in_place,
     adjusted,
     arrays,
+    drop_weak_images,
     figures,
     image_numbers,
     sigmas_of,
     tracks_of,
 )
+from aeromatch_cli.orientation.process import quiet_pycolmap
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
 _WORTH_AGAIN = 0.1
@@ -35,7 +37,6 @@ _MAX_ROUNDS = 3
 # An adjustment ends when a step lowers the cost by a smaller share. With 1e-4 it takes a third of the time, and heights
 # of check points come out four times as bad.
 _COST_TOLERANCE = 1e-6
-_MIN_OBSERVATIONS = 12
 # With fewer points of three images or more, those of two count as well.
 _FEW_OBSERVATIONS = 50
 # An image is tied by so many points of those that it shares with the block, a quarter of them at least.
@@ -49,10 +50,7 @@ _FIRST_ERROR_PX = 12.0
 
 def refine(folder: Path) -> None:
     """Triangulate and adjust every group of posed images, and tie further images to the largest."""
-    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
+    pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     priors = np.load(folder / "priors.npz")
     facts = []
@@ -68,7 +66,7 @@ def refine(folder: Path) -> None:
             model = _refined(pycolmap, model, folder, group["kind"], task["cameras"], priors, attitudes)
         model.update_point_3d_errors()
         _drop_weak_points(model)
-        _drop_weak_images(model)
+        drop_weak_images(model)
         if not image_numbers(model):
             continue
         name = f"model{number}.npz"
@@ -90,7 +88,7 @@ def _refined(
     """The model adjusted and triangulated in turn, while that makes it better."""
     positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
     for number in range(_MAX_ROUNDS):
-        if model.num_points3D() < _MIN_OBSERVATIONS:
+        if model.num_points3D() < MIN_OBSERVATIONS:
             break
         before = model.compute_mean_reprojection_error()
         if kind == "positions":
@@ -190,12 +188,6 @@ def _options(pycolmap: ModuleType) -> Any:
     options.extract_colors = False
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
     return options
-
-
-def _drop_weak_images(model: Any) -> None:
-    for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < _MIN_OBSERVATIONS:
-            model.deregister_frame(image.frame_id)
 
 
 if __name__ == "__main__":

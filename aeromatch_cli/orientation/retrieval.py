@@ -8,10 +8,8 @@ grows with the block, so that the lists of its words, and with them the time of 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import tempfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -20,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.features import load_arrays
+from aeromatch_cli.orientation.process import quiet_pycolmap, run_process
 
 # Visual words per image, and the limits of their number.
 _WORDS_PER_IMAGE, _FEWEST_WORDS, _MOST_WORDS = 20, 500, 30_000
@@ -44,12 +42,7 @@ def similar_pairs(features: Mapping[str, Path], candidates: int) -> list[tuple[s
         folder = Path(scratch)
         task = {"features": [str(features[i]) for i in ids], "ranked": _RANKED_PER_CANDIDATE * candidates}
         (folder / "task.json").write_text(json.dumps(task), encoding="utf-8")
-        command = [sys.executable, "-m", "aeromatch_cli.orientation.retrieval", str(folder)]
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
-        if done.returncode:
-            said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
-            raise InputError(f"pycolmap's image retrieval stopped with exit code {done.returncode}: {said}")
-        ranking = np.load(folder / "ranking.npy")
+        ranking = np.load(run_process("retrieval", folder, "ranking.npy", "pycolmap's image retrieval"))
     return sorted((ids[a], ids[b]) for a, b in best_pairs(ranking, candidates * len(ids)))
 
 
@@ -70,10 +63,7 @@ def best_pairs(ranking: IntArray, count: int) -> set[tuple[int, int]]:
 
 def _retrieve(folder: Path) -> None:
     """The child's part: ranking.npy (N, R) from task.json. A process of its own, as in `mapping`."""
-    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 3
+    pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     descriptors = _write_database(pycolmap, folder / "retrieval.db", [Path(path) for path in task["features"]])
     images = len(task["features"])

@@ -28,8 +28,8 @@ from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import (
     file_digest,
     fingerprint,
-    read_json,
     translated_os_errors,
+    whole_record,
     write_atomically,
     write_json,
     write_text,
@@ -91,13 +91,8 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:
-    path = context.workspace.orientation / "adjusted.json"
-    if context.overwrite or not path.is_file():
-        return {}
-    record = read_json(path)
-    folder = context.workspace.orientation
-    whole = all((folder / n).is_file() and file_digest(folder / n) == d for n, d in record["files"].items())
-    return record if whole else {}
+    """The record of an earlier run whose files are as they were written, else nothing."""
+    return {} if context.overwrite else whole_record(context.workspace.orientation / "adjusted.json")
 
 
 def _remove(context: Context) -> None:

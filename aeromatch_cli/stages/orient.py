@@ -39,6 +39,7 @@ from aeromatch_cli.workspace import (
     fingerprint,
     read_json,
     translated_os_errors,
+    whole_record,
     write_atomically,
     write_json,
     write_text,
@@ -196,13 +197,7 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
 
 def _on_file(context: Context) -> Mapping[str, Any]:
     """The record of an earlier run whose files are as they were written, else nothing."""
-    folder = context.workspace.orientation
-    path = folder / "orientation.json"
-    if context.overwrite or not path.is_file():
-        return {}
-    record = read_json(path)
-    whole = all((folder / n).is_file() and file_digest(folder / n) == d for n, d in record["files"].items())
-    return record if whole else {}
+    return {} if context.overwrite else whole_record(context.workspace.orientation / "orientation.json")
 
 
 def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dict[str, Any]:

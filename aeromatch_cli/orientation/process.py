@@ -1,0 +1,30 @@
+"""Processes of their own for pycolmap, since it stops the whole process on a fault: `python -m MODULE FOLDER`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from types import ModuleType
+
+from aeromatch_cli.errors import InputError
+
+
+def run_process(module: str, folder: Path, result: str, what: str) -> Path:
+    """The file `result` that a module of this package makes in `folder`. InputError, naming `what`, where it stops."""
+    command = [sys.executable, "-m", f"aeromatch_cli.orientation.{module}", str(folder)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode or not (folder / result).is_file():
+        said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
+        raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")
+    return folder / result
+
+
+def quiet_pycolmap() -> ModuleType:
+    """For the child: pycolmap without its log."""
+    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    return pycolmap
