@@ -152,7 +152,8 @@ class Block:
     are absent. crs: authority code of the world frame, or "local". origin_m: (3,) what was subtracted from the
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the ground views, or None where no image has an attitude. tied: pairs (image_id0, image_id1) that a
-    first pass has matched; similar: pairs that look alike, where that was asked for.
+    first pass has matched; similar: pairs that look alike, where that was asked for. outside: images without an
+    attitude that `orient` has confirmed or found.
     """
 
     images: tuple[Image, ...]
@@ -165,6 +166,7 @@ class Block:
     gsd_m: float | None
     tied: tuple[tuple[str, str], ...] = ()
     similar: tuple[tuple[str, str], ...] = ()
+    outside: frozenset[str] = frozenset()
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]

@@ -24,6 +24,7 @@ from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.stages import batches, match
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.rows import PairTask
+from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.lightglue import inference
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
@@ -47,6 +48,11 @@ def task(image_id1: str) -> PairTask:
 
 
 PAIRS = [task(name) for name in ("same", "moved", "many", "few")]
+
+
+def alike(matcher: Matcher) -> dict[str, Matcher]:
+    """The same for every pair."""
+    return {pair.image_id1: matcher for pair in PAIRS}
 
 
 def sides(pair: PairTask) -> tuple[Features, Features]:
@@ -77,7 +83,7 @@ def test_together_they_find_what_each_finds_alone(
         return plain(self, questions)
 
     monkeypatch.setattr(Together, "run_network", spy)
-    found = matched_in_batches(matcher, PAIRS, sides)
+    found = matched_in_batches(alike(matcher), PAIRS, sides)
     assert asked == {1: [1, 1, 1], 3: [2, 1], 32: [3]}[most]
     assert found.keys() == {pair.image_id1 for pair in PAIRS}
     for pair in PAIRS:
@@ -88,9 +94,9 @@ def test_together_they_find_what_each_finds_alone(
 
 
 def test_one_by_one_where_nothing_is_gained(matcher: Together) -> None:
-    assert matched_in_batches(matcher, PAIRS[:1], sides) == {}
-    assert matched_in_batches(LightGlue(weights=matcher.weights), PAIRS, sides) == {}
-    assert matched_in_batches(Nearest(), PAIRS, sides) == {}
+    assert matched_in_batches(alike(matcher), PAIRS[:1], sides) == {}
+    assert matched_in_batches(alike(LightGlue(weights=matcher.weights)), PAIRS, sides) == {}
+    assert matched_in_batches(alike(Nearest()), PAIRS, sides) == {}
 
 
 def test_a_pair_that_fails_is_left_for_its_own_turn(matcher: Together) -> None:
@@ -99,7 +105,7 @@ def test_a_pair_that_fails_is_left_for_its_own_turn(matcher: Together) -> None:
             raise ConfigError("no features")
         return sides(pair)
 
-    assert matched_in_batches(matcher, PAIRS, broken).keys() == {"same", "many", "few"}
+    assert matched_in_batches(alike(matcher), PAIRS, broken).keys() == {"same", "many", "few"}
 
 
 def test_where_the_network_fails_only_settled_pairs_are_there(
@@ -110,7 +116,7 @@ def test_where_the_network_fails_only_settled_pairs_are_there(
 
     monkeypatch.setattr(Together, "run_network", full)
     with caplog.at_level(logging.WARNING):
-        assert matched_in_batches(matcher, PAIRS, sides).keys() == {"many"}
+        assert matched_in_batches(alike(matcher), PAIRS, sides).keys() == {"many"}
     assert "pair by pair" in caplog.text
     assert "CUDA out of memory" in caplog.text
 
@@ -155,7 +161,7 @@ def test_the_stage_writes_what_was_asked_together(matcher: Together, tmp_path: P
         for name in names:
             own = sides(task(name))[1] if name != "a" else features(120)
             write_atomically(workspace.features(name), partial(write_features, features=own, fingerprint=""))
-        result = match.run_task(match.MatchTask("a", tuple(PAIRS), kind, workspace, overwrite=True))
+        result = match.run_task(match.MatchTask("a", tuple(PAIRS), alike(kind), workspace, overwrite=True))
         assert (result.done, result.failures) == (len(PAIRS), ())
         rows.append(read_match_row(workspace.matches("a")))
     assert rows[0].keys() == rows[1].keys() == set(names[1:])
@@ -185,7 +191,7 @@ def test_the_device_is_no_part_of_the_recipe() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_finds_what_the_cpu_finds(matcher: Together) -> None:
     there = LightGlue(weights=matcher.weights, precision="float32", threshold=0.0, device="cuda")
-    together = matched_in_batches(there, PAIRS, sides)
+    together = matched_in_batches(alike(there), PAIRS, sides)
     for pair in PAIRS:
         alone, own = matcher(*sides(pair), pair.geometry), together[pair.image_id1]
         here = dict(zip(map(tuple, alone.indices.tolist()), alone.scores, strict=True))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,17 +28,21 @@ class _Running:
 
 
 def matched_in_batches(
-    matcher: Matcher, pairs: Sequence[PairTask], sides: Callable[[PairTask], tuple[Features, Features]]
+    matchers: Mapping[str, Matcher],
+    pairs: Sequence[PairTask],
+    sides: Callable[[PairTask], tuple[Features, Features]],
 ) -> dict[str, Matches]:
-    """Matches by image_id1; none where the matcher takes pairs one by one.
+    """Matches by image_id1, as are the matchers; none where a matcher takes pairs one by one.
 
     A pair that fails here is left out: it is matched by itself, and fails again with its reason, or needs less memory.
     """
-    if not (isinstance(matcher, BatchedMatcher) and matcher.batches_pairs) or len(pairs) < 2:
-        return {}
     found: dict[str, Matches] = {}
-    for start in range(0, len(pairs), _BATCH_PAIRS):
-        found |= _one_batch(matcher, pairs[start : start + _BATCH_PAIRS], sides)
+    for matcher in dict.fromkeys(matchers.values()):
+        own = [pair for pair in pairs if matchers[pair.image_id1] == matcher]
+        if not (isinstance(matcher, BatchedMatcher) and matcher.batches_pairs) or len(own) < 2:
+            continue
+        for start in range(0, len(own), _BATCH_PAIRS):
+            found |= _one_batch(matcher, own[start : start + _BATCH_PAIRS], sides)
     return found
 
 

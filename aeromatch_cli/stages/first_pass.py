@@ -118,6 +118,15 @@ def _pairs(
     return near | {pair for pair in similar if not set(pair) <= set(placed)}, tuple(similar) if asked else ()
 
 
+def count_pairs(context: Context, recipe: FirstPass) -> int:
+    """How many pairs a first pass compares, or at most as many; nothing is run."""
+    block = context.block
+    count = len(block.images) * (len(block.images) - 1) // 2
+    if len(block.poses) < len(block.images):
+        return count if count <= _MOST_PAIRS else recipe.neighbours * len(block.images)
+    return len(fallback_pairs(block, list(block.poses), recipe.neighbours))
+
+
 def verified_points(context: Context) -> Iterator[PairPoints]:
     """Verified matches of the first pass, stored pixels."""
     keypoints = {}

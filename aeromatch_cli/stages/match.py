@@ -19,16 +19,17 @@ from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies import Matcher
+from aeromatch_cli.strategies.matchers.descriptors.search import Search
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
 
 
 @dataclass(frozen=True, eq=False)
 class MatchTask:
-    """All pairs of one image."""
+    """All pairs of one image. matchers: by image_id1."""
 
     image_id0: str
     pairs: tuple[PairTask, ...]
-    matcher: Matcher
+    matchers: Mapping[str, Matcher]
     workspace: Workspace
     overwrite: bool
     # By image_id, for a matcher that reads pixels.
@@ -44,9 +45,16 @@ class RowResult:
     failures: tuple[tuple[str, str], ...]
 
 
+def matcher_of(context: Context, pair: Pair) -> Matcher:
+    """The matcher of a pair: guided for an image that the first pass could not tie to the others."""
+    chosen: Matcher = context.settings.match
+    untied = context.block.outside & {pair.image_id0, pair.image_id1}
+    return chosen.model_copy(update={"guided": True}) if untied and isinstance(chosen, Search) else chosen
+
+
 def pair_fingerprint(context: Context, pair: Pair) -> str:
     """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
-    matcher = context.settings.match
+    matcher = matcher_of(context, pair)
     sides = [
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
         for i in (pair.image_id0, pair.image_id1)
@@ -70,7 +78,8 @@ def make_tasks(context: Context) -> list[MatchTask]:
         if row:
             ids = (image_id0, *(pair.image_id1 for pair in row)) if context.settings.match.reads_pixels else ()
             sources = {image_id: extract.task_of(context, image_id).views.enhance.source for image_id in ids}
-            task = MatchTask(image_id0, row, context.settings.match, context.workspace, context.overwrite, sources)
+            matchers = {pair.image_id1: matcher_of(context, pair) for pair in usable}
+            task = MatchTask(image_id0, row, matchers, context.workspace, context.overwrite, sources)
             tasks.append(task)
     return sorted(tasks, key=lambda task: (-len(task.pairs), task.image_id0))
 
@@ -80,7 +89,7 @@ def run_task(task: MatchTask) -> RowResult:
     path = task.workspace.matches(task.image_id0)
     old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
-    ahead = matched_in_batches(task.matcher, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
+    ahead = matched_in_batches(task.matchers, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
     row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)
@@ -88,12 +97,12 @@ def run_task(task: MatchTask) -> RowResult:
 
 def _match_pair(task: MatchTask, pair: PairTask, features0: Features, ahead: dict[str, Matches]) -> MatchEntry:
     """ahead: matches of pairs that are there already, which are taken out."""
-    ids = (task.image_id0, pair.image_id1)
+    ids, matcher = (task.image_id0, pair.image_id1), task.matchers[pair.image_id1]
     matches = ahead.pop(pair.image_id1, None)
     if matches is None:
-        sources = (task.sources[ids[0]], task.sources[ids[1]]) if task.matcher.reads_pixels else None
-        matches = compared(task.matcher, _sides(task, pair, features0), pair.geometry, sources)
-    return MatchEntry(pair.image_id1, pair.fingerprint, task.matcher.name, matches)
+        sources = (task.sources[ids[0]], task.sources[ids[1]]) if matcher.reads_pixels else None
+        matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
+    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches)
 
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:

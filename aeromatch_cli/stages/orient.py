@@ -93,6 +93,7 @@ def run(
         ground_source=source,
         tied=tuple((id0, id1) for id0, id1 in record["tied"]),
         similar=tuple((id0, id1) for id0, id1 in record["similar"]),
+        outside=frozenset(record["facts"]["outside"]),
     )
     found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
     context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})

@@ -18,6 +18,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
+from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
@@ -111,7 +112,7 @@ def _attempt(
     dry = command == "check"
     context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":
-        return _check(context, reports[-1], said)
+        return _check(context, reports[0], reports[-1], said)
     if command == "run":
         reports += _run_all(context)
     elif command == "match":
@@ -204,8 +205,9 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
     return tuple(sorted(failures))
 
 
-def _check(context: Context, first: StageReport, said: _Said) -> Result:
-    found = check.run(context, time.perf_counter() - first.started)
+def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
+    settled = bool(oriented.facts) or not isinstance(context.settings.orient, FirstPass)
+    found = check.run(context, time.perf_counter() - first.started, oriented=settled)
     lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}

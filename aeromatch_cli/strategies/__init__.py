@@ -139,6 +139,8 @@ class Matcher(Protocol):
     reads_pixels: ClassVar[bool]
     reads_descriptors: ClassVar[str]
 
+    def reads(self) -> frozenset[str]: ...
+
     def __call__(
         self, features0: Features, features1: Features, geometry: PairGeometry, *rasters: tuple[Raster, Raster]
     ) -> Matches: ...

@@ -12,7 +12,11 @@ TABLE: Table = {
     "blocks": ("benchmarks.blocks.command", "whole real blocks beside pycolmap: matches, mapping, time"),
     "fusion": ("benchmarks.fusion", "every table of preset fusion: a list of runs of the others"),
     "oblique": ("benchmarks.oblique", "every table of oblique pairs: a list of runs of the others"),
-    "orient": ("benchmarks.orient", "orientation from the pictures where the given poses and cameras are wrong"),
+    "orient": (
+        "benchmarks.orient.command",
+        "orientation from the pictures where given poses and cameras are wrong",
+    ),
+    "similar": ("benchmarks.similar", "pairs of images without poses by image retrieval, against reference overlaps"),
     "polar": ("benchmarks.polar.command", "registration of texture-poor ground beside SIFT"),
     "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),
     "lightglue": ("benchmarks.lightglue.command", "the network beside the ratio test, and its seconds"),

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.config import FAMILIES, Settings
+from aeromatch_cli.config import FAMILIES, Settings, load
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
+from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.versions import PIPELINE_VERSION
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
@@ -21,6 +22,7 @@ Versions = Mapping[str, Version]
 # command, commit, date, machine, trained_on, versions; null where unknown.
 Stamp = dict[str, Any]
 REPOSITORY = Path(__file__).parent.parent.parent
+_ORIENTATION: Versions = {"stage.orient": orient.VERSION, "stage.adjust": adjust.VERSION}
 _DIGITS = 12  # of a SHA-256 that tell weights apart
 _SOME = ("sheffield", "caliterra", "brighton")
 _MOST = ("sheffield", "caliterra", "seneca", "brighton")
@@ -96,6 +98,11 @@ def of_settings(*every: Settings, families: Collection[str] = tuple(FAMILIES)) -
     return found
 
 
+def of_chain(preset: str, overrides: Sequence[str] = ()) -> dict[str, Version]:
+    """Versions of all that `aeromatch run` rests on with a preset."""
+    return of_settings(load(preset, overrides)) | _ORIENTATION
+
+
 def of_strategies(family: str, *strategies: Strategy) -> dict[str, Version]:
     """Versions of strategies of one family, of the filters' chain, and of the networks that ship for them."""
     found: dict[str, Version] = {"filter.chain": CHAIN_VERSION} if family == "filter" else {}
@@ -115,7 +122,7 @@ def present_versions() -> dict[str, Version]:
     """Every version that there is now."""
     strategies = {f"{family}.{name}": one.version for family, table in FAMILIES.items() for name, one in table.items()}
     networks = of_networks(*(path.stem for path in SHIPPED_FOLDER.glob("*.safetensors")))
-    return {"pipeline": PIPELINE_VERSION, "filter.chain": CHAIN_VERSION, **strategies, **networks}
+    return {"pipeline": PIPELINE_VERSION, "filter.chain": CHAIN_VERSION, **_ORIENTATION, **strategies, **networks}
 
 
 def changed(stamp: Stamp, present: Versions) -> Iterator[str]:

@@ -17,9 +17,7 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,8 +28,9 @@ from benchmarks import options, stamps
 from benchmarks.blocks import steps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.blocks.steps import run_step
-from benchmarks.orient import worsened
+from benchmarks.orient.cases import worsened
 from benchmarks.tables import Row, markdown
+from benchmarks.whole import whole_run
 
 OURS = {"aeromatch": "noise", "aeromatch-none": "nothing"}
 
@@ -41,18 +40,13 @@ def our_chain(args: Any, images: Path, reference: Path, folder: Path, case: str)
     names = sorted(path.name for path in images.iterdir())
     extra, _ = worsened(case, reference, names, folder)
     work = folder / "work"
-    shutil.rmtree(work, ignore_errors=True)
-    command = [sys.executable, "-m", "aeromatch_cli.cli", "run", args.preset, "--images", str(images), *extra]
-    command += ["--workspace", str(work), "--jobs", str(args.jobs), "--quiet", "--json"]
-    command += [f"--set=extract.keypoints={args.keypoints}"]
-    started = time.perf_counter()
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    seconds = time.perf_counter() - started
-    if done.returncode not in (0, 1):
-        raise SystemExit(f"{' '.join(command[3:])} failed with exit code {done.returncode}:\n{done.stderr[-2000:]}")
-    facts = json.loads(done.stdout.splitlines()[-1])["stages"]["adjust"]["facts"]
+    settings = [f"extract.keypoints={args.keypoints}"]
+    run = whole_run("run", args.preset, images, work, extra=extra, jobs=args.jobs, settings=settings)
+    if not run.answer:
+        raise SystemExit(f"aeromatch run {args.preset} failed with exit code {run.code}:\n{run.said[-2000:]}")
+    facts = run.answer["stages"]["adjust"]["facts"]
     best = max(facts["groups"], key=lambda group: group["images"], default={"images": 0})
-    row: Row = {"registered": best["images"], "models": len(facts["groups"]), "seconds": seconds}
+    row: Row = {"registered": best["images"], "models": len(facts["groups"]), "seconds": run.seconds}
     row |= {key: best.get(key) for key in ("points", "track_length", "reprojection_error_px")}
     database = work / "export" / "colmap" / "database.db"
     for mapper in ("incremental", "global"):
@@ -128,5 +122,5 @@ def main(arguments: Sequence[str]) -> None:
         print(json.dumps(row), file=sys.stderr, flush=True)
     options.publish(
         args, table_of(rows) + "\n", args.out / "chains.md", table="bench_chains",
-        command=options.command_line(parser, args), versions=stamps.of_settings(),
+        command=options.command_line(parser, args), versions=stamps.of_chain(args.preset),
     )  # fmt: skip

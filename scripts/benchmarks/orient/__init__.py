@@ -1,0 +1,1 @@
+"""Orientation from the pictures, where what was given is wrong or missing."""

@@ -1,0 +1,90 @@
+"""What a run has found, against the reference or the exact truth of a rendered block."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.blocks.ground import DemGround
+from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
+from aeromatch_cli.formats.terrain import read_terrain
+from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.orientation.placing import similarity
+from aeromatch_cli.synthetic import load_truth
+from aeromatch_cli.workspace import read_json
+from benchmarks.orient.cases import ANGLES
+from benchmarks.tables import Row
+
+# Places in every image where the terrain is asked.
+_SAMPLES = 60
+
+
+def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -> Row:
+    """Attitudes, focal length and named images of a finished workspace against the reference."""
+    name_of = {image.image_id: image.name for image in read_images(work / "images.csv")}
+    found = {name_of[i]: pose for i, pose in read_poses(work / "poses.csv").items() if pose.world_rotation is not None}
+    with (reference / "poses.csv").open(encoding="utf-8", newline="") as stream:
+        truth = {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
+    common = [name for name in names if name in found and name in truth]
+    turns = [found[name].world_rotation.T @ truth[name] for name in common]
+    u, _, vt = np.linalg.svd(sum(turns, np.zeros((3, 3))))
+    turn = u * [1.0, 1.0, np.linalg.det(u @ vt)] @ vt
+    cosines = [(np.trace(one.T @ turn) - 1.0) / 2.0 for one in turns]
+    errors = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
+    focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
+    record = work / "reports" / "orient.json"
+    facts = read_json(record)["facts"] if record.is_file() else {}
+    remarks = facts.get("remarks", [])
+    whole = any("angles" in remark for remark in remarks)
+    named = wrong if whole else {name_of[i] for i in facts.get("wrong_attitudes", {})}
+    return {
+        "oriented": len(common),
+        "attitude_deg": float(np.median(errors)) if len(errors) else float("nan"),
+        "attitude_max_deg": float(errors.max()) if len(errors) else float("nan"),
+        "focal_share": focal / float(lens["params"][0]) - 1.0,
+        "method": facts.get("method", "none"),
+        "named": len(named & wrong),
+        "wrong": len(wrong),
+        "named_without_cause": len(named - wrong),
+        "said": remarks,
+        "terrain_share": terrain_error(work, reference) if (reference / "truth.json").is_file() else None,
+    }
+
+
+def terrain_error(work: Path, rendered: Path) -> float:
+    """Median height of the terrain found above the rendered surface, without sign, as a share of the flying height.
+
+    Asked at places that the images show. A block in a frame of its own is brought to the truth by its projection
+    centres.
+    """
+    path = work / "orientation" / "terrain.tif"
+    if not path.is_file():
+        return float("nan")
+    truth = load_truth(rendered)
+    name_of = {image.image_id: image.name for image in read_images(work / "images.csv")}
+    found = read_poses(work / "poses.csv")
+    ids = sorted(found)
+    own = np.array([found[i].center_m for i in ids])
+    origin_m = np.array(read_json(work / "block.json")["origin_m"])
+    true = np.array([truth.poses[name_of[i]].center_m for i in ids]) - origin_m
+    if read_json(work / "reports" / "orient.json")["facts"].get("frame") == "world":
+        scale, rotation, shift_m = 1.0, np.eye(3), np.zeros(3)
+    else:
+        scale, rotation, shift_m = similarity(true, own)
+    rng = np.random.default_rng(0)
+    camera = next(iter(truth.cameras.values()))
+    pixels = rng.uniform([0, 0], [camera.width_px - 1, camera.height_px - 1], (_SAMPLES, 2))
+    seen = np.concatenate([truth.surface_points(name_of[i], pixels) for i in ids]) - origin_m
+    seen = seen[np.isfinite(seen).all(axis=1)]
+    seen = seen[np.abs(seen[:, :2] - true[:, :2].mean(axis=0)).max(axis=1) <= np.ptp(true[:, :2], axis=0).max()]
+    moved = scale * seen @ rotation.T + shift_m
+    heights, west_m, north_m, cell_m = read_terrain(path, origin_m)
+    ground = DemGround(heights, west_m, north_m, (cell_m, cell_m), float(np.median(heights)))
+    off_m = np.abs(ground.height_m(moved[:, :2]) - moved[:, 2]) / scale
+    return float(np.median(off_m) / (np.median(true[:, 2]) - np.median(seen[:, 2])))

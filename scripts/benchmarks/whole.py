@@ -1,0 +1,57 @@
+"""Whole commands as a user gives them, each in a process of its own: `aeromatch run`, `aeromatch evaluate`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Run:
+    """code: exit code. answer: the command's last line with --json, empty where it ended with 2 or 3. said: stderr."""
+
+    code: int
+    seconds: float
+    answer: dict[str, Any]
+    said: str
+
+
+def whole_run(
+    command: str,
+    preset: str,
+    images: Path,
+    work: Path,
+    *,
+    extra: Sequence[str] = (),
+    jobs: int = 2,
+    settings: Sequence[str] = (),
+) -> Run:
+    """`aeromatch COMMAND PRESET` into an empty workspace. extra: further options; settings: as in `--set`."""
+    shutil.rmtree(work, ignore_errors=True)
+    words = [sys.executable, "-m", "aeromatch_cli.cli", command, preset, "--images", str(images), *extra]
+    words += ["--workspace", str(work), "--jobs", str(jobs), "--quiet", "--json"]
+    words += [f"--set={setting}" for setting in settings]
+    started = time.perf_counter()
+    done = subprocess.run(words, check=False, capture_output=True, text=True)
+    seconds = time.perf_counter() - started
+    finished = done.returncode in (0, 1) and bool(done.stdout.strip())
+    answer = json.loads(done.stdout.splitlines()[-1]) if finished else {}
+    return Run(done.returncode, seconds, answer, done.stderr.strip())
+
+
+def evaluated(work: Path, truth: Path, *, mapping: bool) -> dict[str, Any]:
+    """Figures of `aeromatch evaluate`. SystemExit where it fails."""
+    words = [sys.executable, "-m", "aeromatch_cli.cli", "evaluate", str(work), "--truth", str(truth)]
+    words += ["--quiet", "--json", *([] if mapping else ["--no-mapping"])]
+    done = subprocess.run(words, check=False, capture_output=True, text=True)
+    if done.returncode not in (0, 1):
+        raise SystemExit(f"aeromatch evaluate failed with exit code {done.returncode}:\n{done.stderr[-2000:]}")
+    facts: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return facts
