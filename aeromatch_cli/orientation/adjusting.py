@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -23,8 +23,12 @@ from aeromatch_cli.orientation.precision import Observations, pose_sigmas
 _SAME_COST = 0.05
 # No coordinate of a keypoint is measured more exactly, in pixels.
 _LEAST_ERROR_PX = 0.03
-# Fewer images do not determine a camera's distortion: it stays as it was given or as mapping left it.
-_DISTORTION_IMAGES = 10
+# Fewer images do not determine a camera's focal length, or its distortion: it stays as it was given.
+_FOCAL_IMAGES, DISTORTION_IMAGES = 3, 10
+# A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
+_LENS_RATIO = 3.0
+# An image this many times as far from the middle of all as they are by the median was placed by chance.
+_FAR = 20.0
 # Images with fewer points than this in their model are taken out of it.
 MIN_OBSERVATIONS = 12
 # So many positions hold a model in the world frame.
@@ -118,9 +122,17 @@ def _adjust(
 ) -> None:
     """used: numbers of the images whose positions are observations; without any the frame is held by two images."""
 
-    def adjuster(which: Any, fixed_cameras: bool) -> Any:
-        return _adjuster(pycolmap, which, used, positions_m, sigmas_m, fixed_cameras, tolerance)
+    images = images_by_camera(model)
+    unknown = {number for number in model.cameras if images[number] < _FOCAL_IMAGES}
+    few = {number for number in model.cameras if images[number] < DISTORTION_IMAGES}
+    distorted = len(few) < len(images)
 
+    def adjuster(which: Any, fixed_cameras: bool) -> Any:
+        fixed = set(model.cameras) if fixed_cameras else few if distorted else unknown
+        return _adjuster(pycolmap, which, used, positions_m, sigmas_m, fixed, distorted, tolerance)
+
+    if distorted and few > unknown:  # their focal lengths first, without anybody's distortion
+        _adjuster(pycolmap, model, used, positions_m, sigmas_m, unknown, False, tolerance).solve()
     if not _with_prior_focal_lengths(pycolmap, model, cameras, adjuster):
         adjuster(model, False).solve()
 
@@ -170,21 +182,22 @@ def _adjuster(
     used: list[int],
     positions_m: FloatArray,
     sigmas_m: FloatArray,
-    fixed_cameras: bool,
+    fixed: Collection[int],
+    distortion: bool,
     tolerance: float,
 ) -> Any:
+    """fixed: cameras whose parameters stay; distortion: whether those of the others' lenses are unknowns, too."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = tolerance
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.refine_extra_params = _determines_distortion(model)
+    options.refine_extra_params = distortion
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in image_numbers(model):
         config.add_image(image_id)
-    if fixed_cameras:
-        for camera_id in model.cameras:
-            config.set_constant_cam_intrinsics(camera_id)
+    for camera_id in fixed:
+        config.set_constant_cam_intrinsics(camera_id)
     if not used:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
@@ -195,10 +208,43 @@ def _adjuster(
     return pycolmap.create_pose_prior_ceres_bundle_adjuster(options, prior_options, config, priors, model)
 
 
-def _determines_distortion(model: Any) -> bool:
-    """Whether a camera has so many images that its distortion is no longer confused with their tilts."""
-    used = Counter(image.camera_id for image in model.images.values() if image.has_pose)
-    return max(used.values(), default=0) >= _DISTORTION_IMAGES
+def images_by_camera(model: Any) -> Counter[int]:
+    """How many posed images each camera of a model has."""
+    return Counter(int(image.camera_id) for image in model.images.values() if image.has_pose)
+
+
+def reset_lenses(model: Any, priors: dict[str, Any]) -> None:
+    """Give cameras back what the mapper could not know of them, before a model is adjusted.
+
+    Distortion of a camera with few images; a focal length that no lens has, with whose camera images are misplaced and
+    leave the model. priors: by camera number, "params" and "focal_px".
+    """
+    images = images_by_camera(model)
+    for number in [number for number in model.cameras if images[number]]:
+        camera, prior = model.cameras[number], priors[str(number)]
+        ratio = camera.mean_focal_length() / prior["focal_px"]
+        if not 1.0 / _LENS_RATIO < ratio < _LENS_RATIO:
+            camera.params = prior["params"]
+            _drop(model, [image for image in model.images.values() if image.has_pose and image.camera_id == number])
+        elif images[number] < DISTORTION_IMAGES:
+            params = np.array(prior["params"])
+            params[camera.focal_length_idxs()] = camera.params[camera.focal_length_idxs()]
+            camera.params = params
+
+
+def drop_far_images(model: Any) -> None:
+    """Take images out of a model that lie far from all others: a mapper places some by a single pair, anywhere."""
+    ids = image_numbers(model)
+    if not ids:
+        return
+    centers = _centers(model, ids)
+    apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    _drop(model, [model.images[i] for i, far in zip(ids, apart > _FAR * np.median(apart), strict=True) if far])
+
+
+def _drop(model: Any, images: Sequence[Any]) -> None:
+    for frame_id in {image.frame_id for image in images}:
+        model.deregister_frame(frame_id)
 
 
 def _prior(pycolmap: ModuleType, image: Any, position_m: FloatArray, sigma_m: float) -> Any:
@@ -294,9 +340,7 @@ def _error_px(model: Any) -> float:
 
 def drop_weak_images(model: Any) -> None:
     """Take images with few points out of a model."""
-    for image in list(model.images.values()):
-        if image.has_pose and image.num_points3D < MIN_OBSERVATIONS:
-            model.deregister_frame(image.frame_id)
+    _drop(model, [i for i in model.images.values() if i.has_pose and i.num_points3D < MIN_OBSERVATIONS])
 
 
 def figures(model: Any) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from aeromatch_cli.geometry.footprints import view_angles_deg
 
 # Two poses explain the matches of a pair when this share of them lies near its epipolar line and in front of both.
 _EXPLAINED_SHARE = 0.75
-_MIN_MATCHES = 15
+# A pair of fewer matches says nothing of two poses.
+MIN_MATCHES = 15
 # Matches at a flatter angle of intersection may seem to lie behind a camera, and give no height.
 _MIN_RAY_ANGLE_DEG = 2.0
 
@@ -60,13 +61,20 @@ def explained_images(
 ) -> set[str]:
     """Images whose given poses explain what they share with each other.
 
-    thresholds_px: by image_id, the error of an exact match in stored pixels. Images are grouped by pairs that are
-    explained; the largest group counts, and each further one that does not contradict those taken before.
+    thresholds_px: by image_id, the error of an exact match in stored pixels.
     """
-    ties = [p for p in pairs if len(p.indices) >= _MIN_MATCHES]
+    ties = [p for p in pairs if len(p.indices) >= MIN_MATCHES]
     good = {
         (p.image_id0, p.image_id1): explained_share(p, poses, cameras, thresholds_px) >= _EXPLAINED_SHARE for p in ties
     }
+    return grouped_images(good)
+
+
+def grouped_images(good: Mapping[tuple[str, str], bool]) -> set[str]:
+    """Images grouped by pairs that hold: the largest group, and each further one that contradicts none before it.
+
+    good: whether a pair of images holds.
+    """
     taken: set[str] = set()
     for group in _groups([ids for ids, holds in good.items() if holds]):
         across = [ids for ids in good if len(taken.intersection(ids)) == 1 and len(group.intersection(ids)) == 1]

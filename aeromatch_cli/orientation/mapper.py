@@ -9,13 +9,22 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.orientation.adjusting import adjusted, arrays, drop_weak_images, figures
+from aeromatch_cli.orientation.adjusting import (
+    DISTORTION_IMAGES,
+    adjusted,
+    arrays,
+    drop_far_images,
+    drop_weak_images,
+    figures,
+    reset_lenses,
+)
 from aeromatch_cli.orientation.process import quiet_pycolmap
 
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
@@ -38,6 +47,8 @@ def solve(folder: Path) -> None:
     models = _mapped(pycolmap, folder, task["mapper"])
     facts = []
     for number, model in enumerate(models):
+        reset_lenses(model, task["cameras"])
+        drop_far_images(model)
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
@@ -88,6 +99,7 @@ def _sees(model: Any, camera_id: int) -> bool:
 def _global(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
     with pycolmap.Database.open(database) as opened:
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
+        most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = options.mapper.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
@@ -95,6 +107,7 @@ def _global(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
     options.mapper.track_required_tracks_per_view = tracks
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
+    options.mapper.bundle_adjustment.refine_extra_params = most >= DISTORTION_IMAGES
     found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
     return found
 

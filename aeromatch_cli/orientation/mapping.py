@@ -25,6 +25,7 @@ from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
 Mapper = Literal["global", "incremental"]
+MAPPERS: tuple[Mapper, ...] = ("global", "incremental")
 
 
 @dataclass(frozen=True, eq=False)

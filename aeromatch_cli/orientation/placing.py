@@ -29,10 +29,12 @@ _TRUSTED = 0.85
 _DOUBTFUL = 5.0
 # How far from level the plane of best fit of a terrain usually is.
 _LEVEL_SIGMA_DEG = 3.0
-# Measured tilts are good to this, and count where they agree to so many degrees with each other, and with the terrain
-# to so many.
+# The mean of measured tilts is no better than this, whatever their number; they count where they agree to so many
+# degrees with each other, and with the terrain to so many.
 _TILT_SIGMA_DEG = 1.0
-_TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG = 3.0, 30.0
+_TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG = 10.0, 30.0
+# Weights fall beyond this distance from the mean.
+_TILTS_NEAR_DEG = 3.0
 _LEAST_TILTS = 3
 
 
@@ -110,11 +112,13 @@ def _vertical(centers: FloatArray, points: FloatArray, ups: FloatArray | None) -
     up = np.median(measured, axis=0)
     for _ in range(10):
         apart_deg = np.rad2deg(np.arccos(np.clip(measured @ up / np.linalg.norm(up), -1.0, 1.0)))
-        up = np.average(measured, axis=0, weights=1.0 / (1.0 + (apart_deg / _TILTS_AGREE_DEG) ** 2))
+        up = np.average(measured, axis=0, weights=1.0 / (1.0 + (apart_deg / _TILTS_NEAR_DEG) ** 2))
     up = up / np.linalg.norm(up)
     apart_deg = np.rad2deg(np.arccos(np.clip(measured @ up, -1.0, 1.0)))
     plausible = up @ by_terrain.up > np.cos(np.deg2rad(_TILTS_PLAUSIBLE_DEG))
-    return _Vertical(up, _TILT_SIGMA_DEG) if plausible and np.median(apart_deg) < _TILTS_AGREE_DEG else by_terrain
+    spread_deg = float(np.median(apart_deg))
+    sigma_deg = float(np.hypot(_TILT_SIGMA_DEG, spread_deg / np.sqrt(len(measured))))
+    return _Vertical(up, sigma_deg) if plausible and spread_deg < _TILTS_AGREE_DEG else by_terrain
 
 
 def similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
 from aeromatch_cli.orientation.dem import Terrain, terrain_of
 from aeromatch_cli.orientation.judgement import (
@@ -70,6 +71,10 @@ class Evidence:
     def explained(self) -> set[str]:
         """Images whose given poses explain their matches."""
         return explained_images(self.pairs, self.block.poses, self.cameras, self.thresholds_px)
+
+    def consistent(self) -> set[str]:
+        """Images whose given poses agree with their matches within their standard deviations."""
+        return consistent_images(self.pairs, self.block.poses, self.cameras, self.thresholds_px)
 
 
 def suffices(evidence: Evidence, good: set[str]) -> bool:
@@ -156,7 +161,8 @@ def from_models(
         if convention is not None and image_id in given:
             given[image_id] = replace(given[image_id], world_rotation=convention.rotation(one))
     by_strip = {} if level or convention else predicted(block, found)
-    for image_id in block.poses.keys() - found.keys():
+    inexact = set() if level else evidence.consistent()
+    for image_id in block.poses.keys() - found.keys() - inexact:
         # An attitude that nothing confirms in a block where others were wrong is not relied on.
         unknown = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
         poses[image_id] = given[image_id] if convention else unknown

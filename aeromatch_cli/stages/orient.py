@@ -16,7 +16,7 @@ from aeromatch_cli.data import Ground, Pose
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
-from aeromatch_cli.orientation.mapping import Group, Model, map_block
+from aeromatch_cli.orientation.mapping import MAPPERS, Group, Model, map_block
 from aeromatch_cli.orientation.solution import (
     Evidence,
     Solution,
@@ -26,6 +26,7 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
+from aeromatch_cli.orientation.soundness import checked
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -45,7 +46,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 7
+VERSION = 8
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -140,21 +141,30 @@ def _mapped(
     context: Context, recipe: FirstPass, first: Context, evidence: Evidence
 ) -> tuple[tuple[Model, ...], Context, Evidence]:
     """Models of a first pass, and it; of another one whose pairs do not lean on positions, where these do not fit."""
-    positions = context.block.poses
-
-    def mapped(one: Context) -> tuple[Model, ...]:
-        with context.executor.step("first pass: mapping"):
-            return map_block(contents_of(one), context.observed, recipe.mapper)
-
-    models = mapped(first)
-    if not positions or (models and not models[0].figures["contradiction"]):
+    models = _sound_models(context, recipe, first, evidence)
+    if not context.block.poses or (models and not models[0].figures["contradiction"]):
         return models, first, evidence
     other, more = _evidence(context, recipe, by_position=False)
     if {(p.image_id0, p.image_id1) for p in other.pairs} <= {(p.image_id0, p.image_id1) for p in first.pairs}:
         return models, first, evidence
-    again = mapped(other)
+    again = _sound_models(context, recipe, other, more)
     better = _oriented(again) > _oriented(models)
     return (again, other, more) if better else (models, first, evidence)
+
+
+def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
+    """Models without the images whose matches they do not explain; by the other mapper where that leaves more."""
+    camera_of = {image.image_id: image.camera_id for image in context.block.images}
+    best = None
+    for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
+        with context.executor.step(f"first pass: {mapper} mapping"):
+            models = map_block(contents_of(first), context.observed, mapper)
+        found = checked(models, evidence.pairs, context.block.cameras, camera_of, evidence.thresholds_px)
+        best = found if best is None or found.sound > best.sound else best
+        if not found.contradicted:
+            break
+    assert best is not None
+    return best.models
 
 
 def _oriented(models: Sequence[Model]) -> int:

@@ -1,0 +1,71 @@
+"""What the mapper cannot know of cameras and places is taken back before a model is adjusted."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aeromatch_cli.orientation.adjusting import drop_far_images, images_by_camera, reset_lenses
+
+zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
+
+MANY, FEW = 12, 4
+
+
+@pytest.fixture
+def model() -> Any:
+    """Images of two cameras around one place: MANY of the first, FEW of the second."""
+    import pycolmap
+
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig = 2, 1
+    options.num_frames_per_rig, options.num_points3D = MANY, 200
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [800.0, 512.0, 384.0, 0.01]
+    made = pycolmap.synthesize_dataset(options)
+    second = [image for image in made.images.values() if image.camera_id == 2]
+    for image in sorted(second, key=lambda image: image.image_id)[FEW:]:
+        made.deregister_frame(image.frame_id)
+    return made
+
+
+def priors(model: Any) -> dict[str, Any]:
+    return {
+        str(number): {"params": [800.0, 512.0, 384.0, 0.01], "focal_px": 800.0, "sigma": 0.05}
+        for number in model.cameras
+    }
+
+
+def test_a_sound_model_keeps_its_images_and_focal_lengths(model: Any) -> None:
+    known = priors(model)
+    model.cameras[1].params = [790.0, 512.0, 384.0, 0.02]
+    model.cameras[2].params = [830.0, 512.0, 384.0, -4.0]
+    reset_lenses(model, known)
+    drop_far_images(model)
+    assert images_by_camera(model) == {1: MANY, 2: FEW}
+    np.testing.assert_allclose(model.cameras[1].params, [790.0, 512.0, 384.0, 0.02])
+    # Four images do not determine a distortion.
+    np.testing.assert_allclose(model.cameras[2].params, [830.0, 512.0, 384.0, 0.01])
+
+
+@pytest.mark.parametrize("focal_px", [-7.4e6, 200.0, 2500.0])
+def test_images_behind_a_lens_that_cannot_be_leave_the_model(model: Any, focal_px: float) -> None:
+    known = priors(model)
+    model.cameras[2].params = [focal_px, 512.0, 384.0, -5772.0]
+    reset_lenses(model, known)
+    assert images_by_camera(model) == {1: MANY}
+    np.testing.assert_allclose(model.cameras[2].params, known["2"]["params"])
+
+
+def test_an_image_at_any_distance_leaves_the_model(model: Any) -> None:
+    import pycolmap
+
+    lost = next(image for image in model.images.values() if image.has_pose)
+    far = pycolmap.Rigid3d(np.column_stack([np.eye(3), [0.0, 0.0, 1e5]]))
+    lost.frame.set_cam_from_world(lost.camera_id, far)
+    drop_far_images(model)
+    assert sum(images_by_camera(model).values()) == MANY + FEW - 1
+    assert not model.images[lost.image_id].has_pose
