@@ -10,6 +10,7 @@ import copy
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from types import ModuleType
 from typing import Any
 
@@ -27,12 +28,16 @@ _LEAST_ERROR_PX = 0.03
 _FOCAL_IMAGES, DISTORTION_IMAGES = 3, 10
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
 _LENS_RATIO = 3.0
+# Images are connected by so many points that both see.
+_SHARED_POINTS = 8
 # An image this many times as far from the middle of all as they are by the median was placed by chance.
 _FAR = 20.0
 # Images with fewer points than this in their model are taken out of it.
 MIN_OBSERVATIONS = 12
 # So many positions hold a model in the world frame.
 _HOLDING = 3
+# A position that is so many standard deviations away is not that of the image.
+_WRONG_SIGMAS = 5.0
 # Position priors beyond this many standard deviations pull less and less (Cauchy).
 _PRIOR_LOSS_SIGMAS = 3.0
 
@@ -68,13 +73,16 @@ def adjust_in_place(
     sigmas_m: FloatArray,
     attitudes: Attitudes,
     tolerance: float,
-) -> None:
-    """Adjust a model whose poses are in the world frame already; it stays there.
+) -> list[int]:
+    """Adjust a model whose poses are in the world frame already; it stays there. Images whose positions were used.
 
     The adjustment itself knows no attitudes: afterwards the whole model is turned to the most probable attitude of the
-    block, by what its positions and its attitudes say of it.
+    block, by what its positions and its attitudes say of it. Positions far from where an image is are not used: they
+    have been found wrong before.
     """
-    used = [i for i in image_numbers(model) if np.isfinite(positions_m[i - 1]).all()]
+    ids = image_numbers(model)
+    off_m = np.linalg.norm(_centers(model, ids) - positions_m[np.array(ids, dtype=int) - 1], axis=1)
+    used = [i for i, off in zip(ids, off_m, strict=True) if off <= _WRONG_SIGMAS * sigmas_m[i - 1]]
     used = used if len(used) >= _HOLDING else []
     _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
     rows = np.array(used, dtype=int) - 1
@@ -84,6 +92,7 @@ def adjust_in_place(
     turn = attitudes.turn(model, by_positions)
     middle_m = _centers(model, used or image_numbers(model)).mean(axis=0)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn), middle_m - turn @ middle_m))
+    return used
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +249,28 @@ def drop_far_images(model: Any) -> None:
     centers = _centers(model, ids)
     apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     _drop(model, [model.images[i] for i, far in zip(ids, apart > _FAR * np.median(apart), strict=True) if far])
+
+
+def connected_parts(model: Any) -> list[list[int]]:
+    """Numbers of images that shared points connect with each other, the largest part first."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    ids = image_numbers(model)
+    shared: Counter[tuple[int, int]] = Counter()
+    for point in model.points3D.values():
+        shared.update(combinations(sorted({int(element.image_id) for element in point.track.elements}), 2))
+    edges = np.array([pair for pair, count in shared.items() if count >= _SHARED_POINTS]).reshape(-1, 2)
+    rows = np.searchsorted(ids, edges)
+    graph = sparse.coo_matrix((np.ones(len(rows)), (rows[:, 0], rows[:, 1])), shape=(len(ids), len(ids)))
+    _, labels = connected_components(graph, directed=False)
+    parts = [[i for i, label in zip(ids, labels, strict=True) if label == k] for k in range(labels.max(initial=-1) + 1)]
+    return sorted(parts, key=lambda part: (-len(part), part))
+
+
+def keep_images(model: Any, numbers: Collection[int]) -> None:
+    """Take all other images out of a model."""
+    _drop(model, [i for i in model.images.values() if i.has_pose and i.image_id not in numbers])
 
 
 def _drop(model: Any, images: Sequence[Any]) -> None:

@@ -13,7 +13,7 @@ from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_dist
 from aeromatch_cli.geometry.footprints import view_angles_deg
 
 # Two poses explain the matches of a pair when this share of them lies near its epipolar line and in front of both.
-_EXPLAINED_SHARE = 0.75
+EXPLAINED_SHARE = 0.75
 # A pair of fewer matches says nothing of two poses.
 MIN_MATCHES = 15
 # Matches at a flatter angle of intersection may seem to lie behind a camera, and give no height.
@@ -65,7 +65,7 @@ def explained_images(
     """
     ties = [p for p in pairs if len(p.indices) >= MIN_MATCHES]
     good = {
-        (p.image_id0, p.image_id1): explained_share(p, poses, cameras, thresholds_px) >= _EXPLAINED_SHARE for p in ties
+        (p.image_id0, p.image_id1): explained_share(p, poses, cameras, thresholds_px) >= EXPLAINED_SHARE for p in ties
     }
     return grouped_images(good)
 
@@ -76,14 +76,14 @@ def grouped_images(good: Mapping[tuple[str, str], bool]) -> set[str]:
     good: whether a pair of images holds.
     """
     taken: set[str] = set()
-    for group in _groups([ids for ids, holds in good.items() if holds]):
+    for group in connected_groups([ids for ids, holds in good.items() if holds]):
         across = [ids for ids in good if len(taken.intersection(ids)) == 1 and len(group.intersection(ids)) == 1]
         if not across:
             taken |= group
     return taken
 
 
-def _groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
+def connected_groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
     """Connected groups of images, the largest first; among equal ones the first by name."""
     group: dict[str, set[str]] = {}
     for id0, id1 in edges:

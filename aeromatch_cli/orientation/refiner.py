@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -23,9 +23,11 @@ from aeromatch_cli.orientation.adjusting import (
     adjust_in_place,
     adjusted,
     arrays,
+    connected_parts,
     drop_weak_images,
     figures,
     image_numbers,
+    keep_images,
     sigmas_of,
     tracks_of,
 )
@@ -37,6 +39,8 @@ _MAX_ROUNDS = 3
 # An adjustment ends when a step lowers the cost by a smaller share. With 1e-4 it takes a third of the time, and heights
 # of check points come out four times as bad.
 _COST_TOLERANCE = 1e-6
+# Fewer images make no group.
+_FEWEST_IMAGES = 3
 # With fewer points of three images or more, those of two count as well.
 _FEW_OBSERVATIONS = 50
 # An image is tied by so many points of those that it shares with the block, a quarter of them at least.
@@ -49,31 +53,49 @@ _FIRST_ERROR_PX = 12.0
 
 
 def refine(folder: Path) -> None:
-    """Triangulate and adjust every group of posed images, and tie further images to the largest."""
+    """Triangulate and adjust every group of posed images, and tie further images to the largest.
+
+    A group whose parts share no points becomes several, each placed by itself.
+    """
     pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
-    priors = np.load(folder / "priors.npz")
-    facts = []
-    for number, group in enumerate(task["groups"]):
+    priors = dict(np.load(folder / "priors.npz"))
+    facts: list[dict[str, Any]] = []
+    waiting = deque(task["groups"])
+    grouped = {number for group in task["groups"] for number in group["images"]}
+    while waiting:
+        group = waiting.popleft()
+        free = not task["fixed"]
+        observed = priors if group["kind"] != "level" else _without_positions(priors)
         model = _posed(pycolmap, folder, set(group["images"]))
-        model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and not task["fixed"])
+        model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and free)
+        if free and group["kind"] != "given":
+            parts = connected_parts(model)
+            keep_images(model, parts[0] if parts else [])
+            waiting.extend({**group, "images": part} for part in parts[1:] if len(part) >= _FEWEST_IMAGES)
         attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
         registered: list[int] = []
-        if not task["fixed"]:
-            if number == 0 and task["more"]:
-                model, registered = _grown(pycolmap, model, folder)
+        if free:
+            if not facts and task["more"]:
+                model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
-            model = _refined(pycolmap, model, folder, group["kind"], task["cameras"], priors, attitudes)
+            model, observed = _refined(pycolmap, model, folder, group["kind"], task["cameras"], observed, attitudes)
         model.update_point_3d_errors()
         _drop_weak_points(model)
         drop_weak_images(model)
         if not image_numbers(model):
             continue
-        name = f"model{number}.npz"
-        deviations = sigmas_of(model, priors["sigmas_m"], task["cameras"], attitudes)
+        name = f"model{len(facts)}.npz"
+        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], attitudes)
         np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+
+
+def _without_positions(priors: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Of a group in a frame of its own: given positions are not observations there."""
+    unknown = {name: np.full_like(priors[name], np.nan) for name in ("positions_m", "sigmas_m")}
+    return {**priors, **unknown}
 
 
 def _refined(
@@ -82,25 +104,30 @@ def _refined(
     folder: Path,
     kind: str,
     cameras: dict[str, Any],
-    priors: Mapping[str, FloatArray],
+    observed: dict[str, FloatArray],
     attitudes: Attitudes,
-) -> Any:
-    """The model adjusted and triangulated in turn, while that makes it better."""
-    positions_m, sigmas_m = priors["positions_m"], priors["sigmas_m"]
+) -> tuple[Any, dict[str, FloatArray]]:
+    """The model adjusted and triangulated in turn, while that makes it better; and the observations that it used."""
+    positions_m, sigmas_m = observed["positions_m"], observed["sigmas_m"]
+    used = image_numbers(model)
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
         before = model.compute_mean_reprojection_error()
         if kind == "positions":
-            adjusted(pycolmap, model, cameras, positions_m, sigmas_m, priors["ups"], _COST_TOLERANCE)
+            placement = adjusted(pycolmap, model, cameras, positions_m, sigmas_m, observed["ups"], _COST_TOLERANCE)
+            used = [i for i, agrees in zip(image_numbers(model), placement.agreeing, strict=True) if agrees]
         else:
-            adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
+            used = adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
         model.update_point_3d_errors()
         made_roughly = number == 0 and _found(kind)
         if not made_roughly and model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
             break
         model = _triangulated(pycolmap, model, folder, rough=False)
-    return model
+    unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
+    sigmas_m = sigmas_m.copy()
+    sigmas_m[unused] = np.nan
+    return model, {**observed, "sigmas_m": sigmas_m}
 
 
 def _found(kind: str) -> bool:
@@ -166,8 +193,8 @@ def _drop_weak_points(model: Any) -> None:
             model.delete_point3D(number)
 
 
-def _grown(pycolmap: ModuleType, model: Any, folder: Path) -> tuple[Any, list[int]]:
-    """The model with further images resected from its points, and their numbers."""
+def _grown(pycolmap: ModuleType, model: Any, folder: Path, others: set[int]) -> tuple[Any, list[int]]:
+    """The model with further images resected from its points, and their numbers. others: images of other groups."""
     before = {image.image_id for image in model.images.values() if image.has_pose}
     start, out = folder / "grown_from", folder / "grown"
     for path in (start, out):
@@ -176,6 +203,8 @@ def _grown(pycolmap: ModuleType, model: Any, folder: Path) -> tuple[Any, list[in
     options = _options(pycolmap)
     options.fix_existing_frames = True  # the frame of the world, and the time
     options.multiple_models = False
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        options.image_names = [image.name for image in opened.read_all_images() if image.image_id not in others]
     options.mapper.abs_pose_min_num_inliers = _FEWEST_INLIERS
     found = pycolmap.incremental_mapping(folder / "database.db", out, out, options=options, input_path=start)
     grown = max(found.values(), key=lambda one: one.num_reg_images(), default=model)

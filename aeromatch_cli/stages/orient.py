@@ -16,7 +16,7 @@ from aeromatch_cli.data import Ground, Pose
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
-from aeromatch_cli.orientation.mapping import MAPPERS, Group, Model, map_block
+from aeromatch_cli.orientation.mapping import MAPPERS, Group, Mapper, Model, map_block
 from aeromatch_cli.orientation.solution import (
     Evidence,
     Solution,
@@ -26,7 +26,7 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
-from aeromatch_cli.orientation.soundness import checked
+from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, sound_part
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -47,6 +47,8 @@ from aeromatch_cli.workspace import (
 )
 
 VERSION = 8
+# Images that no model holds are mapped again by themselves so often.
+_MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -153,18 +155,52 @@ def _mapped(
 
 
 def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
-    """Models without the images whose matches they do not explain; by the other mapper where that leaves more."""
-    camera_of = {image.image_id: image.camera_id for image in context.block.images}
-    best = None
-    for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
-        with context.executor.step(f"first pass: {mapper} mapping"):
-            models = map_block(contents_of(first), context.observed, mapper)
-        found = checked(models, evidence.pairs, context.block.cameras, camera_of, evidence.thresholds_px)
-        best = found if best is None or found.sound > best.sound else best
-        if not found.contradicted:
+    """Models that explain their matches, the largest first. What is left after one is mapped again by itself."""
+    models: list[Model] = []
+    left = evidence.matched
+    for _ in range(_MAX_ROUNDS):
+        found = _one_round(context, recipe, first, evidence, left)
+        models += found
+        left = left - {i for model in found for i in model.rotations}
+        if not found or len(left) < FEWEST_IMAGES:
             break
-    assert best is not None
-    return best.models
+    return tuple(sorted(models, key=lambda model: -len(model.rotations)))
+
+
+def _one_round(
+    context: Context, recipe: FirstPass, first: Context, evidence: Evidence, image_ids: set[str]
+) -> list[Model]:
+    """Sound models of some images; by the other mapper where that finds more of them."""
+    best: list[Model] = []
+    for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
+        mapped = _mapped_images(context, first, mapper, image_ids)
+        found = [part for model in mapped if (part := _sound(context, evidence, model)) is not None]
+        whole = _images(found) == _images(mapped)
+        if not whole:  # what was cut off has bent the rest
+            again = [_mapped_images(context, first, mapper, set(part.rotations)) for part in found]
+            found = [part for one in again for m in one[:1] if (part := _sound(context, evidence, m)) is not None]
+        best = found if _images(found) > _images(best) else best
+        if found and whole:
+            break
+    return best
+
+
+def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
+    cameras = {**context.block.cameras, **model.cameras}
+    of_images = {image.image_id: cameras[image.camera_id] for image in context.block.images}
+    return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px)
+
+
+def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
+    """Models of the pairs of the first pass between some images."""
+    pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
+    with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
+        return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
+
+
+def _images(models: Sequence[Model]) -> int:
+    """Images of all models."""
+    return sum(len(model.rotations) for model in models)
 
 
 def _oriented(models: Sequence[Model]) -> int:
