@@ -20,7 +20,8 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 ### block.json
 
 - `format_version`: 1.
-- `crs`: code of the CRS, or `local`. `origin_m`: [x, y, z] that is subtracted from it.
+- `crs`: code of the CRS, or `local`. `origin_m`: [x, y, z] that is subtracted from it. `given_crs`, `given_origin_m`:
+  those of the given positions, which differ where the orientation could not use them.
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
@@ -57,7 +58,9 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `wrong_attitudes`
   (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
-  (`world`, or `own`: nothing ties it to the CRS), `remarks` (what is wrong with given positions or angles, sentences).
+  (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
+  and the one found, pixels, where they differ by more than 2 %), `stays` (whether wrong given poses were kept,
+  orient=given), `remarks` (what is wrong with given positions or angles, sentences).
 - `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for. `groups`:
   images that were oriented together, the largest group first: `kind` (`given`, `positions`, or `level`: no positions,
   scale and origin arbitrary), `images`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.orientation.arrangement import SAME_SHARE, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
 from aeromatch_cli.orientation.dem import Terrain, terrain_of
@@ -21,7 +23,6 @@ from aeromatch_cli.orientation.judgement import (
     triangulated,
 )
 from aeromatch_cli.orientation.mapping import Model
-from aeromatch_cli.orientation.placing import similarity
 from aeromatch_cli.orientation.resection import resected
 from aeromatch_cli.orientation.strips import predicted
 
@@ -35,10 +36,10 @@ _WRONG_DEG = 30.0
 _WRONG_SIGMAS = 5.0
 # Fewer images make no model.
 _FEWEST_IMAGES = 3
+# A focal length that differs by more than this share is said.
+_FOCAL_SHARE = 0.02
 # Pictures of one place differ by less, in pixels of the stored images.
 _STANDING_PX = 2.0
-# A model of a grown block is moved onto the poses that it had before, where these agree to a share of its extent.
-_SAME_SHARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,22 +89,25 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     Images without matches keep what was given: nothing speaks against it.
     """
     block, pairs, cameras = evidence.block, evidence.pairs, evidence.cameras
-    poses, found = dict(block.poses), dict[str, Pose]()
+    poses = dict(block.poses)
+    known = {i: poses[i] for i in sorted(good)}
+    height_m = _flying_height_m(evidence, known) if evidence.matched - good else 1.0
+    sigmas = (_SIGMA_POSITION_SHARE * height_m, _SIGMA_ANGLE_DEG)
+    found = resected(pairs, known, cameras, evidence.thresholds_px, sigmas)
     if correct:
-        known = {i: poses[i] for i in sorted(good)}
-        height_m = _flying_height_m(evidence, known) if evidence.matched - good else 1.0
-        sigmas = (_SIGMA_POSITION_SHARE * height_m, _SIGMA_ANGLE_DEG)
-        found = resected(pairs, known, cameras, evidence.thresholds_px, sigmas)
-        for image_id in evidence.matched - good - found.keys():
-            if image_id in poses:
-                poses[image_id] = replace(poses[image_id], world_rotation=None)
+        by_strip = predicted(block, known | found)
+        for image_id in (evidence.matched - good - found.keys()) & poses.keys():
+            poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
         poses |= found
-    points = _finite(triangulated(pairs, poses, cameras))
+    # What is wrong with a pose that stays is no reason for a wrong terrain.
+    points = _finite(triangulated(pairs, known | found or poses, cameras))
     facts = {
         "method": "given",
         "frame": "world",
-        "corrected": sorted(found),
+        "corrected": sorted(found) if correct else [],
+        "stays": not correct,
         "remarks": [],
+        "focal_lengths": {},
         "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
         "points": len(points),
         **_judged(block.poses, found),
@@ -125,67 +129,89 @@ def unoriented_remark(evidence: Evidence) -> str:
 
 def judged(given: Solution, pictures: Solution) -> Solution:
     """Given poses as they are, with what the pictures say against them."""
-    against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "remarks")}
-    return replace(given, facts={**given.facts, **against})
+    against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "focal_lengths", "remarks")}
+    placed = pictures.facts["frame"] == "world" and pictures.terrain is not None
+    terrain, points = (pictures.terrain, pictures.facts["points"]) if placed else (given.terrain, given.facts["points"])
+    return replace(given, terrain=terrain, facts={**given.facts, **against, "points": points})
 
 
-def from_models(
-    evidence: Evidence, models: Sequence[Model], before: Mapping[str, Pose], angles: Mapping[str, Angles]
-) -> Solution:
+@dataclass(frozen=True, eq=False)
+class Before:
+    """What an earlier run found for images that have not changed: poses, and cameras by camera_id."""
+
+    poses: Mapping[str, Pose]
+    cameras: Mapping[str, Camera]
+
+
+def from_models(evidence: Evidence, models: Sequence[Model], before: Before, angles: Mapping[str, Angles]) -> Solution:
     """Given poses and cameras, replaced by those of the mapper's models, the largest first.
 
-    before: poses that an earlier run found for images that have not changed; models are moved onto them, and where
-    they agree the images keep them. angles: image_id -> attitude as it was given.
+    before: models are moved onto these poses, and where they agree the images keep them and their cameras. angles:
+    image_id -> attitude as it was given.
     """
     block = evidence.block
     poses, cameras = dict(block.poses), dict(block.cameras)
     found: dict[str, Pose] = {}
-    offset_m = 0.0
-    for model in reversed(models):  # the largest model's cameras count
-        model, kept = _anchored(model, before)
-        if model.kind == "level" and not kept:
-            # Groups that nothing ties to the world or to each other lie side by side.
-            east = np.array([center[0] for center in model.centers_m.values()])
-            model = _moved(model, 1.0, np.eye(3), np.array([offset_m - east.min(), 0.0, 0.0]))
-            offset_m += 2.0 * float(np.ptp(east)) + 1000.0
+    for model, kept in reversed(arranged(models, before.poses)):  # the largest model's cameras count
         height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
         sigma_m = _SIGMA_POSITION_SHARE * abs(height_m)
         for image_id, rotation in model.rotations.items():
             found[image_id] = Pose(model.centers_m[image_id], rotation, sigma_m, _SIGMA_ANGLE_DEG)
         found |= kept
         cameras |= model.cameras
-    level = bool(models) and models[0].kind == "level"
-    convention = None if level else _convention(models, angles)
-    given = dict(block.poses)
-    for image_id, one in angles.items():
-        if convention is not None and image_id in given:
-            given[image_id] = replace(given[image_id], world_rotation=convention.rotation(one))
-    by_strip = {} if level or convention else predicted(block, found)
-    inexact = set() if level else evidence.consistent()
-    for image_id in block.poses.keys() - found.keys() - inexact:
+        cameras |= {k: old for k, old in before.cameras.items() if kept and _same_lens(model.cameras.get(k), old)}
+    beside = {i for model in models if model.kind == "level" for i in model.rotations}
+    own = bool(models) and found.keys() <= beside
+    convention = None if own else _convention(models, angles)
+    outside = block.poses.keys() - found.keys()
+    if own:
+        poses = {}  # given positions are in another frame
+    elif convention is not None:
+        poses |= {i: replace(poses[i], world_rotation=convention.rotation(angles[i])) for i in outside & angles.keys()}
+    else:
         # An attitude that nothing confirms in a block where others were wrong is not relied on.
-        unknown = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
-        poses[image_id] = given[image_id] if convention else unknown
-        if level:
-            del poses[image_id]  # its position is in another frame than the others'
+        by_strip = predicted(block, found)
+        for image_id in outside - evidence.consistent():
+            poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
     poses |= found
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
     points = _finite(triangulated(evidence.pairs, found, lenses))
+    wrong = _judged(block.poses, {i: pose for i, pose in found.items() if i not in beside}, convention, angles)
     facts = {
         "method": "pictures",
-        "frame": "own" if level else "world",
+        "stays": False,
+        "frame": "own" if own else "world",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
         "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
         "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": len(points),
-        **_judged(given, found),
+        **wrong,
+        "focal_lengths": _focal_lengths(block.cameras, cameras),
         "outside": _outside(block, found),
-        "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
+        "remarks": [
+            *_position_remarks(models),
+            *_frame_remarks(beside, own=own),
+            *_convention_remarks(convention),
+        ],
     }
-    if level:
-        facts["wrong_positions"] = facts["wrong_attitudes"] = {}
     return Solution(cameras, poses, terrain_of(points, _area(poses)), facts)
+
+
+def _same_lens(found: Camera | None, old: Camera) -> bool:
+    """Whether a camera that was found again is the one found before, up to what mapping leaves open."""
+    if found is None or (found.model, found.width_px, found.height_px) != (old.model, old.width_px, old.height_px):
+        return False
+    return abs(focal_px(found) / focal_px(old) - 1.0) <= SAME_SHARE
+
+
+def _frame_remarks(beside: Collection[str], *, own: bool) -> list[str]:
+    if not beside:
+        return []
+    arbitrary = "scale, north and place are arbitrary"
+    if own:
+        return [f"without usable positions the result is in a frame of its own: {arbitrary}"]
+    return [f"{len(beside)} images are tied to no position and lie beside the others: their {arbitrary}"]
 
 
 def _convention(models: Sequence[Model], angles: Mapping[str, Angles]) -> Recognised | None:
@@ -214,31 +240,21 @@ def _position_remarks(models: Sequence[Model]) -> list[str]:
     return []
 
 
-def _anchored(model: Model, before: Mapping[str, Pose]) -> tuple[Model, dict[str, Pose]]:
-    """The model moved onto poses found before, and those of its images that keep theirs; as it is where they differ."""
-    common = sorted(model.centers_m.keys() & before.keys())
-    if len(common) < 3:
-        return model, {}
-    old_m = np.array([before[i].center_m for i in common])
-    now = np.array([model.centers_m[i] for i in common])
-    moved = _moved(model, *similarity(now, old_m))
-    errors_m = np.linalg.norm(np.array([moved.centers_m[i] for i in common]) - old_m, axis=1)
-    if errors_m.max() > _SAME_SHARE * np.linalg.norm(np.ptp(old_m, axis=0)):
-        return model, {}
-    return moved, {i: before[i] for i in common}
+def _judged(
+    given: Mapping[str, Pose],
+    found: Mapping[str, Pose],
+    convention: Recognised | None = None,
+    as_given: Mapping[str, Angles] | None = None,
+) -> dict[str, Any]:
+    """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres.
 
-
-def _moved(model: Model, scale: float, rotation: FloatArray, shift_m: FloatArray) -> Model:
-    return replace(
-        model,
-        rotations={i: one @ rotation.T for i, one in model.rotations.items()},
-        centers_m={i: scale * rotation @ center + shift_m for i, center in model.centers_m.items()},
-        points_m=scale * model.points_m @ rotation.T + shift_m,
-    )
-
-
-def _judged(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, Any]:
-    """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres."""
+    convention: how the angles as they were given are to be read, where they are wrong as a whole.
+    """
+    if convention is not None and as_given is not None:
+        read = {
+            i: replace(given[i], world_rotation=convention.rotation(one)) for i, one in as_given.items() if i in given
+        }
+        given = {**given, **read}
     angles = {i: round(error, 1) for i, error in attitude_errors_deg(given, found).items()}
     shifts = {i: round(error, 2) for i, error in position_errors_m(given, found).items()}
     limits = {i: _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m) for i in shifts}
@@ -246,6 +262,12 @@ def _judged(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, A
         "wrong_attitudes": {i: error for i, error in sorted(angles.items()) if error > _WRONG_DEG},
         "wrong_positions": {i: error for i, error in sorted(shifts.items()) if error > limits[i]},
     }
+
+
+def _focal_lengths(given: Mapping[str, Camera], found: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
+    """camera_id -> focal lengths given and found, pixels, where they differ."""
+    both = {k: (focal_px(camera), focal_px(found[k])) for k, camera in sorted(given.items())}
+    return {k: (round(old, 1), round(new, 1)) for k, (old, new) in both.items() if abs(new / old - 1.0) > _FOCAL_SHARE}
 
 
 def _flying_height_m(evidence: Evidence, poses: Mapping[str, Pose]) -> float:

@@ -82,7 +82,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         headline=_headline(images, pairs, facts, failures),
-        notices=notices(images, pairs, facts, wrong, input_facts.get("warnings", [])),
+        notices=notices(images, pairs, facts, _facts(context, "orient"), input_facts.get("warnings", [])),
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
@@ -144,10 +144,10 @@ def notices(
     images: Sequence[ImageRow],
     pairs: Sequence[PairRow],
     facts: Mapping[str, Any],
-    wrong: Mapping[str, float],
+    judged: Mapping[str, Any],
     warnings: Sequence[str],
 ) -> list[Notice]:
-    """What needs a person's eye, the gravest first."""
+    """What needs a person's eye, the gravest first. facts: of the filter; judged: of the orientation."""
     found = []
     names = {row.image_id: row.name for row in images}
     if not facts["verified_matches"]:
@@ -157,11 +157,15 @@ def notices(
         shown = ", ".join(f"{size:,}" for size in sizes[:12] if size > 1)
         text = f"Sizes of the groups with more than one image: {shown}. Images tied to no other: {alone:,}."
         found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
-    if wrong:
-        text = "The pictures contradict the given attitude by the angle shown; the one from the pictures is used."
-        items = tuple(f"{names.get(i, i)}: {angle:.1f}°" for i, angle in wrong.items())
-        title = _counted(len(items), "wrong attitude", "wrong attitudes")
-        found.append(Notice("bad", title, text, items))
+    used = "the given one is kept" if judged.get("stays") else "the one from the pictures is used"
+    for key, what, unit in (("wrong_attitudes", "attitude", "°"), ("wrong_positions", "position", " m")):
+        items = tuple(f"{names.get(i, i)}: {off:.1f}{unit}" for i, off in judged.get(key, {}).items())
+        if items:
+            text = f"The pictures contradict the given {what} by what is shown; {used}."
+            found.append(Notice("bad", _counted(len(items), f"wrong {what}", f"wrong {what}s"), text, items))
+    for camera_id, (before, now) in judged.get("focal_lengths", {}).items():
+        text = f"Camera {camera_id}: {now:.0f} px in the pictures, {before:.0f} px given; {used}."
+        found.append(Notice("warn", "Another focal length", text))
     if facts["weakly_tied"] and facts["verified_matches"]:
         ties = {row.image_id: row for row in images}
         items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in facts["weakly_tied"])

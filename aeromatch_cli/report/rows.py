@@ -32,7 +32,7 @@ T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
 COVERAGE_CELLS = 16
 NOT_JUDGED = "not judged"
-_STAGE_ORDER = ("pairs", "enhance", "simulate", "extract", "match", "filter", "export")
+_STAGE_ORDER = ("orient", "pairs", "enhance", "simulate", "extract", "match", "filter", "adjust", "export")
 
 
 @dataclass(frozen=True)

@@ -95,12 +95,14 @@ def with_gsd(block: Block, before_m: float | None) -> Block:
     return replace(block, gsd_m=gsd_m)
 
 
-def block_record(block: Block, settings: Settings) -> dict[str, Any]:
-    """Contents of block.json."""
+def block_record(block: Block, given: Block, settings: Settings) -> dict[str, Any]:
+    """Contents of block.json. given: the block before it was oriented."""
     return {
         "format_version": FORMAT_VERSION,
         "crs": block.crs,
         "origin_m": list(block.origin_m),
+        "given_crs": given.crs,
+        "given_origin_m": list(given.origin_m),
         "ground_source": block.ground_source,
         "ground_z_m": block.ground.z_m if isinstance(block.ground, ConstantGround) else None,
         "gsd_m": block.gsd_m,
@@ -136,7 +138,7 @@ def _read_inputs(
     names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
     outcomes = dict(zip(names, executor.run(_read_header, [root / name for name in names], "read"), strict=True))
     # The origin of an earlier run is kept, unless the user now asks for another CRS.
-    same_crs = before and given.crs in ("auto", before["crs"])
+    frame = WorldFrame(before["given_crs"], tuple(before["given_origin_m"])) if "given_crs" in before else None
     inputs = block_inputs(
         root,
         lists,
@@ -145,7 +147,7 @@ def _read_inputs(
         crs=given.crs,
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
-        known_frame=WorldFrame(before["crs"], tuple(before["origin_m"])) if same_crs else None,
+        known_frame=frame if frame is not None and given.crs in ("auto", frame.crs) else None,
     )
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     return inputs, {image.image_id: prints[image.name] for image in inputs.images}

@@ -6,12 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from aeromatch_cli.data import Block
-from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.stages import enhance, filter  # noqa: A004
 from aeromatch_cli.stages.stage_report import StageReport
-
-# A focal length that differs more from the given one is said.
-_FOCAL_SAID = 0.02
 
 
 def stage_lines(stage: StageReport, *, part: bool) -> list[str]:
@@ -65,18 +61,19 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     attitudes = sum(pose.world_rotation is not None for pose in given.poses.values())
     explains = f"given poses explain the matches of {explained} of {matched} images"
     if facts["method"] == "given":
-        words = [explains if matched else "no matches to judge the given poses by"]
+        unjudged = "no matches to judge the given poses by" if attitudes else "no matches to find it by"
+        words = [explains if matched else unjudged]
     else:
         sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
         words = [f"from the pictures: {sizes} of {len(block.images)} images", *([explains] if attitudes else [])]
-        for camera_id, camera in sorted(block.cameras.items()):
-            before = focal_px(given.cameras[camera_id])
-            if abs(focal_px(camera) / before - 1.0) > _FOCAL_SAID:
-                words.append(f"focal length of {camera_id}: {focal_px(camera):.0f} px instead of {before:.0f} px")
+    for camera_id, (before, found) in facts["focal_lengths"].items():
+        kept = ", but the given one is kept" if facts["stays"] else ""
+        words.append(f"focal length of {camera_id}: {found:.0f} px instead of {before:.0f} px{kept}")
     for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
         if facts[what]:
             named = _listed([f"{i} ({value:.0f} {unit})" for i, value in facts[what].items()])
-            words.append(f"{what.replace('_', ' ')} given and corrected: {named}")
+            done = "kept, as orient=given asks" if facts["stays"] else "corrected"
+            words.append(f"{what.replace('_', ' ')} given and {done}: {named}")
     if facts["outside"]:
         words.append(f"not oriented: {_listed(facts['outside'])}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
@@ -93,7 +90,7 @@ def _adjust_lines(stage: StageReport) -> list[str]:
     ]
     if len(facts["groups"]) > 1:
         sizes = ", ".join(str(group["images"]) for group in facts["groups"])
-        words.append(f"{len(facts['groups'])} groups of images that nothing ties to each other: {sizes}")
+        words.append(f"{len(facts['groups'])} groups of images, each oriented by itself: {sizes}")
     words += _control_words(facts["control"])
     words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
     return [f"          {line}" for line in words]

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import Ground, Pose
+from aeromatch_cli.data import FloatArray, Ground
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.mapping import MAPPERS, Group, Mapper, Model, map_block
 from aeromatch_cli.orientation.solution import (
+    Before,
     Evidence,
     Solution,
     from_given,
@@ -88,6 +89,13 @@ def run(
     ground, source, remarks = judged_ground(context, terrain, record["facts"])
     remarks += judged_altitudes(ground, context.block, record["facts"], altitudes)
     report.facts = record["facts"] | {"remarks": [*record["facts"]["remarks"], *remarks]}
+    if record["facts"]["frame"] == "own":
+        # Given positions are in another frame, and nothing ties this one to a CRS.
+        context = replace(
+            context,
+            block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0)),
+            given=replace(context.given, poses={}),
+        )
     block = replace(
         context.block,
         cameras=read_cameras(folder / "cameras.csv"),
@@ -125,7 +133,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
         solution = from_given(evidence, good, correct=recipe.replaces)
     else:
         models, first, evidence = _mapped(context, recipe, first, evidence)
-        solution = from_models(evidence, models, _poses_before(context, kept), context.angles)
+        solution = from_models(evidence, models, _before(context, kept), context.angles)
         if not models:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
@@ -188,7 +196,7 @@ def _one_round(
 def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
     cameras = {**context.block.cameras, **model.cameras}
     of_images = {image.image_id: cameras[image.camera_id] for image in context.block.images}
-    return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px)
+    return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px, context.block.poses)
 
 
 def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
@@ -218,11 +226,13 @@ def _evidence(context: Context, recipe: FirstPass, *, by_position: bool = True) 
     return first, Evidence(context.block, pairs, thresholds_px)
 
 
-def _poses_before(context: Context, kept: set[str]) -> dict[str, Pose]:
+def _before(context: Context, kept: set[str]) -> Before:
     if not kept:
-        return {}
-    poses = read_poses(context.workspace.orientation / "poses.csv")
-    return {i: pose for i, pose in poses.items() if i in kept and pose.world_rotation is not None}
+        return Before({}, {})
+    folder = context.workspace.orientation
+    poses = read_poses(folder / "poses.csv")
+    held = {i: pose for i, pose in poses.items() if i in kept and pose.world_rotation is not None}
+    return Before(held, read_cameras(folder / "cameras.csv"))
 
 
 def _prints(context: Context) -> tuple[dict[str, str], str]:
@@ -252,14 +262,15 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     path = folder / "orientation.json"
     with translated_os_errors(path):  # the record comes last: it vouches for the others
         path.unlink(missing_ok=True)
-        (folder / "terrain.tif").unlink(missing_ok=True)
+        if solution.terrain is None:
+            (folder / "terrain.tif").unlink(missing_ok=True)
     write_text(folder / "cameras.csv", cameras_text(solution.cameras))
     write_text(folder / "poses.csv", poses_text(solution.poses))
     names = ["cameras.csv", "poses.csv"]
     terrain = solution.terrain
     if terrain is not None:
         place = terrain.west_m, terrain.north_m, terrain.cell_m
-        data = terrain_bytes(terrain.heights_m, *place, np.array(context.block.origin_m), context.block.crs)
+        data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.facts))
         write_atomically(folder / "terrain.tif", lambda stream: stream.write(data))
         names.append("terrain.tif")
     large = {key: solution.facts[key] for key in ("tied", "similar", "groups")}
@@ -271,4 +282,13 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
 
 def _terrain(context: Context) -> Terrain | None:
     path = context.workspace.orientation / "terrain.tif"
-    return Terrain(*read_terrain(path, np.array(context.block.origin_m))) if path.is_file() else None
+    if not path.is_file():
+        return None
+    origin_m, _ = _frame(context, read_json(context.workspace.orientation / "orientation.json")["facts"])
+    return Terrain(*read_terrain(path, origin_m))
+
+
+def _frame(context: Context, facts: Mapping[str, Any]) -> tuple[FloatArray, str]:
+    """Origin and CRS of what the orientation has found."""
+    own = facts["frame"] == "own"
+    return (np.zeros(3), "local") if own else (np.array(context.block.origin_m), context.block.crs)

@@ -66,6 +66,7 @@ def prepare(
         log.warning("warning: %s", warning)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
+    report.started += oriented.seconds  # has its own report
     context = _with_ground(context, found)
     wanted = _fingerprint(context)
     pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
@@ -182,6 +183,6 @@ def _write(context: Context, pairs_csv: str) -> None:
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,
     }
-    write_json(workspace.block, block_record(block, context.settings))
+    write_json(workspace.block, block_record(block, context.given, context.settings))
     for path, text in texts.items():
         write_text(path, text)
