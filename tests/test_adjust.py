@@ -141,6 +141,29 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
 
 
+def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> None:
+    """Given positions that are mirrored: of a group that is level they are no observations."""
+    mirrored = {
+        i: replace(p, center_m=p.center_m * [-1.0, 1.0, 1.0]) for i, p in given_positions(truth, 1, 0.1).items()
+    }
+    groups = [Group("level", IMAGE_IDS)]
+    adjusted, _ = refine_block(disturbed(truth, 0), Observed(mirrored, FOCAL_SIGMAS, {}), groups, fixed=False)
+    free, _ = refine_block(disturbed(truth, 0), Observed({}, FOCAL_SIGMAS, {}), groups, fixed=False)
+    for image_id, pose in adjusted.poses.items():
+        np.testing.assert_allclose(pose.center_m, free.poses[image_id].center_m, atol=1e-9)
+        np.testing.assert_allclose(pose.sigmas_m, free.poses[image_id].sigmas_m, atol=1e-12)
+
+
+def test_no_image_is_in_two_groups(truth: Truth) -> None:
+    """The matches tie all images: the second group stays by itself, the image in neither is tied to the first."""
+    groups = [Group("positions", IMAGE_IDS[:2]), Group("positions", IMAGE_IDS[2:5])]
+    observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
+    adjusted, figures = refine_block(disturbed(truth, 0), observed, groups, fixed=False)
+    assert sum(one["images"] for one in figures) == len(adjusted.poses) <= len(IMAGE_IDS)
+    seen = np.bincount(np.concatenate([track[:, 1] for track in adjusted.tracks.values()]))
+    assert (seen >= 2).all()
+
+
 def test_the_file_reads_back_exactly(truth: Truth, tmp_path: Path) -> None:
     adjusted, _ = refined(truth)
     path = tmp_path / "adjusted.npz"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import sqlite3
 from pathlib import Path
 
@@ -40,6 +42,47 @@ def test_kappas_off_by_180_degrees_are_named_and_replaced(site: Site, rendered: 
     assert max(errors) < 10.0  # five positions with 5 m errors level a block of 50 m no better
     page = (site.work / "report" / "index.html").read_text()
     assert "all kappas are off by 180 degrees" in page
+
+
+def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Site, rendered: Path) -> None:
+    """x and y exchanged: adjusted, exported and labelled without them, and the same command again does nothing."""
+
+    def exchanged(rows):
+        for row in rows:
+            row["x"], row["y"] = row["y"], row["x"]
+            row["omega_deg"] = row["phi_deg"] = row["kappa_deg"] = ""
+            yield row
+
+    site.rewrite_poses(exchanged)
+    outcome = site("run")
+    assert outcome.code == 0
+    assert "in a frame of its own: scale, north and place are arbitrary" in outcome.stderr
+    export = site.work / "export" / "colmap"
+    world = json.loads((export / "world.json").read_text())
+    assert (world["crs"], world["origin_m"]) == ("local", [0.0, 0.0, 0.0])
+    with (export / "orientation.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == IMAGES
+    # Upright and level: cameras a hundred units above the ground.
+    assert all(abs(float(row["omega_deg"])) < 20.0 for row in rows)
+    assert np.median([float(row["z"]) for row in rows]) == pytest.approx(100.0, rel=0.1)
+    before = {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()}
+    assert site("run").code == 0
+    assert {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()} == before
+
+
+def test_surveyed_poses_are_held_against_single_wrong_ones(site: Site, rendered: Path) -> None:
+    def change(rows):
+        for number, row in enumerate(rows):
+            if number == 1:
+                row["kappa_deg"] = repr(float(row["kappa_deg"]) + 120.0)
+            yield row
+
+    site.rewrite_poses(change)
+    outcome = site("orient", "--set", "orient=given")
+    name = site.names()[1].replace(".", "_")
+    assert f"wrong attitudes given and kept, as orient=given asks: {name} (1" in outcome.stdout
+    assert attitude_errors(site, rendered)[1] > 100.0
 
 
 def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:

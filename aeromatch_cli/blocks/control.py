@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.data import ControlPoint, FloatArray, Image
 from aeromatch_cli.errors import ConfigError
@@ -56,7 +57,9 @@ def read_control(
     checks = {row.name for row in rows if row.check}
     points = tuple(ControlPoint(name, place_m, name in checks, pixels[name]) for name, place_m in places.items())
     absent = sorted({row.image for row in rows} - ids.keys())
-    return points, [f"{path.name} names {len(absent)} images that are not in the block: {absent[0]}"] if absent else []
+    return points, [
+        f"{path.name} names {len(absent)} images that are not in the block: {listed(absent)}"
+    ] if absent else []
 
 
 @dataclass(frozen=True)

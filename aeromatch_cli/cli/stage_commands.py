@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 # Name: what the command does, and examples.
 STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     "run": (
-        "Do everything, over all overlapping pairs: from the pairs to the report.",
+        "Do everything, over all overlapping pairs: from the orientation to the report.",
         (
             "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
             "aeromatch run fusion --images IMGS --poses poses.csv --crs EPSG:32633",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,9 +31,8 @@ _MOST = 0.6
 # Standard deviations of poses from the pictures: of each angle, and of the position as a share of the flying height.
 _SIGMA_ANGLE_DEG = 0.2
 _SIGMA_POSITION_SHARE = 0.005
-# Beyond this a given attitude is wrong and not just inexact; and a position beyond so many standard deviations.
-_WRONG_DEG = 30.0
-_WRONG_SIGMAS = 5.0
+# Beyond so many standard deviations, and so many degrees, a given position or attitude is wrong and not just inexact.
+_WRONG_SIGMAS, _WRONG_DEG = 5.0, 15.0
 # Fewer images make no model.
 _FEWEST_IMAGES = 3
 # A focal length that differs by more than this share is said.
@@ -119,6 +118,8 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
 def unoriented_remark(evidence: Evidence) -> str:
     """Why no image could be oriented from its matches."""
     said = "no image could be oriented from the pictures"
+    if not evidence.pairs:
+        return f"{said}: no two of them have enough matches"
     if len(evidence.matched) < _FEWEST_IMAGES:
         return f"{said}: at least {_FEWEST_IMAGES} images must show the same ground, {len(evidence.matched)} do"
     moved_px = [np.median(np.linalg.norm(p.points0_px - p.points1_px, axis=1)) for p in evidence.pairs]
@@ -189,11 +190,7 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         **wrong,
         "focal_lengths": _focal_lengths(block.cameras, cameras),
         "outside": _outside(block, found),
-        "remarks": [
-            *_position_remarks(models),
-            *_frame_remarks(beside, own=own),
-            *_convention_remarks(convention),
-        ],
+        "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }
     return Solution(cameras, poses, terrain_of(points, _area(poses)), facts)
 
@@ -203,15 +200,6 @@ def _same_lens(found: Camera | None, old: Camera) -> bool:
     if found is None or (found.model, found.width_px, found.height_px) != (old.model, old.width_px, old.height_px):
         return False
     return abs(focal_px(found) / focal_px(old) - 1.0) <= SAME_SHARE
-
-
-def _frame_remarks(beside: Collection[str], *, own: bool) -> list[str]:
-    if not beside:
-        return []
-    arbitrary = "scale, north and place are arbitrary"
-    if own:
-        return [f"without usable positions the result is in a frame of its own: {arbitrary}"]
-    return [f"{len(beside)} images are tied to no position and lie beside the others: their {arbitrary}"]
 
 
 def _convention(models: Sequence[Model], angles: Mapping[str, Angles]) -> Recognised | None:
@@ -229,14 +217,10 @@ def _position_remarks(models: Sequence[Model]) -> list[str]:
     contradiction = models[0].figures.get("contradiction") if models else ""
     if contradiction == "mirrored":
         return [
-            "the given positions fit the pictures only mirrored: are x and y, or latitude and longitude, exchanged? "
-            "Without them the result is in a frame of its own"
+            "the given positions fit the pictures only mirrored: are x and y, or latitude and longitude, exchanged?"
         ]
     if contradiction:
-        return [
-            "the given positions do not fit the pictures: are they those of other images, or of another flight? "
-            "Without them the result is in a frame of its own"
-        ]
+        return ["the given positions do not fit the pictures: are they those of other images, or of another flight?"]
     return []
 
 
@@ -256,10 +240,11 @@ def _judged(
         }
         given = {**given, **read}
     angles = {i: round(error, 1) for i, error in attitude_errors_deg(given, found).items()}
+    limits_deg = {i: max(_WRONG_DEG, _WRONG_SIGMAS * given[i].sigma_angle_deg) for i in angles}
     shifts = {i: round(error, 2) for i, error in position_errors_m(given, found).items()}
     limits = {i: _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m) for i in shifts}
     return {
-        "wrong_attitudes": {i: error for i, error in sorted(angles.items()) if error > _WRONG_DEG},
+        "wrong_attitudes": {i: error for i, error in sorted(angles.items()) if error > limits_deg[i]},
         "wrong_positions": {i: error for i, error in sorted(shifts.items()) if error > limits[i]},
     }
 

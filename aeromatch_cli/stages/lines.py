@@ -79,6 +79,16 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
 
 
+def frame_remarks(record: Mapping[str, Any]) -> list[str]:
+    """What nothing ties to the world. record: orientation.json."""
+    beside = sum(len(group["images"]) for group in record["groups"] if group["kind"] == "level")
+    if not beside:
+        return []
+    if record["facts"]["frame"] == "own":
+        return ["without usable positions the result is in a frame of its own: scale, north and place are arbitrary"]
+    return [f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary"]
+
+
 def _adjust_lines(stage: StageReport) -> list[str]:
     """Figures of the bundle adjustment, and images that it could not tie."""
     facts = stage.facts

@@ -6,6 +6,7 @@ the pictures. Later stages read the result from the workspace's orientation fold
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
+from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
@@ -32,6 +34,7 @@ from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
+from aeromatch_cli.stages.lines import frame_remarks
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -46,6 +49,8 @@ from aeromatch_cli.workspace import (
     write_json,
     write_text,
 )
+
+log = logging.getLogger("aeromatch")
 
 VERSION = 8
 # Images that no model holds are mapped again by themselves so often.
@@ -86,7 +91,8 @@ def run(
         report.skipped = report.items
     folder = context.workspace.orientation
     terrain = _terrain(context)
-    ground, source, remarks = judged_ground(context, terrain, record["facts"])
+    ground, source, ground_remarks = judged_ground(context, terrain, record["facts"])
+    remarks = [*frame_remarks(record), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, record["facts"], altitudes)
     report.facts = record["facts"] | {"remarks": [*record["facts"]["remarks"], *remarks]}
     if record["facts"]["frame"] == "own":
@@ -131,6 +137,8 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
         good = evidence.explained()
     if not evidence.pairs or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
+        if not evidence.pairs and not given:
+            solution.facts["remarks"].append(unoriented_remark(evidence))
     else:
         models, first, evidence = _mapped(context, recipe, first, evidence)
         solution = from_models(evidence, models, _before(context, kept), context.angles)
@@ -203,7 +211,11 @@ def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: 
     """Models of the pairs of the first pass between some images."""
     pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
     with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
-        return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
+        try:
+            return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
+        except InputError as error:  # the other mapper may do, and matches are found without orientation, too
+            log.warning("warning: %s", error)
+            return ()
 
 
 def _images(models: Sequence[Model]) -> int:

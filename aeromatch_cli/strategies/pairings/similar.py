@@ -26,5 +26,5 @@ class Similar(Strategy):
 
     def __call__(self, block: Block) -> list[Pair]:
         """Pairs of a block; see the family's table for the contract."""
-        reasons = dict.fromkeys(block.similar, self.name) | dict.fromkeys(block.tied, "first pass")
+        reasons = dict.fromkeys(block.tied, "first pass") | dict.fromkeys(block.similar, self.name)
         return measured_pairs(block, reasons, block_footprints(block))

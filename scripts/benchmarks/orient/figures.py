@@ -36,17 +36,20 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     turn = u * [1.0, 1.0, np.linalg.det(u @ vt)] @ vt
     cosines = [(np.trace(one.T @ turn) - 1.0) / 2.0 for one in turns]
     errors = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    whole_deg = float(np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
     lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
     focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
     record = work / "reports" / "orient.json"
     facts = read_json(record)["facts"] if record.is_file() else {}
     remarks = facts.get("remarks", [])
     whole = any("angles" in remark for remark in remarks)
+    own = facts.get("frame") == "own"
     named = wrong if whole else {name_of[i] for i in facts.get("wrong_attitudes", {})}
     return {
         "oriented": len(common),
         "attitude_deg": float(np.median(errors)) if len(errors) else float("nan"),
         "attitude_max_deg": float(errors.max()) if len(errors) else float("nan"),
+        "turn_deg": None if own or not common else whole_deg,
         "focal_share": focal / float(lens["params"][0]) - 1.0,
         "method": facts.get("method", "none"),
         "named": len(named & wrong),
