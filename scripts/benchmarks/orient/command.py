@@ -18,12 +18,12 @@ truth and a camera file. Every case is one run of the preset on every k-th image
 
 Attitude error: median and maximum over the oriented images, after one common turn of the whole block. Turn: that one,
 degrees, of results in the world frame; on real blocks it holds the errors of both GPS and the reference. Focal length:
-against the reference camera. Within 3 px: verified matches, by symmetric epipolar distance from the reference poses, and as a share of those
-of the case `reference`. Named: images whose attitude was made wrong and is named so, or all where a fault of the whole
-list is named, and those named without cause. Said: what the summary says of the fault. Terrain, of rendered blocks:
-median distance of the terrain found from the surface that the images show, as a share of the flying height. Images:
-those that the adjusted block holds; lost: those of them that it holds with the reference poses only. Seconds: of the
-whole command, of the stage orient, of the stage match.
+against the reference camera. Within 3 px: verified matches, by symmetric epipolar distance from the reference poses,
+and as a share of those of the case `reference`. Named: images whose attitude was made wrong and is named so, or all
+where a fault of the whole list is named, and those named without cause. Said: what the summary says of the fault.
+Terrain, of rendered blocks: median distance of the terrain found from the surface that the images show, as a share of
+the flying height. Images: those that the adjusted block holds; lost: those of them that it holds with the reference
+poses only. Seconds: of the whole command, of the stage orient, of the stage match.
 """
 
 from __future__ import annotations
