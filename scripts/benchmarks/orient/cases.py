@@ -13,10 +13,14 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 
-CASES = ("reference", "noise", "nothing", "third", "yaw", "longer", "shorter", "outliers", "columns", "mirrored",
-         "shuffled", "ground")  # fmt: skip
+CASES = (
+    "reference", "noisy", "unoriented", "noise", "nothing", "third", "yaw", "longer", "shorter", "outliers", "columns",
+    "mirrored", "shuffled", "ground",
+)  # fmt: skip
 POSITIONS_ONLY = ("noise", "outliers", "mirrored")
 NOISE_M, OUTLIER_M = 5.0, 100.0
+# Of noisy poses: positions, as a share of each image's own flying height, and angles.
+NOISE_SHARE, NOISE_DEG = 0.05, 3.0
 ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 
 
@@ -28,7 +32,8 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
     camera = json.loads((reference / "block.json").read_text(encoding="utf-8"))
     ground_z = camera.pop("ground_z", None)  # the terrain is to be found
     rng = np.random.default_rng(len(names))
-    wrong = _worsen(case, rows, rng)
+    below_m = ground_z["p50"] if isinstance(ground_z, dict) else ground_z or 0.0
+    wrong = _worsen(case, rows, rng, below_m)
     for lens in camera["cameras"].values():
         factor = {"longer": 2.0, "shorter": 0.5}.get(case, 1.0)
         count = 2 if lens["model"] in ("PINHOLE", "OPENCV") else 1
@@ -42,9 +47,10 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
         writer.writerows(rows)
     crs = [] if camera["crs"] == "local" else ["--crs", camera["crs"]]
     if case == "ground":
-        below_m = ground_z["p50"] if isinstance(ground_z, dict) else ground_z
         flying_m = float(np.median([float(row["z"]) for row in rows])) - below_m
         crs += ["--ground", repr(below_m - flying_m)]
+    if case == "unoriented":
+        crs += ["--set=orient=none", "--ground", repr(below_m)]
     exact = (reference / "truth.json").is_file()  # rendered images have no EXIF
     lens = ["--cameras", str(folder / "block.json") if exact or case not in (*POSITIONS_ONLY, "nothing") else "exif"]
     if case == "nothing":
@@ -52,8 +58,8 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
     return ["--poses", str(poses), *lens, *(crs or ["--crs", "local"])], wrong
 
 
-def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator) -> set[str]:
-    """Change the rows of a pose list in place; names of images whose attitude is wrong now."""
+def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator, below_m: float) -> set[str]:
+    """Change the rows of a pose list in place; names of images whose attitude is wrong now. below_m: ground height."""
     wrong = set()
     if case == "shuffled":
         order = rng.permutation(len(rows))
@@ -67,6 +73,10 @@ def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator) -> 
             row[ANGLES[0]], row[ANGLES[1]] = row[ANGLES[1]], row[ANGLES[0]]
             wrong.add(str(row["image"]))
         off_m = np.zeros(3)
+        if case in ("noisy", "unoriented"):
+            off_m = NOISE_SHARE * (float(row["z"]) - below_m) * rng.normal(size=3)
+            for key, off_deg in zip(ANGLES, rng.normal(0.0, NOISE_DEG, 3), strict=True):
+                row[key] = repr(float(row[key]) + float(off_deg))
         if case in ("noise", "outliers"):
             off_m = NOISE_M * rng.normal(size=3) if case == "noise" else off_m
         if case == "outliers" and number % 10 == 0:

@@ -4,6 +4,8 @@ DATA holds blocks as BLOCK/images and BLOCK/reference/{poses.csv,block.json}; SC
 truth and a camera file. Every case is one run of the preset on every k-th image (--thin):
 
   reference  the reference poses and camera as they are: what the others are measured against
+  noisy      noise in all poses, 5 % of the flying height in each coordinate and 3 degrees in each angle
+  unoriented the same with orient=none and the reference's ground height
   noise      positions with 5 m noise in each coordinate, no attitudes, camera from EXIF
   nothing    no poses, camera from EXIF
   third      the attitudes of every third image at random
