@@ -27,6 +27,8 @@ def test_a_page_names_the_tables_that_are_older_than_the_code(path: Path) -> Non
     assert text.startswith("# ")
     assert text.partition("\n")[0] == pages.first_line(text, PRESENT), "scripts/bench pages mends it"
     assert text == pages.refreshed(text, PRESENT), "scripts/bench pages mends it"
+    made = [name for name, _ in pages.stamps(text)]
+    assert made == pages.table_names(text), "a table is empty: its benchmark fills it with --docs"
     for name, stamp in pages.stamps(text):
         assert pages.PAGES[name] == path.name
         assert sorted(stamp) == KEYS, name

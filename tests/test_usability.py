@@ -254,7 +254,16 @@ def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
     assert estimate["seconds_to_start"] > 3.0
     assert estimate["seconds_per_image"] < 1.5
     work = len(site.names()) * estimate["seconds_per_image"] + estimate["pairs"] * estimate["seconds_per_pair"]
-    assert estimate["seconds"] == pytest.approx(estimate["seconds_to_start"] + work, abs=0.1)
+    assert 0.0 < estimate["seconds_to_orient"] < 10.0
+    before = estimate["seconds_to_start"] + estimate["seconds_to_orient"]
+    assert estimate["seconds"] == pytest.approx(before + work, abs=0.1)
+
+
+def test_the_orientation_costs_nothing_where_it_is_there_or_not_wanted(done_site):
+    assert done_site("check").facts["estimate"]["seconds_to_orient"] == 0.0
+    outcome = done_site("check", "--set", "orient=none")
+    assert outcome.facts["estimate"]["seconds_to_orient"] == 0.0
+    assert "orient    " not in outcome.stdout
 
 
 def test_the_estimate_times_pairs_where_a_run_matches_them(site, monkeypatch):
@@ -267,4 +276,5 @@ def test_the_estimate_times_pairs_where_a_run_matches_them(site, monkeypatch):
 
     monkeypatch.setattr(Executor, "run", recorded)
     assert site("check").code == 0
-    assert labels[-2:] == [("_try_image", len(site.names())), ("_try_pair", 3)]
+    whole, first_pass = [("_try_image", len(site.names())), ("_try_pair", 3)], [("_try_image", 2), ("_try_pair", 1)]
+    assert labels[-4:] == [*whole, *first_pass]

@@ -89,12 +89,19 @@ def head(stamp: Stamp) -> str:
 
 
 def stamps(page_text: str) -> Iterator[tuple[str, Stamp]]:
-    """Name and stamp of every table of a page. Raises ValueError where one has none."""
+    """Name and stamp of every table of a page, but for those not made yet. Raises ValueError where one has none."""
     for match in _TABLE.finditer(page_text):
+        if not match[2].strip():
+            continue
         found = _STAMP.search(match[2])
         if found is None:
             raise ValueError(f"table {match[1]} has no stamp")
         yield match[1], json.loads(found[1])
+
+
+def table_names(page_text: str) -> list[str]:
+    """Of all tables of a page, made or not."""
+    return [match[1] for match in _TABLE.finditer(page_text)]
 
 
 def outdated_tables(page_text: str, present: Versions | None = None) -> list[str]:
