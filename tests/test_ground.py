@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aeromatch_cli.blocks.ground import ConstantGround, DemGround, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 
@@ -127,3 +127,12 @@ def test_unusable_dems_are_refused(tmp_path: Path) -> None:
         open_dem(tmp_path / "text.tif", "EPSG:32617", ORIGIN, POSITIONS)
     with pytest.raises(ConfigError, match="cannot read the DEM"):
         open_dem(tmp_path / "absent.tif", "EPSG:32617", ORIGIN, POSITIONS)
+
+
+def test_of_several_rasters_the_one_that_holds_a_point_counts() -> None:
+    near = DemGround(np.full((3, 4), 10.0), 0.0, 20.0, (10.0, 10.0), outside_m=11.0)  # -5 to 35 m, -5 to 25 m
+    far = DemGround(np.full((2, 2), 70.0), 1000.0, 0.0, (10.0, 10.0), outside_m=71.0)  # 995 to 1015 m, -15 to 5 m
+    ground = SeveralGrounds((near, far))
+    places = [[0.0, 0.0], [1010.0, -10.0], [-40.0, 0.0], [900.0, 500.0]]
+    np.testing.assert_allclose(ground.height_m(np.array(places)), [10.0, 70.0, 11.0, 71.0])
+    np.testing.assert_allclose(near.distance_m(np.array([[35.0, 25.0], [38.0, 29.0], [-15.0, 0.0]])), [0.0, 5.0, 10.0])

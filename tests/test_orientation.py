@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z, tilt_deg
-from aeromatch_cli.orientation.dem import terrain_of
+from aeromatch_cli.orientation.dem import terrain_of, terrains_of
 from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share
 from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT, place, similarity
 from aeromatch_cli.orientation.resection import resected
@@ -278,3 +278,20 @@ def test_the_terrain_follows_the_surface_whatever_single_points_say() -> None:
     assert np.median(errors) < 0.25
     assert errors.max() < 2.0
     assert terrain_of(points[:5], xy) is None
+
+
+def test_flights_that_lie_apart_have_a_terrain_each() -> None:
+    xy = np.random.default_rng(1).uniform([-40, -40], [120, 100], (1500, 2))
+    here = np.column_stack([xy, surface(xy)])
+    centers = np.array([pose.center_m for pose in flight().values()])
+    away = np.array([100_000.0, 0.0, 500.0])
+    half = centers[:6], centers[6:]
+    parts = [(here[:700], half[0]), (here[:400] + away, centers + away), (here[700:], half[1])]
+    found = terrains_of(parts)
+    assert len(found) == 2
+    assert found[0].cell_m < 10.0  # both halves of the flight here
+    whole = terrain_of(here, centers[:, :2])
+    assert whole is not None
+    assert found[0].heights_m.shape == whole.heights_m.shape
+    assert np.median(found[1].heights_m) == pytest.approx(500.0, abs=5.0)
+    assert found[1].west_m > 99_000.0

@@ -64,6 +64,27 @@ class DemGround:
         bottom = self.heights_m[y1, x0] * (1 - fx) + self.heights_m[y1, x1] * fx
         return np.where(outside, self.outside_m, top * (1 - fy) + bottom * fy)
 
+    def distance_m(self, xy_m: FloatArray) -> FloatArray:
+        """How far (N,) world points (N, 2) lie from the raster, 0 inside."""
+        rows, columns = self.heights_m.shape
+        middle = np.array([self.west_m, self.north_m]) + 0.5 * np.array(self.cell_m) * [columns - 1, 1 - rows]
+        beyond = np.abs(np.asarray(xy_m) - middle) - 0.5 * np.array(self.cell_m) * [columns, rows]
+        return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralGrounds:
+    """Rasters of flights that lie apart: of each point the first one that holds it counts, else the nearest."""
+
+    parts: tuple[DemGround, ...]
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """World heights (N,) below world points (N, 2)."""
+        points = np.asarray(xy_m, dtype=np.float64)
+        nearest = np.argmin([part.distance_m(points) for part in self.parts], axis=0)
+        heights = np.array([part.height_m(points) for part in self.parts])
+        return np.asarray(heights[nearest, np.arange(len(points))])
+
 
 def open_dem(
     path: Path, crs: str, origin_m: tuple[float, float, float], positions_m: FloatArray

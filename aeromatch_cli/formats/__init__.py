@@ -71,7 +71,8 @@ As those of the workspace.
 
 ### orientation/terrain.tif
 
-Heights of the terrain in the block's CRS, GeoTIFF, float32. Missing where the pictures tell none.
+Heights of the terrain in the block's CRS, GeoTIFF, float32. Missing where the pictures tell none. Flights that lie
+apart have one each: `terrain-2.tif` and so on.
 
 ### orientation/orientation.csv
 

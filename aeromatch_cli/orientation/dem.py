@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +64,36 @@ def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
     heights = np.median(points_m[:, 2][nearest], axis=1).reshape(rows, columns)
     heights = gaussian_filter(heights, 0.7, mode="nearest").astype(np.float32)
     return Terrain(heights, float(x[0]), float(y[0]), cell)
+
+
+def terrains_of(parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[Terrain, ...]:
+    """Terrains of flights that may lie anywhere, in the order of the first of them: one for all that lie together.
+
+    parts: of every group of images, its points (P, 3) and its projection centres (N, 3). Flights far apart in one grid
+    would have cells as wide as a valley.
+    """
+    flights: list[list[tuple[FloatArray, FloatArray]]] = []
+    for part in parts:
+        near = [flight for flight in flights if any(_meet(part[1], other[1]) for other in flight)]
+        joined = [one for flight in near for one in flight]
+        flights = [flight for flight in flights if not any(flight is one for one in near)]
+        flights.append([*joined, part])
+    flights.sort(key=lambda flight: min(n for n, part in enumerate(parts) if any(part is one for one in flight)))
+    found = [
+        terrain_of(np.concatenate([points for points, _ in flight]), np.concatenate([c[:, :2] for _, c in flight]))
+        for flight in flights
+    ]
+    return tuple(terrain for terrain in found if terrain is not None)
+
+
+def _meet(centers0_m: FloatArray, centers1_m: FloatArray) -> bool:
+    """Whether the boxes of two flights (N, 3) meet, each wider by its own extent on every side."""
+    boxes = []
+    for centers in (centers0_m[:, :2], centers1_m[:, :2]):
+        margin = float(np.ptp(centers, axis=0).max())
+        boxes.append((centers.min(axis=0) - margin, centers.max(axis=0) + margin))
+    (low0, high0), (low1, high1) = boxes
+    return bool((low0 <= high1).all() and (low1 <= high0).all())
 
 
 def continued(old: Terrain, new: Terrain, centers_m: FloatArray) -> Terrain:

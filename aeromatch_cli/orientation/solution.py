@@ -14,10 +14,11 @@ from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.orientation.arrangement import SAME_SHARE, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
-from aeromatch_cli.orientation.dem import Terrain, terrain_of
+from aeromatch_cli.orientation.dem import Terrain, terrains_of
 from aeromatch_cli.orientation.judgement import (
     PairPoints,
     attitude_errors_deg,
+    connected_groups,
     explained_images,
     position_errors_m,
     triangulated,
@@ -43,11 +44,12 @@ _STANDING_PX = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """cameras: camera_id -> Camera. poses: image_id -> Pose. facts: JSON-ready, see orientation.json in `formats`."""
+    """cameras: camera_id -> Camera. poses: image_id -> Pose. terrains: of flights that lie apart, the largest first.
+    facts: JSON-ready, see orientation.json in `formats`."""
 
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
-    terrain: Terrain | None
+    terrains: tuple[Terrain, ...]
     facts: Mapping[str, Any]
 
 
@@ -99,7 +101,9 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
             poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
         poses |= found
     # What is wrong with a pose that stays is no reason for a wrong terrain.
-    points = _finite(triangulated(pairs, known | found or poses, cameras))
+    seen = known | found or {i: pose for i, pose in poses.items() if pose.world_rotation is not None}
+    groups = connected_groups([(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= seen.keys()])
+    terrains, points = _terrains(evidence, seen, groups, cameras)
     facts = {
         "method": "given",
         "frame": "world",
@@ -108,11 +112,11 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
         "remarks": [],
         "focal_lengths": {},
         "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
-        "points": len(points),
+        "points": points,
         **_judged(block.poses, found),
         "outside": _outside(block, poses),
     }
-    return Solution(block.cameras, poses, terrain_of(points, _area(poses)), facts)
+    return Solution(block.cameras, poses, terrains, facts)
 
 
 def unoriented_remark(evidence: Evidence) -> str:
@@ -131,9 +135,8 @@ def unoriented_remark(evidence: Evidence) -> str:
 def judged(given: Solution, pictures: Solution) -> Solution:
     """Given poses as they are, with what the pictures say against them."""
     against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "focal_lengths", "remarks")}
-    placed = pictures.facts["frame"] == "world" and pictures.terrain is not None
-    terrain, points = (pictures.terrain, pictures.facts["points"]) if placed else (given.terrain, given.facts["points"])
-    return replace(given, terrain=terrain, facts={**given.facts, **against, "points": points})
+    better = pictures if pictures.facts["frame"] == "world" and pictures.terrains else given
+    return replace(given, terrains=better.terrains, facts={**given.facts, **against, "points": better.facts["points"]})
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +180,7 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
     poses |= found
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
-    points = _finite(triangulated(evidence.pairs, found, lenses))
+    terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
     wrong = _judged(block.poses, {i: pose for i, pose in found.items() if i not in beside}, convention, angles)
     facts = {
         "method": "pictures",
@@ -186,13 +189,13 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
         "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
         "calibrated": sorted({k for model in models for k in model.cameras}),
-        "points": len(points),
+        "points": points,
         **wrong,
         "focal_lengths": _focal_lengths(block.cameras, cameras),
         "outside": _outside(block, found),
         "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }
-    return Solution(cameras, poses, terrain_of(points, _area(poses)), facts)
+    return Solution(cameras, poses, terrains, facts)
 
 
 def _same_lens(found: Camera | None, old: Camera) -> bool:
@@ -263,6 +266,18 @@ def _flying_height_m(evidence: Evidence, poses: Mapping[str, Pose]) -> float:
     return abs(float(np.median([pose.center_m[2] for pose in poses.values()]) - np.median(points[:, 2])))
 
 
+def _terrains(
+    evidence: Evidence, poses: Mapping[str, Pose], groups: Sequence[set[str]], cameras: Mapping[str, Camera]
+) -> tuple[tuple[Terrain, ...], int]:
+    """Terrains of groups of posed images, and how many points they come from. cameras: by image_id."""
+    parts = []
+    for group in groups:
+        own = [pair for pair in evidence.pairs if {pair.image_id0, pair.image_id1} <= group]
+        centers_m = np.array([poses[i].center_m for i in sorted(group)])
+        parts.append((_finite(triangulated(own, poses, cameras)), centers_m))
+    return terrains_of(parts), sum(len(points) for points, _ in parts)
+
+
 def _finite(parts: Sequence[FloatArray]) -> FloatArray:
     points = np.concatenate([np.zeros((0, 3)), *parts])
     return points[np.isfinite(points).all(axis=1)]
@@ -271,7 +286,3 @@ def _finite(parts: Sequence[FloatArray]) -> FloatArray:
 def _outside(block: Block, poses: Mapping[str, Pose]) -> list[str]:
     known = {i for i, pose in poses.items() if pose.world_rotation is not None}
     return sorted(image.image_id for image in block.images if image.image_id not in known)
-
-
-def _area(poses: Mapping[str, Pose]) -> FloatArray:
-    return np.array([pose.center_m[:2] for pose in poses.values()]).reshape(-1, 2)

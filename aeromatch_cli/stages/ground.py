@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.ground import ConstantGround, DemGround, open_dem
+from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGrounds, open_dem
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, FloatArray, Ground
@@ -50,20 +50,22 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
 
 
 def judged_ground(
-    context: Context, terrain: Terrain | None, facts: Mapping[str, Any]
+    context: Context, terrains: Sequence[Terrain], facts: Mapping[str, Any]
 ) -> tuple[Ground | None, str, list[str]]:
     """The ground that later stages use, where it comes from in words, and what contradicts it.
 
-    terrain: of the pictures, or None. facts: those of the orientation. A stated ground wins, unless it cannot be right.
+    terrains: of the pictures, one for each flight. facts: those of the orientation. A stated ground wins, unless it
+    cannot be right.
     """
     ground, source = context.block.ground, context.block.ground_source
     own_frame = facts["frame"] == "own"
-    if terrain is None:
+    if not terrains:
         return (None, "", []) if own_frame else (ground, source, [])
-    cell = (terrain.cell_m, terrain.cell_m)
-    shown = DemGround(
-        terrain.heights_m, terrain.west_m, terrain.north_m, cell, outside_m=float(np.median(terrain.heights_m))
+    parts = tuple(
+        DemGround(one.heights_m, one.west_m, one.north_m, (one.cell_m, one.cell_m), float(np.median(one.heights_m)))
+        for one in terrains
     )
+    shown: Ground = parts[0] if len(parts) == 1 else SeveralGrounds(parts)
     words = f"terrain from {facts['points']} points of the first pass"
     if ground is None or own_frame:
         return shown, words, []

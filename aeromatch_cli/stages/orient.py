@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -90,8 +91,7 @@ def run(
     else:
         report.skipped = report.items
     folder = context.workspace.orientation
-    terrain = _terrain(context)
-    ground, source, ground_remarks = judged_ground(context, terrain, record["facts"])
+    ground, source, ground_remarks = judged_ground(context, _terrains(context, record), record["facts"])
     remarks = [*frame_remarks(record), *ground_remarks]
     remarks += judged_altitudes(ground, context.block, record["facts"], altitudes)
     report.facts = record["facts"] | {"remarks": [*record["facts"]["remarks"], *remarks]}
@@ -149,10 +149,12 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
-    terrain = solution.terrain
-    if terrain is not None and kept and (old := _terrain(context)) is not None:
-        terrain = continued(old, terrain, np.array([p.center_m for p in solution.poses.values()]))
-    return replace(solution, terrain=terrain, facts=facts)
+    terrains = solution.terrains
+    old = _terrains(context, _on_file(context)) if kept else ()
+    if len(old) == len(terrains):
+        centers_m = np.array([pose.center_m for pose in solution.poses.values()])
+        terrains = tuple(continued(one, new, centers_m) for one, new in zip(old, terrains, strict=True))
+    return replace(solution, terrains=terrains, facts=facts)
 
 
 def _mapped(
@@ -274,17 +276,17 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     path = folder / "orientation.json"
     with translated_os_errors(path):  # the record comes last: it vouches for the others
         path.unlink(missing_ok=True)
-        if solution.terrain is None:
-            (folder / "terrain.tif").unlink(missing_ok=True)
     write_text(folder / "cameras.csv", cameras_text(solution.cameras))
     write_text(folder / "poses.csv", poses_text(solution.poses))
     names = ["cameras.csv", "poses.csv"]
-    terrain = solution.terrain
-    if terrain is not None:
+    for number, terrain in enumerate(solution.terrains, start=1):
         place = terrain.west_m, terrain.north_m, terrain.cell_m
         data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.facts))
-        write_atomically(folder / "terrain.tif", lambda stream: stream.write(data))
-        names.append("terrain.tif")
+        names.append("terrain.tif" if number == 1 else f"terrain-{number}.tif")
+        write_atomically(folder / names[-1], partial(_put, data=data))
+    with translated_os_errors(folder):
+        for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
+            old.unlink(missing_ok=True)
     large = {key: solution.facts[key] for key in ("tied", "similar", "groups")}
     facts = {key: value for key, value in solution.facts.items() if key not in large}
     files = {name: file_digest(folder / name) for name in names}
@@ -292,12 +294,19 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     return read_json(path)
 
 
-def _terrain(context: Context) -> Terrain | None:
-    path = context.workspace.orientation / "terrain.tif"
-    if not path.is_file():
-        return None
-    origin_m, _ = _frame(context, read_json(context.workspace.orientation / "orientation.json")["facts"])
-    return Terrain(*read_terrain(path, origin_m))
+def _put(stream: BinaryIO, data: bytes) -> None:
+    stream.write(data)
+
+
+def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...]:
+    """Those on file, the largest flight's first. record: orientation.json."""
+    names = sorted(
+        (name for name in record.get("files", ()) if name.endswith(".tif")), key=lambda name: (len(name), name)
+    )
+    if not names:
+        return ()
+    origin_m, _ = _frame(context, record["facts"])
+    return tuple(Terrain(*read_terrain(context.workspace.orientation / name, origin_m)) for name in names)
 
 
 def _frame(context: Context, facts: Mapping[str, Any]) -> tuple[FloatArray, str]:
