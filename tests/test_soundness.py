@@ -90,6 +90,8 @@ def test_an_image_on_a_single_pair_stays_only_where_its_position_confirms_it() -
         ("ab bc ca cd db", ["abcd"]),  # two triangles with a side in common
         ("ab bc ca cd de ec", ["abc", "cde"]),  # and with a corner only
         ("ab bc ca xy yz zx", ["abc", "xyz"]),
+        ("ab bc ca ad cd be ef", ["abcd"]),  # e and f hang on one edge
+        ("ab bc ca cd db ae ed", ["abcde"]),  # e has two edges, and no triangle
     ],
 )
 def test_triangles_hold_together_by_their_sides(edges: str, expected: list[str]) -> None:

@@ -40,7 +40,7 @@ def sound_part(
     """The most images of a model that explained pairs hold in their places; None of fewer than three.
 
     A pair tells the direction from one image to another and not the distance: places hold in triangles that share
-    sides. Images tied to them otherwise stay where their given positions confirm their places.
+    sides, and by two ties to such. Images tied to them otherwise stay where their given positions confirm their places.
 
     cameras: image_id -> camera, the model's own where it has found it. thresholds_px: by image_id, errors of exact
     matches in stored pixels. given: image_id -> pose whose position was given.
@@ -71,11 +71,24 @@ def _confirmed(model: Model, given: Mapping[str, Pose]) -> set[str]:
 
 
 def rigid_groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
-    """Nodes of the triangles of a graph, together where these share sides one after the other."""
+    """Nodes of the triangles of a graph, together where these share sides one after the other; and further nodes with
+    edges to two of such a group.
+    """
     around: dict[str, set[str]] = {}
     for one, other in edges:
         around.setdefault(one, set()).add(other)
         around.setdefault(other, set()).add(one)
+    return [_grown(group, around) for group in _triangles(edges, around)]
+
+
+def _grown(group: set[str], around: Mapping[str, set[str]]) -> set[str]:
+    grown = set(group)
+    while more := {node for node, others in around.items() if node not in grown and len(others & grown) > 1}:
+        grown |= more
+    return grown
+
+
+def _triangles(edges: Sequence[tuple[str, str]], around: Mapping[str, set[str]]) -> list[set[str]]:
     sides = {frozenset(edge): set(edge) for edge in edges}
     for one, other in edges:
         for third in around[one] & around[other]:
