@@ -263,6 +263,24 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
+class JoinedKeypoints:
+    """Keypoints of one image that several steps of a cascade have found.
+
+    keypoints_px: (K, 2), sizes_px: (K,), responses: (K,) float32 as in Features. kinds: names of the steps; kind_idx:
+    (K,) uint8, the first of them that found each keypoint. numbers: by step, (K_step,) int32 number here of each
+    keypoint of its own features. colours: as in Features.
+    """
+
+    keypoints_px: FloatArray
+    sizes_px: FloatArray
+    responses: FloatArray
+    kinds: tuple[str, ...]
+    kind_idx: NDArray[np.uint8]
+    numbers: Mapping[str, IntArray]
+    colours: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Matches:
     """Correspondences of one pair.
 

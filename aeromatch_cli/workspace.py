@@ -74,6 +74,14 @@ class Workspace:
         """The first pass is a small workspace of its own."""
         return Workspace(self.orientation / "first_pass")
 
+    def step(self, name: str) -> Workspace:
+        """A step of a cascade is a workspace of its own."""
+        return Workspace(self.root / "steps" / name)
+
+    @property
+    def steps(self) -> Path:
+        return self.root / "steps.csv"
+
     @property
     def reports(self) -> Path:
         return self.root / "reports"

@@ -16,6 +16,7 @@ from aeromatch_cli.strategies.matchers import MATCHERS
 from aeromatch_cli.strategies.orienters import ORIENTERS
 from aeromatch_cli.strategies.pairings import PAIRINGS
 from aeromatch_cli.strategies.simulators import SIMULATORS
+from aeromatch_cli.strategies.steps import STEPS
 
 
 def named(value: Any) -> Any:
@@ -141,6 +142,11 @@ class Settings(_Section):
     match: _choice(MATCHERS) = Field(  # type: ignore[valid-type]
         MATCHERS["nearest"](), description="Which features of two images correspond."
     )
+    cascade: Annotated[tuple[_choice(STEPS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+        (),
+        description="Further steps for pairs that the settings above leave with too few matches, cheapest first; the "
+        "matches of all steps of a pair are verified together.",
+    )
     filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
         (FILTERS["poselib"](),),
         min_length=1,  # without a filter no pair is ever verified
@@ -186,13 +192,19 @@ class Settings(_Section):
             )
         return self
 
-    @field_validator("export")
+    @field_validator("export", "cascade")
     @classmethod
     def _one_folder_each(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
-        names = [getattr(exporter, "name", "") for exporter in value]
+        names = [getattr(one, "name", "") for one in value]
         if len(set(names)) < len(names):
-            raise ValueError(f"each exporter at most once, its folder has its name: {', '.join(names)}")
+            raise ValueError(f"each at most once, its folder has its name: {', '.join(names)}")
         return value
+
+    @model_validator(mode="after")
+    def _keypoints_in_cascades(self) -> Settings:
+        if self.cascade and self.match.reads_pixels:
+            raise ValueError(f"a cascade joins keypoints, and match {self.match.name} measures points without any")
+        return self
 
 
 FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
@@ -202,6 +214,7 @@ FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
     "simulate": SIMULATORS,
     "extract": EXTRACTORS,
     "match": MATCHERS,
+    "cascade": STEPS,
     "filter": FILTERS,
     "export": EXPORTERS,
 }

@@ -48,7 +48,7 @@ def _family(key: str, table: Mapping[str, type[Strategy]], value: Any) -> Iterat
     chained = isinstance(value, tuple)
     used = value if chained else (value,)
     yield f"# Names: {', '.join(table)}"
-    yield f"{key}:"
+    yield f"{key}:" if used else f"{key}: []"
     for strategy in used:
         yield from _indented(_strategy_lines(strategy, chained=chained))
     for strategy_class in table.values():

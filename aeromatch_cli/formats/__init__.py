@@ -136,6 +136,16 @@ K keypoints, D descriptors, V views. A keypoint may have several descriptors.
 - `view_enhanced` (V,) bool: whether the view shows the enhanced picture.
 - `colours` (K, 3) uint8: RGB around each keypoint; only with `extract.colours`.
 
+With a `cascade` these are the keypoints of all steps that looked at the image, without descriptors and views:
+`keypoints_px`, `sizes_px`, `responses`; `kinds` (S,) str: names of the steps; `kind_idx` (K,) uint8: the first of them
+that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each keypoint of the step's own file.
+
+### steps.csv, steps/<step>/
+
+Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
+the further ones). Features, matches and verdicts of a step lie in its folder, laid out like this workspace; those of
+the workspace itself join them.
+
 ### matches/<id0>.npz
 
 One row: all P pairs of id0, concatenated. Pair p owns the entries `offsets[p]` to `offsets[p + 1]` of M matches.
@@ -170,7 +180,8 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
-- `facts` of match: `matches`. Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
+- `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs). Of extract with a cascade: `images_by_step`.
+  Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).
 - `facts` of export: exporter -> files and counts.
 

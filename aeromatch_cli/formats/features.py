@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import (
     Features,
     FloatArray,
+    JoinedKeypoints,
 )
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.reading import readable
@@ -44,6 +45,24 @@ def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> No
 def read_features(path: Path) -> Features:
     """All arrays. Raises BrokenFileError when the file is missing or broken."""
     return Features(**load_arrays(path, _FEATURE_ARRAYS, ("colours",)))
+
+
+def write_joined(stream: BinaryIO, joined: JoinedKeypoints, fingerprint: str) -> None:
+    """Of a cascade: keypoints of all its steps; descriptors stay in the steps' own files."""
+    arrays: dict[str, Any] = {name: getattr(joined, name) for name in ("keypoints_px", "sizes_px", "responses")}
+    arrays |= {f"numbers_{name}": numbers for name, numbers in joined.numbers.items()}
+    if joined.colours is not None:
+        arrays["colours"] = joined.colours
+    kinds = np.array(joined.kinds, dtype=np.str_)
+    np.savez(stream, fingerprint=np.array(fingerprint), kinds=kinds, kind_idx=joined.kind_idx, **arrays)
+
+
+def read_joined(path: Path) -> JoinedKeypoints:
+    """Raises BrokenFileError when the file is missing or broken."""
+    kinds = tuple(str(name) for name in load_arrays(path, ("kinds",))["kinds"])
+    numbers = load_arrays(path, [f"numbers_{name}" for name in kinds])
+    arrays: dict[str, Any] = load_arrays(path, ("keypoints_px", "sizes_px", "responses", "kind_idx"), ("colours",))
+    return JoinedKeypoints(kinds=kinds, numbers={name: numbers[f"numbers_{name}"] for name in kinds}, **arrays)
 
 
 def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8] | None]:

@@ -23,6 +23,14 @@ _GUESS = 0.2
 
 
 @dataclass(frozen=True, eq=False)
+class Union:
+    """What the features of every image and the matches of every pair of a cascade must carry: fingerprints, by id."""
+
+    features: Mapping[str, str]
+    matches: Mapping[tuple[str, str], str]
+
+
+@dataclass(frozen=True, eq=False)
 class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
@@ -40,6 +48,10 @@ class Context:
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
+    # The pairs that are worked on, of a step of a cascade; None: all.
+    chosen: frozenset[tuple[str, str]] | None = None
+    # Fingerprints of features and matches that steps of a cascade have made together; None without a cascade.
+    union: Union | None = None
     # Stands before the names of stages in what is shown of progress.
     part: str = ""
     shard: Shard | None = None
@@ -66,10 +78,11 @@ class Context:
         return [image for image in self.block.images if self.owns(image.image_id)]
 
     def rows(self) -> dict[str, list[Pair]]:
-        """Pairs of this shard by image_id0, in order."""
+        """Pairs of this shard and step by image_id0, in order."""
         rows: dict[str, list[Pair]] = {}
         for pair in self.pairs:
-            if self.owns(pair.image_id0):
+            wanted = self.chosen is None or (pair.image_id0, pair.image_id1) in self.chosen
+            if wanted and self.owns(pair.image_id0):
                 rows.setdefault(pair.image_id0, []).append(pair)
         return rows
 

@@ -122,9 +122,11 @@ def _is_done(task: ExtractTask) -> bool:
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:
     """Those of the images whose features on file are the ones that the present settings and inputs give."""
-    found = set()
-    for image_id in set(image_ids):
-        task = task_of(context, image_id)
-        if features_fingerprint(task.path) == task.fingerprint:
-            found.add(image_id)
-    return found
+    return {i for i in set(image_ids) if features_fingerprint(context.workspace.features(i)) == wanted(context, i)}
+
+
+def wanted(context: Context, image_id: str) -> str:
+    """What the features of an image must carry."""
+    if context.union is not None:
+        return context.union.features.get(image_id, "")
+    return task_of(context, image_id).fingerprint

@@ -29,6 +29,10 @@ def _picture_lines(stage: StageReport) -> list[str]:
         words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
     if facts.get(enhance.SKIPPED):
         words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
+    if "settled_by" in facts:
+        whole = max(1, sum(facts["settled_by"].values()))
+        shares = [f"{100 * count / whole:.0f} % by {name}" for name, count in facts["settled_by"].items()]
+        words.append(f"pairs settled: {', '.join(shares)}")
     if "remark" in facts:
         words.append(facts["remark"])
     return [f"          {'; '.join(words)}"] if words else []

@@ -54,6 +54,8 @@ def matcher_of(context: Context, pair: Pair) -> Matcher:
 
 def pair_fingerprint(context: Context, pair: Pair) -> str:
     """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
+    if context.union is not None:
+        return context.union.matches.get((pair.image_id0, pair.image_id1), "")
     matcher = matcher_of(context, pair)
     sides = [
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))

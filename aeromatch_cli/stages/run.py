@@ -13,7 +13,19 @@ from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.executor import Executor, Progress
-from aeromatch_cli.stages import adjust, check, enhance, export, extract, filter, match, pairs, simulate  # noqa: A004
+from aeromatch_cli.stages import (
+    adjust,
+    cascade,
+    check,
+    enhance,
+    export,
+    extract,
+    filter,  # noqa: A004
+    match,
+    pairs,
+    simulate,
+    union,
+)
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
@@ -34,6 +46,8 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 }
 # Stages whose items are independent: these can be cut into shards, the others need everything.
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
+# Of a cascade these work on what its steps have found together.
+_AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
 # What a command rests on: everything before it in this chain.
 _CHAIN = ("orient", "pairs", "extract", "match", "filter", "adjust", "export", "report")
 
@@ -115,13 +129,16 @@ def _attempt(
         return _check(context, reports[0], reports[-1], said)
     if command == "run":
         reports += _run_all(context)
+    elif context.settings.cascade and command in _AFTER_CASCADE:
+        context, made = _cascaded(context) if command == "match" else (_joined(context), [])
+        reports += made
+        if command != "match":
+            reports += _one_stage(command, context)
     elif command == "match":
         features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
     elif command not in ("orient", "pairs"):
-        if command == "export":
-            reports.append(adjust.run(replace(context, overwrite=False)))
-        reports.append(STAGES[command](context))
+        reports += _one_stage(command, context)
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
@@ -130,9 +147,28 @@ def _attempt(
     return _result(command, context, reports, said)
 
 
+def _one_stage(command: str, context: Context) -> list[StageReport]:
+    before = [adjust.run(replace(context, overwrite=False))] if command == "export" else []
+    return [*before, STAGES[command](context)]
+
+
+def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
+    """All steps of a cascade and, unless it is a shard, what they have found together."""
+    steps = cascade.run(context)
+    if context.shard is not None:
+        return context, [report for step in steps for report in step.reports]
+    joined = union.joined_context(context, steps)
+    return joined, union.run(joined, steps)
+
+
+def _joined(context: Context) -> Context:
+    """The context of the stages after a cascade, whose steps are on file."""
+    return union.joined_context(context, cascade.plan(context))
+
+
 def _run_all(context: Context) -> list[StageReport]:
     """extract, match, filter; then export and report."""
-    reports = _to_filter(context)
+    context, reports = _to_filter(context)
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
             report.run(context)
@@ -156,13 +192,16 @@ def _current_page(context: Context) -> StageReport | None:
     return StageReport("report", items=1, skipped=1, facts=read_json(own)["facts"])
 
 
-def _to_filter(context: Context) -> list[StageReport]:
+def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
     """Of a shard, images of other shards come after its own: by then another machine may have done them."""
+    if context.settings.cascade:
+        context, reports = _cascaded(context)
+        return context, reports if context.shard is not None else [*reports, filter.run(context)]
     features = extract.run(context)
     if context.shard is not None:
         others = match.images_of_rows(context) - {image.image_id for image in context.images()}
         features = extract.run(replace(context, overwrite=False), others, features)
-    return [features, match.run(context), filter.run(context)]
+    return context, [features, match.run(context), filter.run(context)]
 
 
 def _result(command: str, context: Context, reports: list[StageReport], said: _Said) -> Result:

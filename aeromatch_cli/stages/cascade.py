@@ -1,0 +1,160 @@
+"""cascade: steps from cheap to expensive, each for the pairs that those before it leave with too few matches.
+
+Every step is a small workspace of its own below WORK/steps, made by the stages extract, match and filter. A pair takes
+a further step where its verified matches are few for its overlap, or leave parts of the overlap empty. Whether it does
+depends on this pair alone, so that shards agree. `union` joins what the steps have found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from aeromatch_cli.config import Settings
+from aeromatch_cli.data import FloatArray, Pair
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.geometry.coverage import covered_share, shared_cells
+from aeromatch_cli.stages import extract, filter, match  # noqa: A004
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
+from aeromatch_cli.strategies.extractors.learned import Learned
+from aeromatch_cli.strategies.extractors.sift import Sift
+from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
+from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
+from aeromatch_cli.strategies.steps import LearnedFeatures, LiftedShadows, Step
+
+# The first step of every cascade.
+FIRST = "first"
+# A pair with fewer verified matches is never settled, however small its overlap.
+_LEAST_MATCHES = 30
+
+Key = tuple[str, str]
+_RECIPES: Mapping[type[Step], Callable[[Step], dict[str, Strategy]]] = {
+    LearnedFeatures: lambda step: {
+        "simulate": NeighbourViews(),
+        "extract": Learned(keypoints=step.keypoints),
+        "match": Bidirectional(ratio=0.9, guided=True),
+    },
+    LiftedShadows: lambda step: {
+        "enhance": ShadowEnhancement(),
+        "simulate": NeighbourViews(),
+        "extract": Sift(keypoints=step.keypoints),
+        "match": LightGlue(guided=True),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a step has found of a pair: verified matches, the share of the image that overlaps, and the share of the
+    overlap's cells that matches lie in. Both shares NaN where poses or ground are unknown."""
+
+    verified: int
+    overlap: float
+    coverage: float
+
+    def falls_short_of(self, step: Step) -> str:
+        """Why the pair takes the step, "" where it need not."""
+        share = self.overlap if np.isfinite(self.overlap) else 1.0
+        least = max(_LEAST_MATCHES, round(step.below_matches * share))
+        if self.verified < least:
+            return f"{self.verified} verified matches of {least} that the overlap promises"
+        if self.coverage < step.below_coverage:
+            return f"verified matches in {100 * self.coverage:.0f} % of the overlap"
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class StepContext:
+    """A step with its context. reasons: why each pair takes it, "" in the first. reports: of extract, match and filter,
+    where this command has run them."""
+
+    name: str
+    context: Context
+    reasons: Mapping[Key, str]
+    reports: tuple[StageReport, ...] = ()
+
+
+def run(context: Context) -> list[StepContext]:
+    """Make what is not up to date of every step of the shard, in order; the steps with their reports."""
+    done = []
+    for step in _steps(context):
+        own = step.context
+        own.workspace.create()
+        # All images in the first step: what failed there is told of those, too, that are in no pair.
+        ids = match.images_of_rows(own) if step.name == FIRST else _images(step)
+        reports = [extract.run(own, ids), match.run(own), filter.run(own)]
+        done.append(replace(step, reports=tuple(reports)))
+    return done
+
+
+def _images(step: StepContext) -> set[str]:
+    return {image_id for key in step.reasons for image_id in key}
+
+
+def plan(context: Context) -> list[StepContext]:
+    """The steps as far as they are on file."""
+    return list(_steps(context))
+
+
+def _steps(context: Context) -> Iterator[StepContext]:
+    """Each step, with the pairs that the results on file of those before it leave to it."""
+    settings = context.settings
+    chosen = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
+    steps = [_step(context, FIRST, settings.model_copy(update={"cascade": ()}), chosen)]
+    yield steps[0]
+    for recipe in settings.cascade:
+        found = evidence_of([step.context for step in steps], steps[-1].reasons)
+        reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
+        left = {key: reason for key, reason in reasons.items() if reason}
+        own = settings.model_copy(update={"cascade": (), **_RECIPES[type(recipe)](recipe)})
+        steps.append(_step(context, recipe.name, own, left))
+        yield steps[-1]
+
+
+def _step(context: Context, name: str, settings: Settings, reasons: Mapping[Key, str]) -> StepContext:
+    own = replace(
+        context,
+        settings=settings,
+        workspace=context.workspace.step(name),
+        chosen=frozenset(reasons),
+        part=f"{name}: ",
+    )
+    return StepContext(name, own, reasons)
+
+
+def evidence_of(steps: Sequence[Context], keys: Collection[Key]) -> dict[Key, Evidence]:
+    """What the steps have found together of those of the pairs that the last one has judged."""
+    places: dict[Key, list[tuple[FloatArray, FloatArray]]] = {}
+    last: set[Key] = set()
+    for context in steps:
+        read = cache(lambda image_id, context=context: read_keypoints(context.workspace.features(image_id))[0])
+        last = set()
+        for pair, entry in filter.verified_pairs(context):
+            key = pair.image_id0, pair.image_id1
+            if key in keys and (context.chosen is None or key in context.chosen):
+                last.add(key)
+                found = entry.matches.indices if entry.verdict.state == "verified" else entry.matches.indices[:0]
+                places.setdefault(key, []).append((read(key[0])[found[:, 0]], read(key[1])[found[:, 1]]))
+    pairs = ((pair.image_id0, pair.image_id1, pair) for pair in steps[0].pairs)
+    return {(id0, id1): _evidence(steps[0], pair, places[id0, id1]) for id0, id1, pair in pairs if (id0, id1) in last}
+
+
+def _evidence(context: Context, pair: Pair, found: Sequence[tuple[FloatArray, FloatArray]]) -> Evidence:
+    """found: verified places of either image, by step."""
+    geometry = context.geometry(pair)
+    points0, points1 = (np.concatenate([one[side] for one in found]) for side in range(2))
+    shared = shared_cells(geometry)
+    if shared is None or shared.share == 0.0:
+        return Evidence(len(points0), float("nan"), float("nan"))
+    if shared.cells0.mean() >= shared.cells1.mean():
+        coverage = covered_share(shared.cells0, geometry.camera0, points0)
+    else:
+        coverage = covered_share(shared.cells1, geometry.camera1, points1)
+    return Evidence(len(points0), shared.share, coverage)

@@ -1,0 +1,302 @@
+"""union: one table of keypoints per image and one row of matches per pair, of all steps of a cascade.
+
+A keypoint of a later step that lies on one of an earlier step is that keypoint, so that tracks run through steps. Of
+matches that lie together in both images one stays: one that its own step has verified before others.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
+from aeromatch_cli.formats.features import features_fingerprint, read_joined, read_keypoints, write_joined
+from aeromatch_cli.formats.rows import (
+    MatchEntry,
+    VerifiedEntry,
+    read_match_row,
+    read_verified_row,
+    row_fingerprints,
+    write_match_row,
+)
+from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.stages import cascade, extract, match
+from aeromatch_cli.stages.cascade import StepContext
+from aeromatch_cli.stages.context import Context, Union
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, run_stage
+from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
+from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically, write_text
+
+VERSION = 1
+# Keypoints of two steps that are nearer than this are one.
+SAME_PX = 0.5
+# Matches that are nearer than this in both images are one.
+_SAME_MATCH_PX = 1.0
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointsTask:
+    """One image. steps: name and features of those that have looked at it, in order."""
+
+    image_id: str
+    steps: tuple[tuple[str, Path], ...]
+    workspace: Workspace
+    fingerprint: str
+
+
+@dataclass(frozen=True, eq=False)
+class RowTask:
+    """All pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, names and workspaces."""
+
+    image_id0: str
+    pairs: Mapping[str, str]
+    steps: Mapping[str, tuple[tuple[str, Workspace], ...]]
+    workspace: Workspace
+
+
+def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
+    """The context of the stages after the cascade."""
+    features: dict[str, str] = {}
+    for image in context.block.images:
+        kinds = [
+            (step.name, extract.task_of(step.context, image.image_id).fingerprint)
+            for step in _of(steps, image.image_id)
+        ]
+        features[image.image_id] = fingerprint(VERSION, kinds)
+    matches = {}
+    for pair in context.pairs:
+        key = pair.image_id0, pair.image_id1
+        found = [(s.name, match.pair_fingerprint(s.context, pair)) for s in steps if key in s.reasons]
+        matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
+    return replace(context, union=Union(features, matches))
+
+
+def _of(steps: Sequence[StepContext], image_id: str) -> list[StepContext]:
+    """Steps that have looked at an image: the first, and those that one of its pairs takes."""
+    return [step for step in steps if step.name == cascade.FIRST or image_id in _images(step)]
+
+
+def _images(step: StepContext) -> frozenset[str]:
+    return _images_of(frozenset(step.reasons))
+
+
+@lru_cache(maxsize=16)
+def _images_of(keys: frozenset[Key]) -> frozenset[str]:
+    return frozenset(image_id for key in keys for image_id in key)
+
+
+def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:
+    """Write features and matches of the context's union, and steps.csv; the reports of extract and match."""
+    assert context.union is not None
+    return [_join_keypoints(context, steps), _join_matches(context, steps)]
+
+
+def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageReport:
+    assert context.union is not None
+    report = StageReport("extract", items=len(context.block.images))
+    _count_seconds(report, steps, ["extract"])
+    report.failures = _failures(steps, "extract")
+    tasks = []
+    usable = [extract.current(step.context, _all_images(context, step)) for step in steps]
+    for image in context.block.images:
+        image_id = image.image_id
+        own = [step for step in _of(steps, image_id) if image_id in usable[steps.index(step)]]
+        wanted = context.union.features[image_id]
+        if own and (context.overwrite or features_fingerprint(context.workspace.features(image_id)) != wanted):
+            paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
+            tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
+    run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
+    report.skipped = report.items - report.done - len(report.failures)
+    report.facts = {"images_by_step": {step.name: len(_all_images(context, step)) for step in steps}}
+    report.fingerprint = fingerprint(sorted(context.union.features.values()))
+    return report.write(context.workspace)
+
+
+def _all_images(context: Context, step: StepContext) -> set[str]:
+    if step.name == cascade.FIRST:
+        return {image.image_id for image in context.block.images}
+    return set(_images(step))
+
+
+def _failures(steps: Sequence[StepContext], stage: str) -> list[tuple[str, str]]:
+    """Of all steps, each item once."""
+    found: dict[str, str] = {}
+    for step in steps:
+        for one, item, reason in gather_failures(step.context.workspace):
+            if one == stage:
+                found.setdefault(item, reason if step.name == cascade.FIRST else f"{step.name}: {reason}")
+    return sorted(found.items())
+
+
+def _count_seconds(report: StageReport, steps: Sequence[StepContext], stages: Collection[str]) -> None:
+    """What the steps' own stages took is part of what the stage takes."""
+    report.started -= sum(one.seconds for step in steps for one in step.reports if one.stage in stages)
+
+
+def join_keypoints(task: KeypointsTask) -> int:
+    """Write features/<id>.npz of one image; how many keypoints it has."""
+    parts = [(name, *read_keypoints(path)) for name, path in task.steps]
+    joined = joined_keypoints([(name, places, sizes) for name, places, sizes, _ in parts])
+    write_atomically(
+        task.workspace.features(task.image_id), lambda stream: write_joined(stream, joined, task.fingerprint)
+    )
+    return len(joined.keypoints_px)
+
+
+def joined_keypoints(parts: Sequence[tuple[str, FloatArray, FloatArray]]) -> JoinedKeypoints:
+    """parts: of each step name, places (K, 2) and sizes (K,)."""
+    from scipy.spatial import cKDTree
+
+    places, sizes = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    kinds: list[IntArray] = []
+    numbers: dict[str, IntArray] = {}
+    for kind, (name, own_places, own_sizes) in enumerate(parts):
+        number = np.full(len(own_places), -1, np.int64)
+        if len(places) and len(own_places):
+            apart, nearest = cKDTree(places).query(own_places, distance_upper_bound=SAME_PX)
+            near = np.flatnonzero(np.isfinite(apart))
+            near = near[one_to_one(near, nearest[near], apart[near])]
+            number[near] = nearest[near]
+        new = np.flatnonzero(number < 0)
+        number[new] = len(places) + np.arange(len(new))
+        places, sizes = np.concatenate([places, own_places[new]]), np.concatenate([sizes, own_sizes[new]])
+        kinds.append(np.full(len(new), kind))
+        numbers[name] = number.astype(np.int32)
+    return JoinedKeypoints(
+        keypoints_px=places.astype(np.float32),
+        sizes_px=sizes.astype(np.float32),
+        responses=np.ones(len(places), np.float32),
+        kinds=tuple(numbers),
+        kind_idx=np.concatenate([np.zeros(0, np.int64), *kinds]).astype(np.uint8),
+        numbers=numbers,
+    )
+
+
+def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport:
+    assert context.union is not None
+    report = StageReport("match")
+    _count_seconds(report, steps, ["match", "filter"])
+    tasks, ready = [], extract.current(context, {image.image_id for image in context.block.images})
+    on_file = [{i: row_fingerprints(s.context.workspace.matches(i)) for i in context.rows()} for s in steps]
+    for image_id0, pairs in context.rows().items():
+        wanted, own = {}, {}
+        for pair in pairs:
+            key = pair.image_id0, pair.image_id1
+            known = [
+                (step.name, step.context.workspace)
+                for step, found in zip(steps, on_file, strict=True)
+                if key in step.reasons and found[image_id0].get(key[1]) == match.pair_fingerprint(step.context, pair)
+            ]
+            if known and set(key) <= ready:
+                wanted[key[1]], own[key[1]] = context.union.matches[key], tuple(known)
+        tasks.append(RowTask(image_id0, wanted, own, context.workspace))
+    tasks = [task for task in tasks if task.pairs]
+    report.items = sum(len(task.pairs) for task in tasks)
+    todo = [
+        task
+        for task in tasks
+        if context.overwrite or row_fingerprints(context.workspace.matches(task.image_id0)) != dict(task.pairs)
+    ]
+    counts = run_stage(context, report, join_row, todo, [task.image_id0 for task in todo])
+    report.done = sum(len(task.pairs) for task in todo)
+    report.skipped = report.items - report.done
+    report.failures += _failures(steps, "match")
+    if counts:  # else those on file still hold
+        report.facts = {"matches": sum(counts), "settled_by": _settled_by(context.pairs, steps)}
+    report.fingerprint = fingerprint(sorted(fp for task in tasks for fp in task.pairs.values()))
+    _write_steps(context, steps)
+    return report.write(context.workspace)
+
+
+def _settled_by(pairs: Sequence[Pair], steps: Sequence[StepContext]) -> dict[str, int]:
+    """How many pairs each step has settled: the last one that they took."""
+    last = Counter(_last(steps, (pair.image_id0, pair.image_id1)) for pair in pairs)
+    return {step.name: last[step.name] for step in steps}
+
+
+def _last(steps: Sequence[StepContext], key: Key) -> str:
+    return [step.name for step in steps if key in step.reasons][-1]
+
+
+def _write_steps(context: Context, steps: Sequence[StepContext]) -> None:
+    """steps.csv: which steps every pair took, and why."""
+    lines: list[tuple[Any, ...]] = []
+    for pair in context.pairs:
+        key = pair.image_id0, pair.image_id1
+        taken = [step for step in steps if key in step.reasons]
+        reasons = "; ".join(f"{step.name}: {step.reasons[key]}" for step in taken if step.reasons[key])
+        lines.append((*key, "+".join(step.name for step in taken), reasons))
+    write_text(context.workspace.steps, csv_text(("image_id0", "image_id1", "steps", "reasons"), lines))
+
+
+def join_row(task: RowTask) -> int:
+    """Write matches/<id0>.npz of one row; how many matches it has."""
+    keypoints0 = _joined(task.workspace.features(task.image_id0))
+    raw = {w: read_match_row(w.matches(task.image_id0)) for w in _workspaces(task)}
+    kept = {w: read_verified_row(w.verified(task.image_id0)) for w in raw}
+    entries = []
+    for image_id1, own in task.pairs.items():
+        keypoints1 = _joined(task.workspace.features(image_id1))
+        parts = [(name, raw[w][image_id1], kept[w].get(image_id1)) for name, w in task.steps[image_id1]]
+        names = "+".join(dict.fromkeys(entry.strategy for _, entry, _ in parts))
+        entries.append(MatchEntry(image_id1, own, names, joined_matches(parts, keypoints0, keypoints1)))
+    write_atomically(task.workspace.matches(task.image_id0), lambda stream: write_match_row(stream, entries))
+    return sum(len(entry.matches.indices) for entry in entries)
+
+
+def _workspaces(task: RowTask) -> set[Workspace]:
+    return {workspace for own in task.steps.values() for _, workspace in own}
+
+
+def joined_matches(
+    parts: Sequence[tuple[str, MatchEntry, VerifiedEntry | None]],
+    keypoints0: JoinedKeypoints,
+    keypoints1: JoinedKeypoints,
+) -> Matches:
+    """Matches of one pair, numbered as in the joined keypoints. parts: step, its matches, what it has verified."""
+    indices, scores, views, costs = [], [], [], []
+    for name, entry, verified in parts:
+        found = entry.matches
+        own = np.column_stack(
+            [side.numbers[name][found.indices[:, k]] for k, side in enumerate((keypoints0, keypoints1))]
+        )
+        held = np.zeros(len(own), dtype=bool)
+        if verified is not None and verified.verdict.state == "verified":
+            held = _rows_in(found.indices, verified.matches.indices)
+        indices.append(own.reshape(-1, 2))
+        scores.append(found.scores)
+        views.append(found.view_pairs)
+        costs.append(1.0 - found.scores + ~held)
+    pairs, cost = np.concatenate(indices), np.concatenate(costs)
+    kept = one_to_one(pairs[:, 0], pairs[:, 1], cost)
+    places = np.concatenate(
+        [keypoints0.keypoints_px[pairs[kept, 0]], keypoints1.keypoints_px[pairs[kept, 1]]], axis=1, dtype=np.float64
+    )
+    kept = kept[distinct(places, cost[kept], _SAME_MATCH_PX)]
+    kept = kept[np.argsort(pairs[kept, 0], kind="stable")]
+    return Matches(pairs[kept].astype(np.int32), np.concatenate(scores)[kept], np.concatenate(views)[kept])
+
+
+def _rows_in(rows: IntArray, wanted: IntArray) -> BoolArray:
+    """Which rows (N, 2) of numbers are among the wanted ones (M, 2)."""
+    width = int(max(rows.max(initial=0), wanted.max(initial=0))) + 1
+    codes, known = (pairs.astype(np.int64) @ [width, 1] for pairs in (rows, wanted))
+    return np.isin(codes, known)
+
+
+def _joined(path: Path) -> JoinedKeypoints:
+    return _cached(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _cached(path: Path, stamp: int) -> JoinedKeypoints:
+    del stamp  # only tells rewritten files apart
+    return read_joined(path)

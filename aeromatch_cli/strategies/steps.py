@@ -1,0 +1,50 @@
+"""Further steps of a cascade: recipes for pairs that the cheaper steps before leave with too few matches.
+
+The first step is what the settings say of enhance, simulate, extract and match. `stages.cascade` follows the recipes;
+the matches of all steps of a pair are verified together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from pydantic import Field
+
+from aeromatch_cli.strategies import Strategy
+
+
+class Step(Strategy):
+    """What all steps have in common: which pairs take them."""
+
+    below_matches: int = Field(
+        600,
+        ge=1,
+        description="The step is taken by pairs with fewer verified matches than this times the share of the image "
+        "that overlaps. Larger: more pairs take it, more time.",
+    )
+    below_coverage: float = Field(
+        0.7,
+        ge=0.0,
+        le=1.0,
+        description="And by pairs whose verified matches lie in less than this share of the cells of the overlap (8 x "
+        "8 in the image). Larger: more pairs take it, more time.",
+    )
+    keypoints: int = Field(
+        4000, ge=1, description="Largest number of descriptors per image of this step. Larger: more time and memory."
+    )
+
+
+class LearnedFeatures(Step):
+    """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search."""
+
+    name: Literal["learned"] = "learned"
+
+
+class LiftedShadows(Step):
+    """SIFT with shadows lifted, views from the neighbours' directions, LightGlue."""
+
+    name: Literal["shadow"] = "shadow"
+
+
+STEPS: Mapping[str, type[Strategy]] = {"learned": LearnedFeatures, "shadow": LiftedShadows}

@@ -1,0 +1,162 @@
+"""Cascades: which pairs go on to a further step, and how the matches of several steps become one result."""
+
+from __future__ import annotations
+
+import csv
+import sqlite3
+
+import numpy as np
+import pytest
+from conftest import IMAGES, Site
+
+from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdict
+from aeromatch_cli.formats.features import read_joined, read_keypoints
+from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
+from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
+from aeromatch_cli.stages.cascade import Evidence
+from aeromatch_cli.stages.union import joined_keypoints, joined_matches
+from aeromatch_cli.strategies.steps import LearnedFeatures
+
+CAMERA = Camera("SIMPLE_PINHOLE", 800, 600, (800.0, 399.5, 299.5))
+DOWN = np.diag([1.0, -1.0, -1.0])
+NOTHING = np.zeros(0)
+
+
+def geometry(east_m: float) -> PairGeometry:
+    """Two pictures of flat ground from 100 m, straight down, 100 m by 75 m each."""
+    poses = [Pose(np.array([x, 0.0, 100.0]), DOWN, 0.1, 0.1) for x in (0.0, east_m)]
+    return PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, *poses, 0.0)
+
+
+@pytest.mark.parametrize(("east_m", "columns"), [(0.0, 8), (50.0, 4), (75.0, 2), (120.0, 0)])
+def test_the_shared_cells_are_those_that_the_other_image_shows(east_m: float, columns: int) -> None:
+    shared = shared_cells(geometry(east_m))
+    assert shared is not None
+    expected = np.zeros((CELLS, CELLS), dtype=bool)
+    expected[:, CELLS - columns :] = columns > 0
+    np.testing.assert_array_equal(shared.cells0, expected)
+    np.testing.assert_array_equal(shared.cells1, expected[:, ::-1])
+    assert shared.share == columns / CELLS
+
+
+def test_coverage_counts_shared_cells_with_a_point() -> None:
+    shared = shared_cells(geometry(50.0))
+    assert shared is not None
+    points = np.array([[450.0, 10.0], [451.0, 11.0], [799.4, 599.4], [10.0, 10.0]])
+    assert covered_share(shared.cells0, CAMERA, points) == 2 / 32
+    assert np.isnan(covered_share(np.zeros((CELLS, CELLS), bool), CAMERA, points))
+
+
+def test_without_attitudes_no_overlap_is_known() -> None:
+    known = geometry(50.0)
+    assert known.pose1 is not None
+    unposed = PairGeometry(known.pair, CAMERA, CAMERA, known.pose0, None, 0.0)
+    assert shared_cells(unposed) is None
+
+
+@pytest.mark.parametrize(
+    ("evidence", "reason"),
+    [
+        (Evidence(300, 0.5, 0.9), ""),
+        (Evidence(299, 0.5, 0.9), "299 verified matches of 300 that the overlap promises"),
+        (Evidence(29, 0.01, 1.0), "29 verified matches of 30 that the overlap promises"),
+        (Evidence(900, 0.5, 0.55), "verified matches in 55 % of the overlap"),
+        (Evidence(600, float("nan"), float("nan")), ""),
+        (Evidence(599, float("nan"), float("nan")), "599 verified matches of 600 that the overlap promises"),
+    ],
+)
+def test_a_pair_goes_on_where_it_falls_short_of_its_overlap(evidence: Evidence, reason: str) -> None:
+    assert evidence.falls_short_of(LearnedFeatures(below_matches=600, below_coverage=0.7)) == reason
+
+
+def test_a_keypoint_of_a_later_step_that_lies_on_an_earlier_one_is_that_one() -> None:
+    first = np.array([[10.0, 10.0], [50.0, 50.0], [90.0, 10.0]], np.float32)
+    later = np.array([[50.3, 50.2], [70.0, 70.0], [10.1, 10.0], [9.8, 10.0]], np.float32)
+    sizes = np.ones(4, np.float32)
+    joined = joined_keypoints([("first", first, sizes[:3]), ("learned", later, sizes)])
+    # Of two that lie on one keypoint the nearer has it.
+    np.testing.assert_array_equal(joined.numbers["learned"], [1, 3, 0, 4])
+    np.testing.assert_array_equal(joined.numbers["first"], [0, 1, 2])
+    np.testing.assert_allclose(joined.keypoints_px, np.concatenate([first, later[[1, 3]]]))
+    np.testing.assert_array_equal(joined.kind_idx, [0, 0, 0, 1, 1])
+    assert joined.kinds == ("first", "learned")
+
+
+def entry(indices: list[tuple[int, int]], scores: list[float]) -> MatchEntry:
+    pairs = np.array(indices, np.int32).reshape(-1, 2)
+    return MatchEntry("b", "", "nearest", Matches(pairs, np.array(scores, np.float32), np.zeros_like(pairs, np.int16)))
+
+
+def verified(made: MatchEntry, keep: list[int]) -> VerifiedEntry:
+    kept = Matches(made.matches.indices[keep], made.matches.scores[keep], made.matches.view_pairs[keep])
+    return VerifiedEntry("b", "", len(made.matches.indices), kept, Verdict(np.ones(len(keep), bool), "verified"))
+
+
+def test_of_matches_that_contradict_or_lie_together_the_verified_one_stays() -> None:
+    places = np.array([[100.0 * n, 0.0] for n in range(4)], np.float32)
+    near = places[[0, 1, 3]] + np.array([[0.8, 0.0]], np.float32)  # keypoints of their own, less than 1 px away
+    sizes = np.ones(4, np.float32)
+    sides = [joined_keypoints([("first", places, sizes), ("learned", near, sizes[:3])]) for _ in range(2)]
+    first = entry([(0, 0), (1, 2), (2, 2)], [0.2, 0.9, 0.3])
+    learned = entry([(0, 0), (1, 1), (2, 2)], [0.6, 0.5, 0.4])
+    found = joined_matches(
+        [("first", first, verified(first, [0, 2])), ("learned", learned, verified(learned, [1, 2]))], *sides
+    )
+    # 0-0 of the first step is verified and that of the second lies on it; 1-2 takes 2 from the verified 2-2.
+    np.testing.assert_array_equal(found.indices, [(0, 0), (2, 2), (5, 5), (6, 6)])
+    np.testing.assert_allclose(found.scores, [0.2, 0.3, 0.5, 0.4])
+
+
+@pytest.mark.slow
+def test_a_cascade_ends_in_one_result(site: Site) -> None:
+    """All pairs take the second step; keypoints and matches of both are one result, made once."""
+    settings = ("--set", "cascade=shadow", "--set", "cascade.shadow.below_matches=100000")
+    settings += ("--set", "cascade.shadow.keypoints=300")
+    outcome = site("run", *settings)
+    assert outcome.code == 0, outcome.stderr
+    assert "pairs settled: 0 % by first, 100 % by shadow" in outcome.stdout
+    with (site.work / "steps.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == IMAGES * (IMAGES - 1) // 2
+    assert {row["steps"] for row in rows} == {"first+shadow"}
+    assert all("that the overlap promises" in row["reasons"] for row in rows)
+    ids = [name.replace(".", "_") for name in site.names()]
+    for image_id in ids:
+        joined = read_joined(site.work / "features" / f"{image_id}.npz")
+        for step, numbers in joined.numbers.items():
+            own = read_keypoints(site.work / "steps" / step / "features" / f"{image_id}.npz")[0]
+            apart_px = np.linalg.norm(joined.keypoints_px[numbers] - own, axis=1)
+            assert apart_px.max() < (1e-6 if step == "first" else 0.51)
+    both = {step: _matches(site, step) for step in ("first", "shadow")}
+    whole = sum(len(e.matches.indices) for e in _rows(site.work / "verified"))
+    assert whole > 1.05 * max(both.values())
+    with sqlite3.connect(site.work / "export" / "colmap" / "database.db") as database:
+        (exported,) = database.execute("SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0").fetchone()
+    assert exported == sum(e.verdict.state == "verified" for e in _rows(site.work / "verified"))
+    before = {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()}
+    assert site("run", *settings).code == 0
+    assert {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()} == before
+
+
+def _matches(site: Site, step: str) -> int:
+    return sum(len(e.matches.indices) for e in _rows(site.work / "steps" / step / "verified"))
+
+
+def _rows(folder) -> list[VerifiedEntry]:
+    return [e for path in sorted(folder.glob("*.npz")) for e in read_verified_row(path).values()]
+
+
+@pytest.mark.slow
+def test_shards_of_a_cascade_agree_with_the_whole(site: Site) -> None:
+    settings = ("--set", "cascade=shadow", "--set", "cascade.shadow.below_matches=400")
+    settings += ("--set", "cascade.shadow.keypoints=200")
+    assert site("run", *settings).code == 0
+    whole = {path.name: path.read_bytes() for path in (site.work / "verified").glob("*.npz")}
+    steps = (site.work / "steps.csv").read_text()
+    other = site.another_workspace("parts")
+    for part in ("1/2", "2/2"):
+        assert site("run", *settings, "--workspace", other, "--shard", part).code == 0
+    assert not (other / "verified").exists()
+    assert site("run", *settings, "--workspace", other).code == 0
+    assert (other / "steps.csv").read_text() == steps
+    assert {path.name: path.read_bytes() for path in (other / "verified").glob("*.npz")} == whole
