@@ -18,14 +18,15 @@ truth and a camera file. Every case is one run of the preset on every k-th image
   shuffled   every line is that of another image
   ground     a ground height that is wrong by the flying height
 
-Attitude error: median and maximum over the oriented images, after one common turn of the whole block. Turn: that one,
-degrees, of results in the world frame; on real blocks it holds the errors of both GPS and the reference. Focal length:
-against the reference camera. Within 3 px: verified matches, by symmetric epipolar distance from the reference poses,
-and as a share of those of the case `reference`. Named: images whose attitude was made wrong and is named so, or all
-where a fault of the whole list is named, and those named without cause. Said: what the summary says of the fault.
-Terrain, of rendered blocks: median distance of the terrain found from the surface that the images show, as a share of
-the flying height. Images: those that the adjusted block holds; lost: those of them that it holds with the reference
-poses only. Seconds: of the whole command, of the stage orient, of the stage match.
+Attitude error: median and maximum over the images that `orient` has oriented, after one common turn of the whole block.
+Adjusted: median after the final adjustment. Turn: the common one, degrees, of results in the world frame; on real
+blocks it holds the errors of both GPS and the reference. Focal length: against the reference camera. Within 3 px:
+verified matches, by symmetric epipolar distance from the reference poses, and as a share of those of the case
+`reference`. Named: images whose attitude was made wrong and is named so, or all where a fault of the whole list is
+named, and those named without cause. Said: what the summary says of the fault. Terrain, of rendered blocks: median
+distance of the terrain found from the surface that the images show, as a share of the flying height. Images: those that
+the adjusted block holds; lost: those of them that it holds with the reference poses only. Seconds: of the whole
+command, of the stage orient, of the stage match.
 """
 
 from __future__ import annotations
@@ -125,6 +126,7 @@ def _seconds(row: Row) -> str:
 COLUMNS: Sequence[Column[Row]] = (
     ("images", _of_images),
     ("attitude, degrees", lambda row: f"{row['attitude_deg']:.3f} ({row['attitude_max_deg']:.2f})"),
+    ("adjusted", lambda row: "" if row.get("adjusted_deg") is None else f"{row['adjusted_deg']:.3f}"),
     ("turn", lambda row: "" if row["turn_deg"] is None else f"{row['turn_deg']:.1f}"),
     ("focal length", lambda row: f"{100 * row['focal_share']:+.1f} %"),
     ("named", _named),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from aeromatch_cli.blocks.ground import DemGround
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
 from aeromatch_cli.formats.terrain import read_terrain
 from aeromatch_cli.geometry.cameras import focal_px
@@ -31,12 +32,8 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     with (reference / "poses.csv").open(encoding="utf-8", newline="") as stream:
         truth = {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
     common = [name for name in names if name in found and name in truth]
-    turns = [found[name].world_rotation.T @ truth[name] for name in common]
-    u, _, vt = np.linalg.svd(sum(turns, np.zeros((3, 3))))
-    turn = u * [1.0, 1.0, np.linalg.det(u @ vt)] @ vt
-    cosines = [(np.trace(one.T @ turn) - 1.0) / 2.0 for one in turns]
-    errors = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    whole_deg = float(np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))))
+    errors, whole_deg = turned_errors({name: found[name].world_rotation for name in common}, truth)
+    adjusted, _ = turned_errors(_adjusted(work), truth)
     lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
     focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
     record = work / "reports" / "orient.json"
@@ -50,6 +47,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "attitude_deg": float(np.median(errors)) if len(errors) else float("nan"),
         "attitude_max_deg": float(errors.max()) if len(errors) else float("nan"),
         "turn_deg": None if own or not common else whole_deg,
+        "adjusted_deg": float(np.median(adjusted)) if len(adjusted) else None,
         "focal_share": focal / float(lens["params"][0]) - 1.0,
         "method": facts.get("method", "none"),
         "named": len(named & wrong),
@@ -58,6 +56,27 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "said": remarks,
         "terrain_share": terrain_error(work, reference) if (reference / "truth.json").is_file() else None,
     }
+
+
+def turned_errors(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArray]) -> tuple[FloatArray, float]:
+    """Errors (N,) in degrees of rotations cam_from_world after the common turn that fits best, and its angle."""
+    turns = [found[name].T @ truth[name] for name in sorted(found.keys() & truth.keys())]
+    if not turns:
+        return np.zeros(0), float("nan")
+    u, _, vt = np.linalg.svd(sum(turns, np.zeros((3, 3))))
+    turn = u * [1.0, 1.0, np.linalg.det(u @ vt)] @ vt
+    cosines = np.array([np.trace(turn), *(np.trace(one.T @ turn) for one in turns)])
+    angles = np.rad2deg(np.arccos(np.clip((cosines - 1.0) / 2.0, -1.0, 1.0)))
+    return angles[1:], float(angles[0])
+
+
+def _adjusted(work: Path) -> dict[str, FloatArray]:
+    """Attitudes of the adjusted block, by image name; none without one."""
+    path = work / "orientation" / "orientation.csv"
+    if not path.is_file():
+        return {}
+    with path.open(encoding="utf-8", newline="") as stream:
+        return {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
 
 
 def terrain_error(work: Path, rendered: Path) -> float:
