@@ -76,7 +76,8 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     row |= {"unregistered": sorted(stages["adjust"]["facts"].get("outside", names))}
     row |= {"registered": (facts.get("mapping") or {}).get("registered")}
     write_json(answer, row)
-    shutil.rmtree(work, ignore_errors=not args.keep)
+    if not args.keep:
+        shutil.rmtree(work)
     return row
 
 
