@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.orient.cases import ANGLES, NOISE_DEG, NOISE_SHARE, worsened
-from benchmarks.orient.figures import turned_errors
+from benchmarks.orient.figures import most_alike, turned_errors
 from scipy.spatial.transform import Rotation
 
 NAMES = [f"i{n:02d}.jpg" for n in range(40)]
@@ -69,3 +69,12 @@ def test_attitudes_are_compared_after_a_common_turn() -> None:
     assert errors.max() == pytest.approx(5.0, abs=0.2)
     assert np.median(errors) < 0.2
     assert len(turned_errors({}, truth)[0]) == 0
+
+
+def test_images_in_the_wrong_place_are_not_right() -> None:
+    truth = {name: Rotation.random(random_state=n).as_matrix() for n, name in enumerate(NAMES)}
+    turn = Rotation.from_euler("y", 40.0, degrees=True).as_matrix()
+    away = Rotation.from_euler("x", 30.0, degrees=True).as_matrix()
+    found = {name: rotation @ (away if n >= 30 else turn) for n, (name, rotation) in enumerate(truth.items())}
+    assert most_alike(found, truth, 3.0) == 30
+    assert most_alike({}, truth, 3.0) == 0

@@ -12,6 +12,7 @@ from test_orientation import CAMERA, flight, limits, matches
 from aeromatch_cli.data import Pose
 from aeromatch_cli.orientation.arrangement import arranged
 from aeromatch_cli.orientation.consistency import consistent_images
+from aeromatch_cli.orientation.judgement import PairPoints
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.soundness import rigid_groups, sound_part
 
@@ -67,7 +68,8 @@ def test_an_image_on_a_single_pair_stays_only_where_its_position_confirms_it() -
     truth = flight()
     pairs, _ = matches(truth)
     ties = [p for p in pairs if "i00" in (p.image_id0, p.image_id1)]
-    single = [p for p in pairs if p not in ties] + ties[:1]
+    alone = replace(ties[0], indices=ties[0].indices + 100_000)  # keypoints that no other pair has
+    single = [*(p for p in pairs if p not in ties), alone]
     base = truth["i00"].center_m - truth[ties[0].image_id1].center_m
     slid = truth | {"i00": replace(truth["i00"], center_m=truth["i00"].center_m + 3.0 * base)}  # along the pair's line
     given = {i: replace(pose, sigma_position_m=5.0) for i, pose in truth.items()}
@@ -82,20 +84,24 @@ def test_an_image_on_a_single_pair_stays_only_where_its_position_confirms_it() -
         assert part.rotations.keys() >= truth.keys() - {"i00"}
 
 
+def tie(ids: str, first: int) -> PairPoints:
+    """Twenty matches of two images, of keypoints with the same numbers in both from `first` on."""
+    indices = np.arange(first, first + 20)
+    return PairPoints(ids[0], ids[1], np.zeros((20, 2)), np.zeros((20, 2)), np.column_stack([indices, indices]))
+
+
 @pytest.mark.parametrize(
-    ("edges", "expected"),
+    ("ties", "expected"),
     [
-        ("ab bc cd da", []),  # a ring without a triangle
-        ("ab bc ca", ["abc"]),
-        ("ab bc ca cd db", ["abcd"]),  # two triangles with a side in common
-        ("ab bc ca cd de ec", ["abc", "cde"]),  # and with a corner only
-        ("ab bc ca xy yz zx", ["abc", "xyz"]),
-        ("ab bc ca ad cd be ef", ["abcd"]),  # e and f hang on one edge
-        ("ab bc ca cd db ae ed", ["abcde"]),  # e has two edges, and no triangle
+        ([("ab", 0), ("bc", 10)], ["abc"]),  # ten keypoints of b in both
+        ([("ab", 0), ("bc", 15)], []),  # five
+        ([("ab", 0), ("bc", 0), ("cd", 100), ("de", 100)], ["abc", "cde"]),  # two groups that share an image only
+        ([("ab", 0), ("bc", 0), ("cd", 10), ("de", 10)], ["abcde"]),
+        ([("ab", 0), ("bc", 100), ("ac", 200)], []),  # a triangle without a point that all three see
     ],
 )
-def test_triangles_hold_together_by_their_sides(edges: str, expected: list[str]) -> None:
-    found = rigid_groups([(edge[0], edge[1]) for edge in edges.split()])
+def test_scales_are_tied_by_keypoints_that_two_pairs_share(ties: list[tuple[str, int]], expected: list[str]) -> None:
+    found = rigid_groups([tie(*one) for one in ties])
     assert sorted("".join(sorted(group)) for group in found) == expected
 
 

@@ -25,8 +25,12 @@ def map_both(database: Path, images_folder: Path | None) -> dict[str, Any]:
     return found if "skipped" in found else found | {"global": map_database(database, images_folder, "global")}
 
 
-def map_database(database: Path, images_folder: Path | None, mapper: Mapper = "incremental") -> dict[str, Any]:
+def map_database(
+    database: Path, images_folder: Path | None, mapper: Mapper = "incremental", *, attitudes: bool = False
+) -> dict[str, Any]:
     """Figures of the largest model: registered, models, points, track_length, reprojection_error_px; and seconds.
+
+    attitudes: also `attitudes`, image name -> rotation (3, 3) cam_from_world of its registered images.
 
     registered: images that see a point. Global mapping places others, too, by a single pair, at any distance.
 
@@ -43,7 +47,8 @@ def map_database(database: Path, images_folder: Path | None, mapper: Mapper = "i
             said = (done.stderr or done.stdout).strip().splitlines()[-1:]
             return {"skipped": f"pycolmap's mapping failed with exit code {done.returncode}: {' '.join(said)}"}
         found: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
-    return found
+    rotations = found.pop("attitudes", {})
+    return found | {"attitudes": rotations} if attitudes else found
 
 
 def _map(database: Path, images_folder: Path, out: Path, mapper: str) -> None:
@@ -66,8 +71,10 @@ def _map(database: Path, images_folder: Path, out: Path, mapper: str) -> None:
     facts: dict[str, Any] = {"registered": 0, "models": len(models), "seconds": seconds}
     if models:
         best = max(models.values(), key=lambda model: model.num_reg_images())
+        seen = [image for image in best.images.values() if image.has_pose and image.num_points3D > 0]
         facts = {
-            "registered": sum(image.has_pose and image.num_points3D > 0 for image in best.images.values()),
+            "registered": len(seen),
+            "attitudes": {image.name: image.cam_from_world().rotation.matrix().tolist() for image in seen},
             "models": len(models),
             "seconds": seconds,
             "points": best.num_points3D(),

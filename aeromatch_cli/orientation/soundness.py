@@ -7,8 +7,9 @@ cameras; of two parts that do not belong together, hardly any across.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from aeromatch_cli.orientation.mapping import Model
 _SLACK = 3.0
 # A position confirms a place up to so many standard deviations.
 _CONFIRMED_SIGMAS = 3.0
+# So many keypoints that two pairs of an image share tie their scales to each other.
+_SHARED_KEYPOINTS = 8
 # Fewer images make no model.
 FEWEST_IMAGES = 3
 
@@ -39,8 +42,9 @@ def sound_part(
 ) -> Model | None:
     """The most images of a model that explained pairs hold in their places; None of fewer than three.
 
-    A pair tells the direction from one image to another and not the distance: places hold in triangles that share
-    sides, and by two ties to such. Images tied to them otherwise stay where their given positions confirm their places.
+    A pair tells the direction from one image to another and not the distance. Points that three images see tell it:
+    keypoints of an image that two of its pairs share. Images tied otherwise stay where their given positions confirm
+    their places.
 
     cameras: image_id -> camera, the model's own where it has found it. thresholds_px: by image_id, errors of exact
     matches in stored pixels. given: image_id -> pose whose position was given.
@@ -50,12 +54,17 @@ def sound_part(
     inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
     good = [p for p in inside if explained_share(p, poses, cameras, limits_px) >= EXPLAINED_SHARE]
     edges = [(p.image_id0, p.image_id1) for p in good]
-    rigid = max(rigid_groups(edges), key=lambda group: (len(group), min(group)), default=set())
+    rigid = max(rigid_groups(good), key=lambda group: (len(group), min(group)), default=set())
     sure = rigid | (_confirmed(model, given) if model.kind == "positions" else set())
     groups = connected_groups([edge for edge in edges if sure.issuperset(edge)])
     if not groups or len(groups[0]) < FEWEST_IMAGES:
         return None
-    left = sorted(groups[0])
+    return only(model, groups[0])
+
+
+def only(model: Model, image_ids: Collection[str]) -> Model:
+    """Some images of a model."""
+    left = sorted(image_ids)
     return replace(
         model,
         rotations={i: model.rotations[i] for i in left},
@@ -70,32 +79,26 @@ def _confirmed(model: Model, given: Mapping[str, Pose]) -> set[str]:
     return {i for i, off in off_m.items() if off <= _CONFIRMED_SIGMAS * given[i].sigma_position_m}
 
 
-def rigid_groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
-    """Nodes of the triangles of a graph, together where these share sides one after the other; and further nodes with
-    edges to two of such a group.
-    """
-    around: dict[str, set[str]] = {}
-    for one, other in edges:
-        around.setdefault(one, set()).add(other)
-        around.setdefault(other, set()).add(one)
-    return [_grown(group, around) for group in _triangles(edges, around)]
+def rigid_groups(pairs: Sequence[PairPoints]) -> list[set[str]]:
+    """Images of pairs whose relative scales are known: two pairs of an image that share keypoints there, and so on."""
+    of_image: dict[str, list[tuple[int, set[int]]]] = {}
+    for number, pair in enumerate(pairs):
+        for side, image_id in enumerate((pair.image_id0, pair.image_id1)):
+            of_image.setdefault(image_id, []).append((number, set(pair.indices[:, side].tolist())))
+    root = list(range(len(pairs)))
 
+    def standing(number: int) -> int:
+        while root[number] != number:
+            root[number] = root[root[number]]
+            number = root[number]
+        return number
 
-def _grown(group: set[str], around: Mapping[str, set[str]]) -> set[str]:
-    grown = set(group)
-    while more := {node for node, others in around.items() if node not in grown and len(others & grown) > 1}:
-        grown |= more
-    return grown
-
-
-def _triangles(edges: Sequence[tuple[str, str]], around: Mapping[str, set[str]]) -> list[set[str]]:
-    sides = {frozenset(edge): set(edge) for edge in edges}
-    for one, other in edges:
-        for third in around[one] & around[other]:
-            three = [frozenset(side) for side in ((one, other), (one, third), (other, third))]
-            joined = sides[three[0]] | sides[three[1]] | sides[three[2]]
-            members = {id(sides[side]) for side in three}
-            if len(members) > 1:
-                sides |= {side: joined for side, group in sides.items() if id(group) in members}
-    found = {id(group): group for group in sides.values() if len(group) > 2}
-    return list(found.values())
+    for seen in of_image.values():
+        for (one, own), (other, others) in combinations(seen, 2):
+            ends = sorted((standing(one), standing(other)))
+            if ends[0] != ends[1] and len(own & others) >= _SHARED_KEYPOINTS:
+                root[ends[1]] = ends[0]
+    groups: dict[int, set[str]] = {}
+    for number, pair in enumerate(pairs):
+        groups.setdefault(standing(number), set()).update((pair.image_id0, pair.image_id1))
+    return [group for group in groups.values() if len(group) >= FEWEST_IMAGES]

@@ -30,7 +30,7 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
-from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, sound_part
+from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -192,15 +192,27 @@ def _one_round(
     best: list[Model] = []
     for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
         mapped = _mapped_images(context, first, mapper, image_ids)
-        found = [part for model in mapped if (part := _sound(context, evidence, model)) is not None]
+        found = _sound_parts(context, evidence, mapped)
         whole = _images(found) == _images(mapped)
         if not whole:  # what was cut off has bent the rest
-            again = [_mapped_images(context, first, mapper, set(part.rotations)) for part in found]
-            found = [part for one in again for m in one[:1] if (part := _sound(context, evidence, m)) is not None]
+            again = [_mapped_images(context, first, mapper, set(part.rotations))[:1] for part in found]
+            found = _sound_parts(context, evidence, [model for models in again for model in models])
         best = found if _images(found) > _images(best) else best
         if found and whole:
             break
     return best
+
+
+def _sound_parts(context: Context, evidence: Evidence, models: Sequence[Model]) -> list[Model]:
+    """The models as far as they explain their matches, each image in the largest that has it."""
+    found: list[Model] = []
+    taken: set[str] = set()
+    for model in sorted(models, key=lambda model: -len(model.rotations)):
+        part = _sound(context, evidence, only(model, model.rotations.keys() - taken))
+        if part is not None:
+            found.append(part)
+            taken |= part.rotations.keys()
+    return found
 
 
 def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:

@@ -78,8 +78,8 @@ def write_table(page: Path, name: str, text: str, stamp: Stamp) -> None:
     if not any(match[1] == name for match in _TABLE.finditer(old)):
         start, end = f"<!-- table {name}: start -->", f"<!-- table {name}: end -->"
         raise SystemExit(f"{page} lacks the lines {start} and {end}: add them where the table belongs")
-    body = f"{head(stamp)}\n{text.strip()}\n"
-    new = _TABLE.sub(lambda match: match[0].replace(match[2], body) if match[1] == name else match[0], old)
+    body = f"<!-- table {name}: start -->\n{head(stamp)}\n{text.strip()}\n<!-- table {name}: end -->"
+    new = _TABLE.sub(lambda match: body if match[1] == name else match[0], old)
     write_text(page, refreshed(new))
 
 

@@ -8,9 +8,10 @@ from EXIF in all chains:
   incremental     pycolmap: its SIFT, exhaustive matching, incremental mapping
   global          the same matches, global mapping
 
-Registered: images of the largest model. Points, track length, reprojection error: of that model. Seconds: wall clock,
-of pycolmap extraction, matching and mapping; of aeromatch the whole command, report included. Both mappers' images from
-aeromatch's own database stand behind.
+Registered: images of the largest model. Right: those of them whose attitudes agree with the reference within 3 degrees
+after one common turn: a mapper may register images in wrong places. Points, track length, reprojection error: of that
+model. Seconds: wall clock, of pycolmap extraction, matching and mapping; of aeromatch the whole command, report
+included. Both mappers' images from aeromatch's own database stand behind.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.workspace import read_json, write_json
 from benchmarks import options, stamps
@@ -29,9 +32,11 @@ from benchmarks.blocks import steps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.blocks.steps import run_step
 from benchmarks.orient.cases import worsened
+from benchmarks.orient.figures import attitudes_of, most_alike
 from benchmarks.tables import Row, markdown
 from benchmarks.whole import whole_run
 
+RIGHT_DEG = 3.0
 OURS = {"aeromatch": "noise", "aeromatch-none": "nothing"}
 
 
@@ -48,6 +53,8 @@ def our_chain(args: Any, images: Path, reference: Path, folder: Path, case: str)
     best = max(facts["groups"], key=lambda group: group["images"], default={"images": 0})
     row: Row = {"registered": best["images"], "models": len(facts["groups"]), "seconds": run.seconds}
     row |= {key: best.get(key) for key in ("points", "track_length", "reprojection_error_px")}
+    adjusted = attitudes_of(work / "orientation" / "orientation.csv")
+    row["right"] = most_alike(adjusted, attitudes_of(reference / "poses.csv"), RIGHT_DEG)
     database = work / "export" / "colmap" / "database.db"
     for mapper in ("incremental", "global"):
         row[f"by_{mapper}"] = map_database(database, images, mapper).get("registered")
@@ -63,7 +70,9 @@ def pycolmap_chains(args: Any, images: Path, reference: Path, folder: Path) -> d
     seconds += run_step(steps.colmap_match, database, args.jobs, False, None)["seconds"]
     rows = {}
     for mapper in ("incremental", "global"):
-        found = map_database(database, images, mapper)
+        found = map_database(database, images, mapper, attitudes=True)
+        own = {name: np.array(rotation) for name, rotation in found.pop("attitudes", {}).items()}
+        found["right"] = most_alike(own, attitudes_of(reference / "poses.csv"), RIGHT_DEG)
         rows[mapper] = found | {"seconds": seconds + found.get("seconds", 0.0)}
     database.unlink()
     return rows
@@ -93,7 +102,17 @@ def rows_of(args: Any) -> Iterator[Row]:
 
 def table_of(rows: Sequence[Row]) -> str:
     """One line per chain."""
-    header = ("block", "chain", "registered", "points", "track length", "error px", "s", "incremental / global")
+    header = (
+        "block",
+        "chain",
+        "registered",
+        "right",
+        "points",
+        "track length",
+        "error px",
+        "s",
+        "incremental / global",
+    )
     lines = []
     for row in rows:
         both = f"{row['by_incremental']} / {row['by_global']}" if "by_global" in row else ""
@@ -101,7 +120,7 @@ def table_of(rows: Sequence[Row]) -> str:
         block = row["block"] if row["every"] == 1 else f"{row['block']} / {row['every']}"
         registered = f"{row.get('registered', 0)} of {row['images']}"
         points = str(row.get("points", "-"))
-        lines.append((block, row["chain"], registered, points, *figures, f"{row['seconds']:.0f}", both))
+        lines.append((block, row["chain"], registered, row["right"], points, *figures, f"{row['seconds']:.0f}", both))
     return markdown(header, lines)
 
 

@@ -29,11 +29,10 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     """Attitudes, focal length and named images of a finished workspace against the reference."""
     name_of = {image.image_id: image.name for image in read_images(work / "images.csv")}
     found = {name_of[i]: pose for i, pose in read_poses(work / "poses.csv").items() if pose.world_rotation is not None}
-    with (reference / "poses.csv").open(encoding="utf-8", newline="") as stream:
-        truth = {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
+    truth = attitudes_of(reference / "poses.csv")
     common = [name for name in names if name in found and name in truth]
     errors, whole_deg = turned_errors({name: found[name].world_rotation for name in common}, truth)
-    adjusted, _ = turned_errors(_adjusted(work), truth)
+    adjusted, _ = turned_errors(attitudes_of(work / "orientation" / "orientation.csv"), truth)
     lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
     focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
     record = work / "reports" / "orient.json"
@@ -70,13 +69,21 @@ def turned_errors(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArra
     return angles[1:], float(angles[0])
 
 
-def _adjusted(work: Path) -> dict[str, FloatArray]:
-    """Attitudes of the adjusted block, by image name; none without one."""
-    path = work / "orientation" / "orientation.csv"
+def attitudes_of(path: Path) -> dict[str, FloatArray]:
+    """Rotations cam_from_world of a table with omega, phi, kappa, by image name; none where there is no such file."""
     if not path.is_file():
         return {}
     with path.open(encoding="utf-8", newline="") as stream:
         return {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
+
+
+def most_alike(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArray], limit_deg: float) -> int:
+    """How many rotations agree with the truth after one common turn: that with which most do."""
+    common = sorted(found.keys() & truth.keys())
+    turns = np.array([found[name].T @ truth[name] for name in common]).reshape(-1, 3, 3)
+    traces = np.einsum("mij,nij->mn", turns, turns)
+    angles = np.rad2deg(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0)))
+    return int((angles <= limit_deg).sum(axis=1).max(initial=0))
 
 
 def terrain_error(work: Path, rendered: Path) -> float:
