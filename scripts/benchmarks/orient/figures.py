@@ -19,7 +19,7 @@ from aeromatch_cli.orientation.placing import similarity
 from aeromatch_cli.synthetic import load_truth
 from aeromatch_cli.workspace import read_json
 from benchmarks.orient.cases import ANGLES
-from benchmarks.tables import Row
+from benchmarks.tables import Row, plain
 
 # Places in every image where the terrain is asked.
 _SAMPLES = 60
@@ -53,7 +53,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "wrong": len(wrong),
         "named_without_cause": len(named - wrong),
         "said": remarks,
-        "terrain_share": terrain_error(work, reference) if (reference / "truth.json").is_file() else None,
+        "terrain_share": plain(terrain_error(work, reference)) if (reference / "truth.json").is_file() else None,
     }
 
 
