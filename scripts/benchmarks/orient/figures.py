@@ -33,8 +33,11 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     common = [name for name in names if name in found and name in truth]
     errors, whole_deg = turned_errors({name: found[name].world_rotation for name in common}, truth)
     adjusted, _ = turned_errors(attitudes_of(work / "orientation" / "orientation.csv"), truth)
-    lens = next(iter(json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"].values()))
-    focal = max(focal_px(camera) for camera in read_cameras(work / "cameras.csv").values())
+    lenses = json.loads((reference / "block.json").read_text(encoding="utf-8"))["cameras"]
+    focal = {k: focal_px(camera) for k, camera in read_cameras(work / "cameras.csv").items()}
+    # Cameras from EXIF have names of their own, and real blocks have one.
+    true = {k: lenses[k if k in lenses else next(iter(lenses))]["params"][0] for k in focal}
+    shares = [focal[k] / float(true[k]) - 1.0 for k in focal]
     record = work / "reports" / "orient.json"
     facts = read_json(record)["facts"] if record.is_file() else {}
     remarks = facts.get("remarks", [])
@@ -47,7 +50,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "attitude_max_deg": float(errors.max()) if len(errors) else float("nan"),
         "turn_deg": None if own or not common else whole_deg,
         "adjusted_deg": float(np.median(adjusted)) if len(adjusted) else None,
-        "focal_share": focal / float(lens["params"][0]) - 1.0,
+        "focal_share": max(shares, key=abs),
         "method": facts.get("method", "none"),
         "named": len(named & wrong),
         "wrong": len(wrong),
