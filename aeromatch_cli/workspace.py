@@ -189,7 +189,11 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Atomic, UTF-8; a file that already holds the text is left untouched."""
-    data = text.encode("utf-8")
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Atomic; a file that already holds the bytes is left untouched."""
     with translated_os_errors(path):
         if path.is_file() and path.read_bytes() == data:
             return

@@ -15,10 +15,7 @@ CELLS = 8
 
 @dataclass(frozen=True, eq=False)
 class SharedCells:
-    """Cells of either image whose middle lies, on the ground, in the other: (CELLS, CELLS) bool, rows downwards.
-
-    None where poses or ground are unknown.
-    """
+    """Cells of either image whose middle lies, on the ground, in the other: (CELLS, CELLS) bool, rows downwards."""
 
     cells0: BoolArray
     cells1: BoolArray

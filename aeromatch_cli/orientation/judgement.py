@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
 
+# An image, or a pair of them.
+N = TypeVar("N", str, tuple[str, str])
 # Two poses explain the matches of a pair when this share of them lies near its epipolar line and in front of both.
 EXPLAINED_SHARE = 0.75
 # A pair of fewer matches says nothing of two poses.
@@ -83,13 +86,13 @@ def grouped_images(good: Mapping[tuple[str, str], bool]) -> set[str]:
     return taken
 
 
-def connected_groups(edges: Sequence[tuple[str, str]]) -> list[set[str]]:
-    """Connected groups of images, the largest first; among equal ones the first by name."""
-    group: dict[str, set[str]] = {}
-    for id0, id1 in edges:
-        both = group.get(id0, {id0}) | group.get(id1, {id1})
-        for image_id in both:
-            group[image_id] = both
+def connected_groups(edges: Sequence[tuple[N, N]]) -> list[set[N]]:
+    """Connected groups of nodes, the largest first; among equal ones the first in order."""
+    group: dict[N, set[N]] = {}
+    for one, other in edges:
+        both = group.get(one, {one}) | group.get(other, {other})
+        for node in both:
+            group[node] = both
     unique = {id(members): members for members in group.values()}
     return sorted(unique.values(), key=lambda members: (-len(members), min(members)))
 

@@ -25,6 +25,7 @@ from aeromatch_cli.orientation.judgement import (
 )
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.resection import resected
+from aeromatch_cli.orientation.soundness import FEWEST_IMAGES
 from aeromatch_cli.orientation.strips import predicted
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
@@ -34,8 +35,6 @@ _SIGMA_ANGLE_DEG = 0.2
 _SIGMA_POSITION_SHARE = 0.005
 # Beyond so many standard deviations, and so many degrees, a given position or attitude is wrong and not just inexact.
 _WRONG_SIGMAS, _WRONG_DEG = 5.0, 15.0
-# Fewer images make no model.
-_FEWEST_IMAGES = 3
 # A focal length that differs by more than this share is said.
 _FOCAL_SHARE = 0.02
 # Pictures of one place differ by less, in pixels of the stored images.
@@ -124,8 +123,8 @@ def unoriented_remark(evidence: Evidence) -> str:
     said = "no image could be oriented from the pictures"
     if not evidence.pairs:
         return f"{said}: no two of them have enough matches"
-    if len(evidence.matched) < _FEWEST_IMAGES:
-        return f"{said}: at least {_FEWEST_IMAGES} images must show the same ground, {len(evidence.matched)} do"
+    if len(evidence.matched) < FEWEST_IMAGES:
+        return f"{said}: at least {FEWEST_IMAGES} images must show the same ground, {len(evidence.matched)} do"
     moved_px = [np.median(np.linalg.norm(p.points0_px - p.points1_px, axis=1)) for p in evidence.pairs]
     if float(np.median(moved_px)) < _STANDING_PX:
         return f"{said}: they show the same from the same place"

@@ -81,24 +81,15 @@ def _confirmed(model: Model, given: Mapping[str, Pose]) -> set[str]:
 
 def rigid_groups(pairs: Sequence[PairPoints]) -> list[set[str]]:
     """Images of pairs whose relative scales are known: two pairs of an image that share keypoints there, and so on."""
-    of_image: dict[str, list[tuple[int, set[int]]]] = {}
-    for number, pair in enumerate(pairs):
-        for side, image_id in enumerate((pair.image_id0, pair.image_id1)):
-            of_image.setdefault(image_id, []).append((number, set(pair.indices[:, side].tolist())))
-    root = list(range(len(pairs)))
-
-    def standing(number: int) -> int:
-        while root[number] != number:
-            root[number] = root[root[number]]
-            number = root[number]
-        return number
-
-    for seen in of_image.values():
-        for (one, own), (other, others) in combinations(seen, 2):
-            ends = sorted((standing(one), standing(other)))
-            if ends[0] != ends[1] and len(own & others) >= _SHARED_KEYPOINTS:
-                root[ends[1]] = ends[0]
-    groups: dict[int, set[str]] = {}
-    for number, pair in enumerate(pairs):
-        groups.setdefault(standing(number), set()).update((pair.image_id0, pair.image_id1))
-    return [group for group in groups.values() if len(group) >= FEWEST_IMAGES]
+    of_image: dict[str, list[tuple[tuple[str, str], set[int]]]] = {}
+    for pair in pairs:
+        ids = pair.image_id0, pair.image_id1
+        for side, image_id in enumerate(ids):
+            of_image.setdefault(image_id, []).append((ids, set(pair.indices[:, side].tolist())))
+    tied = [
+        (one, other)
+        for seen in of_image.values()
+        for (one, own), (other, others) in combinations(seen, 2)
+        if len(own & others) >= _SHARED_KEYPOINTS
+    ]
+    return [{image_id for ids in group for image_id in ids} for group in connected_groups(tied)]

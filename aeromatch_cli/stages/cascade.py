@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -80,6 +80,13 @@ class StepContext:
     reasons: Mapping[Key, str]
     reports: tuple[StageReport, ...] = ()
 
+    @cached_property
+    def images(self) -> frozenset[str]:
+        """Those that the step looks at: all in the first, else those of its pairs."""
+        if self.name == FIRST:
+            return frozenset(image.image_id for image in self.context.block.images)
+        return frozenset(image_id for key in self.reasons for image_id in key)
+
 
 def run(context: Context) -> list[StepContext]:
     """Make what is not up to date of every step of the shard, in order; the steps with their reports."""
@@ -88,14 +95,10 @@ def run(context: Context) -> list[StepContext]:
         own = step.context
         own.workspace.create()
         # All images in the first step: what failed there is told of those, too, that are in no pair.
-        ids = match.images_of_rows(own) if step.name == FIRST else _images(step)
+        ids = match.images_of_rows(own) if step.name == FIRST else step.images
         reports = [extract.run(own, ids), match.run(own), filter.run(own)]
         done.append(replace(step, reports=tuple(reports)))
     return done
-
-
-def _images(step: StepContext) -> set[str]:
-    return {image_id for key in step.reasons for image_id in key}
 
 
 def plan(context: Context) -> list[StepContext]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +45,7 @@ from aeromatch_cli.workspace import (
     read_json,
     translated_os_errors,
     whole_record,
-    write_atomically,
+    write_bytes,
     write_json,
     write_text,
 )
@@ -84,7 +83,7 @@ def run(
     if record is None:
         same = before.get("settings") == settings
         kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
-        solution = _solution(context, recipe, kept)
+        solution = _solution(context, recipe, kept, before)
         head = {"fingerprint": report.fingerprint, "settings": settings, "images": images}
         record = _write(context, solution, head)
         report.done = report.items
@@ -123,9 +122,9 @@ def groups(context: Context) -> list[Group]:
     return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 
 
-def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
+def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mapping[str, Any]) -> Solution:
     """What the first pass says. kept: images that have not changed since an earlier run, whose poses and terrain stay
-    as they were where the new ones agree with them."""
+    as they were where the new ones agree with them. before: the record of that run."""
     block = context.block
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
@@ -150,7 +149,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str]) -> Solution:
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
     terrains = solution.terrains
-    old = _terrains(context, _on_file(context)) if kept else ()
+    old = _terrains(context, before) if kept else ()
     if len(old) == len(terrains):
         centers_m = np.array([pose.center_m for pose in solution.poses.values()])
         terrains = tuple(continued(one, new, centers_m) for one, new in zip(old, terrains, strict=True))
@@ -295,7 +294,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
         place = terrain.west_m, terrain.north_m, terrain.cell_m
         data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.facts))
         names.append("terrain.tif" if number == 1 else f"terrain-{number}.tif")
-        write_atomically(folder / names[-1], partial(_put, data=data))
+        write_bytes(folder / names[-1], data)
     with translated_os_errors(folder):
         for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
             old.unlink(missing_ok=True)
@@ -304,10 +303,6 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     files = {name: file_digest(folder / name) for name in names}
     write_json(path, {**head, "facts": facts, **large, "files": files})
     return read_json(path)
-
-
-def _put(stream: BinaryIO, data: bytes) -> None:
-    stream.write(data)
 
 
 def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...]:

@@ -66,31 +66,16 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
     """The context of the stages after the cascade."""
     features: dict[str, str] = {}
     for image in context.block.images:
-        kinds = [
-            (step.name, extract.task_of(step.context, image.image_id).fingerprint)
-            for step in _of(steps, image.image_id)
-        ]
-        features[image.image_id] = fingerprint(VERSION, kinds)
+        image_id = image.image_id
+        looking = [step for step in steps if image_id in step.images]
+        kinds = [(step.name, extract.task_of(step.context, image_id).fingerprint) for step in looking]
+        features[image_id] = fingerprint(VERSION, kinds)
     matches = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         found = [(s.name, match.pair_fingerprint(s.context, pair)) for s in steps if key in s.reasons]
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
     return replace(context, union=Union(features, matches))
-
-
-def _of(steps: Sequence[StepContext], image_id: str) -> list[StepContext]:
-    """Steps that have looked at an image: the first, and those that one of its pairs takes."""
-    return [step for step in steps if step.name == cascade.FIRST or image_id in _images(step)]
-
-
-def _images(step: StepContext) -> frozenset[str]:
-    return _images_of(frozenset(step.reasons))
-
-
-@lru_cache(maxsize=16)
-def _images_of(keys: frozenset[Key]) -> frozenset[str]:
-    return frozenset(image_id for key in keys for image_id in key)
 
 
 def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:
@@ -105,25 +90,19 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
     tasks = []
-    usable = [extract.current(step.context, _all_images(context, step)) for step in steps]
+    usable = [extract.current(step.context, step.images) for step in steps]
     for image in context.block.images:
         image_id = image.image_id
-        own = [step for step in _of(steps, image_id) if image_id in usable[steps.index(step)]]
+        own = [step for step, ready in zip(steps, usable, strict=True) if image_id in ready]
         wanted = context.union.features[image_id]
         if own and (context.overwrite or features_fingerprint(context.workspace.features(image_id)) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
     report.skipped = report.items - report.done - len(report.failures)
-    report.facts = {"images_by_step": {step.name: len(_all_images(context, step)) for step in steps}}
+    report.facts = {"images_by_step": {step.name: len(step.images) for step in steps}}
     report.fingerprint = fingerprint(sorted(context.union.features.values()))
     return report.write(context.workspace)
-
-
-def _all_images(context: Context, step: StepContext) -> set[str]:
-    if step.name == cascade.FIRST:
-        return {image.image_id for image in context.block.images}
-    return set(_images(step))
 
 
 def _failures(steps: Sequence[StepContext], stage: str) -> list[tuple[str, str]]:
