@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -49,6 +50,14 @@ def test_every_form_of_position_and_attitude(tmp_path: Path) -> None:
     assert (row.attitude, row.attitude_kind) == (None, "none")
 
 
+def test_heights_may_be_missing(tmp_path: Path) -> None:
+    for text in ("image,x,y\n1.jpg,1,2\n", "image,x,y,z\n1.jpg,1,2,\n"):
+        found = read_poses(write(tmp_path, text)).rows[0].position
+        assert found is not None
+        assert found[:2] == (1.0, 2.0)
+        assert math.isnan(found[2])
+
+
 def test_rows_without_coordinates_are_unposed_and_the_rest_is_kept(tmp_path: Path) -> None:
     lines = ["a,NaN,1,2,0,0,0", "b,,,,,,", "c,0,0,5,0,0,0", "d,1,2,3,,,", "e,1,2,3,4,nan,6", "f,1,2,3,4,5,6"]
     poses = read_poses(write(tmp_path, "\n".join(["image,lat,lon,alt,yaw,pitch,roll", *lines])))
@@ -79,7 +88,7 @@ def test_a_fault_of_every_line_is_one_warning(tmp_path: Path) -> None:
         ("# only a remark\n", "no header"),
         ("image,x,y,z\n", "no line follows"),
         ("image,omega_deg,phi_deg,kappa_deg\na,1,2,3\n", "no position"),
-        ("image,x,y\na,1,2\n", "'z' is missing"),
+        ("image,x\na,1\n", "'y' is missing"),
         ("image,lat,lon,height\na,1,2,3\n", "'alt' is missing.*'height' is not a height above ground"),
         ("image,lat,lon,z\na,1,2,3\n", "name it 'alt'"),
         ("image,x,y,z,omega_deg,phi_deg\na,1,2,3,4,5\n", "'kappa_deg' is missing"),

@@ -181,7 +181,9 @@ def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
     assert {image.image_id for image in inputs.images} == {
         *("good_jpg", "noposition_jpg", "noangles_jpg", "zero_jpg", "noaltitude_jpg")
     }
-    assert set(inputs.poses) == {"good_jpg", "noangles_jpg"}
+    assert set(inputs.poses) == {"good_jpg", "noangles_jpg", "noaltitude_jpg"}
+    heights_m = {image_id: pose.center_m[2] for image_id, pose in inputs.poses.items()}
+    assert heights_m["noaltitude_jpg"] == np.median([heights_m["good_jpg"], heights_m["noangles_jpg"]])
     assert inputs.poses["noangles_jpg"].world_rotation is None
     assert [failure.name for failure in inputs.failures] == ["corrupt.jpg", "empty.jpg"]
     text = "\n".join(inputs.warnings)
@@ -189,7 +191,7 @@ def test_one_bad_image_never_stops_the_rest(tmp_path: Path) -> None:
         "._good.jpg",
         "2 of 5 images (noposition.jpg, zero.jpg) have no GPS",
         "no angles",
-        "without altitude",
+        "1 of 5 images (noaltitude.jpg) have a position without height: a level flight at ",
     ):
         assert words in text
     assert "(0, 0): no fix" in text
@@ -208,6 +210,22 @@ def test_without_poses_every_image_is_unposed(tmp_path: Path) -> None:
     for poses in (None, ""):
         inputs = read_inputs(tmp_path, poses)
         assert (len(inputs.images), dict(inputs.poses), inputs.crs) == (1, {}, "local")
+
+
+def test_a_list_without_heights(tmp_path: Path) -> None:
+    """Heights of EXIF where it has some, else a level flight; the accuracy of a position says so."""
+    write_dji(tmp_path / "a.jpg", 46.84, -91.99, 200.0)
+    write_dji(tmp_path / "b.jpg", 46.841, -91.99, 210.0)
+    table = write_poses(tmp_path, "image,x,y,sigma_position_m\na.jpg,1,2,0.5\nb.jpg,3,4,0.5\n")
+    inputs = read_inputs(tmp_path, table)
+    assert [pose.center_m.tolist() for pose in inputs.poses.values()] == [[1.0, 2.0, 200.0], [3.0, 4.0, 210.0]]
+    assert "2 of 2 images (a.jpg, b.jpg) have no height in the list: that of EXIF is used" in inputs.warnings
+    for name in ("a.jpg", "b.jpg"):
+        write_image(tmp_path / name)
+    inputs = read_inputs(tmp_path, table)
+    assert [pose.center_m.tolist() for pose in inputs.poses.values()] == [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]
+    assert [pose.sigma_position_m for pose in inputs.poses.values()] == [10.0, 10.0]
+    assert any("a level flight at 0 m, so that heights count from the flight, is assumed" in w for w in inputs.warnings)
 
 
 def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:

@@ -25,11 +25,13 @@ from aeromatch_cli.geometry.angles import Angles
 AngleConvention = Literal["auto", "gimbal", "nadir"]
 
 _FAR_M = 1_000_000.0  # no block reaches from its frame's zero this far
+# Standard deviation of a flight's height above or below its level, in metres, where heights are not given.
+_LEVEL_SIGMA_M = 10.0
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Where and how one image was taken, as stated. Units and kinds as in `poses.PoseRow`.
+    """Where and how one image was taken, as stated. Units and kinds as in `poses.PoseRow`; a height may be NaN.
 
     forward: for yaw, pitch, roll: True where the optical axis is body x (gimbal), False where it is down (nadir).
     """
@@ -59,10 +61,11 @@ def observation_of_row(row: PoseRow, angles: AngleConvention) -> Observation | N
 
 
 def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observation | None:
-    """What an image's header states; None without position and altitude. "auto" goes by the tags' origin."""
-    if facts.latitude_deg is None or facts.longitude_deg is None or facts.altitude_m is None:
+    """What an image's header states; None without position. "auto" goes by the tags' origin."""
+    if facts.latitude_deg is None or facts.longitude_deg is None:
         return None
-    position = (facts.latitude_deg, facts.longitude_deg, facts.altitude_m)
+    altitude_m = np.nan if facts.altitude_m is None else facts.altitude_m
+    position = (facts.latitude_deg, facts.longitude_deg, altitude_m)
     found = facts.angles
     if found is None:
         return Observation(position, "geographic", None, "none", forward=True, sigma_position_m=facts.sigma_position_m)
@@ -76,13 +79,15 @@ class Located(NamedTuple):
     """Observations in the world frame.
 
     poses, angles: by image name; angles are the attitudes as they were given. unusable: what is wrong with other
-    positions, in words -> names.
+    positions, in words -> names. level: images without a height. level_m: the height that they were given, in the CRS.
     """
 
     frame: WorldFrame
     poses: dict[str, Pose]
     angles: dict[str, Angles]
     unusable: Mapping[str, Sequence[str]]
+    level: Sequence[str]
+    level_m: float
 
 
 def angles_of_exif(facts: ExifFacts, angles: AngleConvention) -> Angles | None:
@@ -102,7 +107,7 @@ def oriented(
     sigma_position_m: float,
     sigma_angle_deg: float,
 ) -> Located:
-    """Everything in one world frame.
+    """Everything in one world frame. Images without heights get the median of the others', or 0 where none has one.
 
     crs: what the user gave ("auto", "local" or a code); stated_crs: what an input file states, or None. known_frame:
     the frame of an earlier run on a block that has grown since; used again where its CRS is the same, so that old
@@ -133,6 +138,7 @@ def oriented(
             raise ConfigError(f"no position lies in the area of {code}: check --crs, and latitude against longitude")
     zeros = _grid_zeros(code, grid)
     grid = {name: center_m for name, center_m in grid.items() if name not in zeros}
+    grid, level_m, level = _with_heights(grid)
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
     stated = {name: _angles(observations[name], turns[name]) for name in grid}
     angles = {name: one for name, one in stated.items() if one is not None}
@@ -140,13 +146,25 @@ def oriented(
         name: Pose(
             center_m=center_m - np.array(frame.origin_m),
             world_rotation=angles[name].rotation if name in angles else None,
-            sigma_position_m=observations[name].sigma_position_m or sigma_position_m,
+            sigma_position_m=max(
+                observations[name].sigma_position_m or sigma_position_m, _LEVEL_SIGMA_M if name in level else 0.0
+            ),
             sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
         )
         for name, center_m in grid.items()
     }
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
-    return Located(frame, poses, angles, {words: names for words, names in unusable.items() if names})
+    faults = {words: names for words, names in unusable.items() if names}
+    return Located(frame, poses, angles, faults, level, level_m)
+
+
+def _with_heights(grid: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], float, list[str]]:
+    """Centres that all have a height, the one that was put in, and for which images: flights are about level."""
+    level = [name for name, center_m in grid.items() if np.isnan(center_m[2])]
+    heights_m = [float(center_m[2]) for name, center_m in grid.items() if name not in set(level)]
+    level_m = float(np.median(heights_m)) if heights_m else 0.0
+    filled: dict[str, FloatArray] = {name: np.array([*grid[name][:2], level_m]) for name in level}
+    return {**grid, **filled}, level_m, level
 
 
 def _grid_zeros(crs: str, grid: Mapping[str, FloatArray]) -> list[str]:

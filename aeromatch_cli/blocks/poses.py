@@ -13,8 +13,9 @@ Columns, in any order and case (aliases in brackets):
   sigma_x_m sigma_y_m sigma_z_m [sde sdn sdu, std_e std_n std_u]     as PPK results have them; the largest counts
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
-header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose coordinates are
-empty or NaN leaves its image without pose and is reported; every other defect is a ConfigError.
+header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose horizontal
+coordinates are empty or NaN leaves its image without pose and is reported; heights may be empty or missing, see
+`observations.oriented`; every other defect is a ConfigError.
 """
 
 from __future__ import annotations
@@ -67,8 +68,9 @@ class PoseRow:
     """One line of a pose list.
 
     image: as written, with forward slashes. line: 1-based, for messages. position: x, y, z in metres or lat, lon in
-    degrees and alt in metres, as `position_kind` says; None where the line gives none. attitude: three angles in
-    degrees or a quaternion (w, x, y, z), as `attitude_kind` says; None with "none". camera: "" where not given.
+    degrees and alt in metres, as `position_kind` says, with a height of NaN where the line gives none; None where it
+    gives no horizontal position. attitude: three angles in degrees or a quaternion (w, x, y, z), as `attitude_kind`
+    says; None with "none". camera: "" where not given.
     """
 
     image: str
@@ -218,8 +220,8 @@ def _form(
     if not present:
         return None
     missing = [name for name in forms[present[0]] if name not in columns]
-    if missing:
-        heights = [name for name in columns if name in _UNCLEAR_HEIGHTS and missing[0] in ("z", "alt")]
+    heights = [name for name in columns if name in _UNCLEAR_HEIGHTS and missing[:1] in (["z"], ["alt"])]
+    if missing and (heights or missing not in (["z"], ["alt"])):
         hint = f" (if {heights[0]!r} is not a height above ground, name it {missing[0]!r})" if heights else ""
         raise ConfigError(
             f"{where}: column {missing[0]!r} is missing: {what} needs {','.join(forms[present[0]])}{hint}"
@@ -258,10 +260,12 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     axes = [numbers((name,))[0] for name in _AXIS_SIGMAS if name in record]
     if sigmas[0] is None and axes and None not in axes:
         sigmas[0] = max(axis for axis in axes if axis is not None)
-    position = numbers(_POSITIONS[layout.position_kind])
+    across = _POSITIONS[layout.position_kind][:2]
+    x, y = numbers(across)
+    height = _POSITIONS[layout.position_kind][2]
+    z = numbers((height,))[0] if height in record else None
     attitude = numbers(_ATTITUDES[layout.attitude_kind]) if layout.attitude_kind != "none" else ()
-    x, y, z = position
-    lacking = next((n for n, v in zip(_POSITIONS[layout.position_kind], position, strict=True) if v is None), None)
+    lacking = next((name for name, value in zip(across, (x, y), strict=True) if value is None), None)
     if lacking:
         faults.setdefault(f"no number in column {lacking}, treated as unposed", {})[number] = image
     elif layout.position_kind == "geographic" and x == 0.0 and y == 0.0:
@@ -278,7 +282,7 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     return PoseRow(
         image=image,
         line=number,
-        position=(x, y, z) if x is not None and y is not None and z is not None else None,
+        position=(x, y, math.nan if z is None else z) if x is not None and y is not None else None,
         position_kind=layout.position_kind,
         attitude=whole or None,
         attitude_kind=layout.attitude_kind if whole else "none",

@@ -5,9 +5,10 @@ One bad image never stops the rest: it is left out and recorded. A bad list or s
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, get_args
 
@@ -20,6 +21,7 @@ from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
+    Located,
     Observation,
     angles_of_exif,
     observation_of_exif,
@@ -139,10 +141,12 @@ def block_inputs(
         stated_crs = crs if crs != AUTO or camera_file is None else camera_file.crs or crs
         observations, remarks = agreed(observations, facts, stated_crs, f"pose list {lists.poses}")
         warnings += remarks
-    frame, named_poses, angles, unusable = oriented(
+    located = oriented(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
-    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in unusable.items()]
+    frame, named_poses, angles = located.frame, located.poses, located.angles
+    warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
+    warnings += _level_flight(located, facts)
     stated = _stated_ground(camera_file, frame, Path(lists.cameras).name)
     hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
     if lists.poses == EXIF:  # tilts of images without a position
@@ -269,7 +273,7 @@ def _observations(
             stated = observation_of_row(rows[name], lists.angles) if name in rows else None
             if stated is not None:
                 observations[name] = stated
-        return observations, []
+        return _with_exif_heights(observations, facts)
     without: dict[str, list[str]] = defaultdict(list)
     for name, fact in facts.items():
         observation = observation_of_exif(fact, lists.angles)
@@ -277,8 +281,6 @@ def _observations(
             observations[name] = observation
             if observation.attitude is None:
                 without["no angles in XMP: position only"].append(name)
-        elif fact.latitude_deg is not None:
-            without["a GPS position without altitude: treated as unposed"].append(name)
         else:
             without["no GPS position: treated as unposed"].append(name)
     remarks = [f"{_count(items, facts)} have {what}" for what, items in without.items()]
@@ -286,6 +288,28 @@ def _observations(
     for note, count in notes.items():
         remarks.append(f"{count} of {len(facts)} images: {note}")
     return observations, remarks
+
+
+def _with_exif_heights(
+    observations: dict[str, Observation], facts: Mapping[str, ExifFacts]
+) -> tuple[dict[str, Observation], list[str]]:
+    """A list without any height takes those of the headers: one that has some may count from another zero."""
+    if not observations or any(math.isfinite(one.position[2]) for one in observations.values()):
+        return observations, []
+    heights_m = {name: height_m for name in observations if (height_m := facts[name].altitude_m) is not None}
+    for name, height_m in heights_m.items():
+        observations[name] = replace(observations[name], position=(*observations[name].position[:2], height_m))
+    remark = f"{_count(list(heights_m), observations)} have no height in the list: that of EXIF is used"
+    return observations, [remark] if heights_m else []
+
+
+def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]:
+    """What is said of images without a height."""
+    if not located.level:
+        return []
+    all_level = len(located.level) == len(located.poses)
+    zero = "0 m, so that heights count from the flight" if all_level else f"{located.level_m:.1f} m, that of the others"
+    return [f"{_count(located.level, facts)} have a position without height: a level flight at {zero}, is assumed"]
 
 
 def _count(names: Sequence[str], total: Mapping[str, object]) -> str:

@@ -141,13 +141,13 @@ def load_reference(folder: Path, images_folder: Path | None = None) -> Reference
     if cameras.ground_z_m is None:
         raise InputError(f"{folder / 'block.json'} states no ground height: add ground_z (metres), overlaps rest on it")
     observations = {row.image: observation_of_row(row, "auto") for row in pose_list.rows}
-    known = {name: found for name, found in observations.items() if found is not None}
-    frame, poses, _, _ = oriented(known, "auto", cameras.crs, None, 0.0, 0.0)
-    poses = {name: pose for name, pose in poses.items() if pose.world_rotation is not None}
+    known = {name: found for name, found in observations.items() if found and np.isfinite(found.position).all()}
+    located = oriented(known, "auto", cameras.crs, None, 0.0, 0.0)
+    poses = {name: pose for name, pose in located.poses.items() if pose.world_rotation is not None}
     if len(poses) < 2:
         raise InputError(f"{folder / 'poses.csv'} gives {len(poses)} images position and attitude: two are needed")
     by_name = {row.image: _camera_of(row, cameras, folder) for row in pose_list.rows if row.image in poses}
-    return ReferenceTruth(by_name, poses, cameras.ground_z_m - frame.origin_m[2], images_folder)
+    return ReferenceTruth(by_name, poses, cameras.ground_z_m - located.frame.origin_m[2], images_folder)
 
 
 def _camera_of(row: PoseRow, file: CameraFile, folder: Path) -> Camera:

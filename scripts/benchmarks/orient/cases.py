@@ -15,9 +15,9 @@ from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_
 
 CASES = (
     "reference", "noisy", "unoriented", "noise", "nothing", "third", "yaw", "longer", "shorter", "outliers", "columns",
-    "mirrored", "shuffled", "ground",
+    "mirrored", "shuffled", "ground", "level",
 )  # fmt: skip
-POSITIONS_ONLY = ("noise", "outliers", "mirrored")
+POSITIONS_ONLY = ("noise", "outliers", "mirrored", "level")
 NOISE_M, OUTLIER_M = 5.0, 100.0
 # Of noisy poses: positions, as a share of each image's own flying height, and angles.
 NOISE_SHARE, NOISE_DEG = 0.05, 3.0
@@ -40,7 +40,8 @@ def worsened(case: str, reference: Path, names: Sequence[str], folder: Path) -> 
         lens["params"][:count] = [value * factor for value in lens["params"][:count]]
     (folder / "block.json").write_text(json.dumps(camera), encoding="utf-8")
     poses = folder / "poses.csv"
-    keep = [key for key in rows[0] if case not in POSITIONS_ONLY or key not in ANGLES]
+    unknown = {*(ANGLES if case in POSITIONS_ONLY else ()), *("z" if case == "level" else ())}
+    keep = [key for key in rows[0] if key not in unknown]
     with poses.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, keep, extrasaction="ignore")
         writer.writeheader()
@@ -77,8 +78,8 @@ def _worsen(case: str, rows: list[dict[str, Any]], rng: np.random.Generator, bel
             off_m = NOISE_SHARE * (float(row["z"]) - below_m) * rng.normal(size=3)
             for key, off_deg in zip(ANGLES, rng.normal(0.0, NOISE_DEG, 3), strict=True):
                 row[key] = repr(float(row[key]) + float(off_deg))
-        if case in ("noise", "outliers"):
-            off_m = NOISE_M * rng.normal(size=3) if case == "noise" else off_m
+        if case in ("noise", "level"):
+            off_m = NOISE_M * rng.normal(size=3)
         if case == "outliers" and number % 10 == 0:
             turn = rng.uniform(0.0, 2.0 * np.pi)
             off_m = OUTLIER_M * np.array([np.cos(turn), np.sin(turn), 0.0])
