@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from zlib import crc32
+
+import numpy as np
 
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.scan import identifier
@@ -29,6 +32,9 @@ FOCAL_SIGMAS: Mapping[str, float] = {
 }
 # Two statements of the focal length that differ by more than this factor cannot both be meant.
 _CONTRADICTION = 1.25
+# Cameras are calibrated with pictures of another size: where EXIF confirms one of these factors to this share, it is
+# that.
+_OTHER_SIZES, _SIZE_SHARE = (0.25, 0.5, 2.0, 4.0), 0.1
 
 # Shorter focal lengths, as a share of the longer side, are those of fisheye lenses (16 mm on 35-mm film).
 _FISHEYE_FOCAL = 0.45
@@ -177,6 +183,33 @@ def cameras_from_file(
         camera_ids[name] = identifier(chosen.camera) + size
         cameras[camera_ids[name]] = camera
     return CameraAssignment(cameras, camera_ids, reasons, (), dict.fromkeys(cameras, FOCAL_SIGMAS["camera file"]))
+
+
+def contradicting_exif(
+    assignment: CameraAssignment, facts: Mapping[str, ExifFacts]
+) -> tuple[dict[str, float], list[str]]:
+    """camera id -> likely focal length in px, of cameras of a file that cannot be the one EXIF tells of; and remarks.
+
+    The likely one is that of EXIF, or that of the file for pictures of half or double the size. facts: by image name.
+    """
+    stated: dict[str, list[float]] = defaultdict(list)
+    for name, camera_id in assignment.camera_ids.items():
+        px, source = focal_from_exif_px(facts[name])
+        if source != "guess":
+            stated[camera_id].append(px)
+    found = {camera_id: float(np.median(values)) for camera_id, values in sorted(stated.items())}
+    odd = {k: px for k, px in found.items() if _contradicts(focal_px(assignment.cameras[k]), px)}
+    remarks = [
+        f"camera {camera_id}: focal length {focal_px(assignment.cameras[camera_id]):.0f} px in the camera file, "
+        f"{px:.0f} px by EXIF of its images: the pictures are asked which is right"
+        for camera_id, px in odd.items()
+    ]
+    return {k: _of_other_size(focal_px(assignment.cameras[k]), px) for k, px in odd.items()}, remarks
+
+
+def _of_other_size(calibrated_px: float, exif_px: float) -> float:
+    factor = min(_OTHER_SIZES, key=lambda one: abs(one * calibrated_px - exif_px))
+    return factor * calibrated_px if abs(factor * calibrated_px / exif_px - 1.0) < _SIZE_SHARE else exif_px
 
 
 def fitted(camera: Camera, width_px: int, height_px: int) -> Camera | None:

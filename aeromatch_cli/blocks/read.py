@@ -16,7 +16,13 @@ import numpy as np
 
 from aeromatch_cli.blocks.agreement import agreed
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
-from aeromatch_cli.blocks.cameras import CameraAssignment, cameras_from_exif, cameras_from_file, listed
+from aeromatch_cli.blocks.cameras import (
+    CameraAssignment,
+    cameras_from_exif,
+    cameras_from_file,
+    contradicting_exif,
+    listed,
+)
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.observations import (
@@ -66,6 +72,7 @@ class BlockInputs:
     ground_hint_source: str
     ground_is_stated: bool
     focal_sigmas: Mapping[str, float]
+    likely_focals: Mapping[str, float]
     warnings: tuple[str, ...]
     failures: tuple[ReadFailure, ...]
 
@@ -137,6 +144,8 @@ def block_inputs(
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
+    likely_focals, remarks = contradicting_exif(assignment, facts) if camera_file is not None else ({}, [])
+    warnings += remarks
     if lists.pose_list is not None:
         stated_crs = crs if crs != AUTO or camera_file is None else camera_file.crs or crs
         observations, remarks = agreed(observations, facts, stated_crs, f"pose list {lists.poses}")
@@ -164,6 +173,7 @@ def block_inputs(
         ground_hint_source=hint_source,
         ground_is_stated=stated is not None,
         focal_sigmas=assignment.focal_sigmas,
+        likely_focals=likely_focals,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
     )

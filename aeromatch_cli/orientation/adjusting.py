@@ -20,8 +20,10 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.placing import Placement, place
 from aeromatch_cli.orientation.precision import Observations, pose_sigmas
 
-# A prior focal length is taken where the cost with it is larger by no more than this share.
-_SAME_COST = 0.05
+# A prior focal length is taken where the cost with it is larger by no more than this share, or by so
+# many times the mean of a residual: chance lowers it by one for every unknown. The share holds for twice the prior's
+# standard deviation, and grows with the distance: what a lens model lacks also lowers the cost.
+_SAME_COST, _CHANCE = 0.05, 6.0
 # No coordinate of a keypoint is measured more exactly, in pixels.
 _LEAST_ERROR_PX = 0.03
 # Fewer images do not determine a camera's focal length, or its distortion: it stays as it was given.
@@ -34,6 +36,8 @@ _SHARED_POINTS = 8
 _FAR = 20.0
 # Images with fewer points than this in their model are taken out of it.
 MIN_OBSERVATIONS = 12
+# Headings are wrong beyond this, degrees.
+_WRONG_HEADING_DEG = 20.0
 # So many positions hold a model in the world frame.
 _HOLDING = 3
 # A position that is so many standard deviations away is not that of the image.
@@ -63,6 +67,32 @@ def adjusted(
     used = [] if placement.kind == "level" else [i for i, agrees in zip(ids, placement.agreeing, strict=True) if agrees]
     _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
     return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
+
+
+def believed_tilts(
+    pycolmap: ModuleType,
+    model: Any,
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    ups: FloatArray,
+    rotations: FloatArray,
+) -> FloatArray:
+    """The measured tilts, or NaN for all where the headings that were given with them are wrong.
+
+    A list whose headings contradict the positions has a fault that may be in its tilts as well. rotations: (N, 3, 3)
+    cam_from_world as given, NaN where there is none. The model is placed by its positions and the terrain.
+    """
+    ids = image_numbers(model)
+    rows = np.array(ids) - 1
+    placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], np.full((len(ids), 3), np.nan))
+    known = np.isfinite(rotations[rows]).all(axis=(1, 2))
+    if placement.kind == "level" or not known.any():
+        return ups
+    found = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])[known]
+    turns = found.transpose(0, 2, 1) @ rotations[rows][known]
+    headings = np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])
+    wrong = float(np.median(np.abs(np.rad2deg(headings)))) > _WRONG_HEADING_DEG
+    return np.full_like(ups, np.nan) if wrong else ups
 
 
 def adjust_in_place(
@@ -142,36 +172,37 @@ def _adjust(
 
     if distorted and few > unknown:  # their focal lengths first, without anybody's distortion
         _adjuster(pycolmap, model, used, positions_m, sigmas_m, unknown, False, tolerance).solve()
-    if not _with_prior_focal_lengths(pycolmap, model, cameras, adjuster):
-        adjuster(model, False).solve()
+    cost = adjuster(model, False).solve().ceres_summary.final_cost
+    _prefer_prior_focal_lengths(model, cameras, cost, adjuster)
 
 
-def _with_prior_focal_lengths(
-    pycolmap: ModuleType, model: Any, priors: dict[str, Any], adjuster: Callable[[Any, bool], Any]
-) -> bool:
-    """Whether focal lengths far from their priors are given up, since the pictures say nothing against the priors.
+def _prefer_prior_focal_lengths(
+    model: Any, priors: dict[str, Any], cost: float, adjuster: Callable[[Any, bool], Any]
+) -> None:
+    """Give up focal lengths far from their priors, where the pictures say nothing against the priors.
 
     Where all images look straight down on flat ground, any focal length goes with some flying height, and what an
-    adjustment finds is chance. A prior is taken where the cost of an adjustment with it is nearly the same.
+    adjustment finds is chance. A prior is taken where the cost of an adjustment with it is nearly the same. cost: of
+    the model as it is.
     """
-    far = {
-        number: prior
-        for number, prior in priors.items()
-        if int(number) in model.cameras
-        and abs(model.cameras[int(number)].mean_focal_length() / prior["focal_px"] - 1.0) > 2.0 * prior["sigma"]
+    lenses = {number: model.cameras[int(number)] for number in priors if int(number) in model.cameras}
+    away = {
+        number: abs(camera.mean_focal_length() / priors[number]["focal_px"] - 1.0) / (2.0 * priors[number]["sigma"])
+        for number, camera in lenses.items()
     }
+    far = {number: priors[number] for number, sigmas in away.items() if sigmas > 1.0}
     if not far:
-        return False
-    cost = adjuster(model, False).solve().ceres_summary.final_cost
+        return
     trial = copy.deepcopy(model)
     for number, prior in far.items():
         trial.cameras[int(number)].params = prior["params"]
-    if adjuster(trial, True).solve().ceres_summary.final_cost > (1.0 + _SAME_COST) * cost:
-        return False
+    spare = 2 * model.compute_num_observations() - 3 * model.num_points3D() - 6 * model.num_reg_images()
+    same = max(_SAME_COST * max(away.values()), _CHANCE / max(spare, 1))
+    if adjuster(trial, True).solve().ceres_summary.final_cost > (1.0 + same) * cost:
+        return
     for number, prior in far.items():
         model.cameras[int(number)].params = prior["params"]
     adjuster(model, True).solve()
-    return True
 
 
 def _placed(

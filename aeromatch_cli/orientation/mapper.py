@@ -20,6 +20,7 @@ from aeromatch_cli.orientation.adjusting import (
     DISTORTION_IMAGES,
     adjusted,
     arrays,
+    believed_tilts,
     drop_far_images,
     drop_weak_images,
     figures,
@@ -52,8 +53,13 @@ def solve(folder: Path) -> None:
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
-        observed = priors["positions_m"], priors["sigmas_m"], priors["ups"]
-        placement = adjusted(pycolmap, model, task["cameras"], *observed, _COST_TOLERANCE)
+        observed = priors["positions_m"], priors["sigmas_m"]
+        ups = believed_tilts(pycolmap, model, *observed, priors["ups"], priors["rotations"])
+        placement = adjusted(pycolmap, model, task["cameras"], *observed, ups, _COST_TOLERANCE)
+        reset_lenses(model, task["cameras"])  # few points determine no lens
+        drop_weak_images(model)
+        if model.num_reg_images() < _MIN_IMAGES:
+            continue
         name = f"model{number}.npz"
         np.savez(folder / name, **arrays(model))
         facts.append({"file": name, "kind": placement.kind, "contradiction": placement.contradiction, **figures(model)})

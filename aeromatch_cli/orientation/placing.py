@@ -33,6 +33,9 @@ _LEVEL_SIGMA_DEG = 3.0
 # degrees with each other, and with the terrain to so many.
 _TILT_SIGMA_DEG = 1.0
 _TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG = 10.0, 30.0
+# Tilts that contradict positions and terrain together by so many standard deviations have a fault in common: an angle
+# of another convention, a camera mounted askew. There the terrain counts less: it may be a slope.
+_TILTS_WRONG_SIGMAS, _SLOPE_SIGMA_DEG = 4.0, 6.0
 # Weights fall beyond this distance from the mean.
 _TILTS_NEAR_DEG = 3.0
 _LEAST_TILTS = 3
@@ -79,7 +82,8 @@ def place(
     the world, NaN where there is none; sigmas_m: (N,) their standard deviations. ups: (N, 3) unit vectors upwards in
     the model by the tilt that each camera has measured, NaN where it has none.
     """
-    vertical = _vertical(centers, points, ups)
+    by_terrain = _Vertical(_up(centers, points), _LEVEL_SIGMA_DEG)
+    vertical = _vertical(by_terrain, ups)
     known: BoolArray = np.asarray(np.isfinite(positions_m).all(axis=1))
     found = _by_positions(centers[known], positions_m[known], sigmas_m[known]) if known.sum() >= 2 else None
     if found is None:
@@ -92,7 +96,11 @@ def place(
     agreeing = np.zeros(len(centers), dtype=bool)
     agreeing[np.flatnonzero(known)[found.agreeing]] = True
     found = replace(found, agreeing=agreeing)
-    return _levelled(found, centers, positions_m[agreeing], float(np.median(sigmas_m[agreeing])), vertical)
+    used_m = positions_m[agreeing]
+    information = _information(found, centers, used_m, float(np.median(sigmas_m[agreeing])))
+    if _off_level(found, information, used_m, by_terrain, vertical):
+        vertical = by_terrain
+    return _levelled(found, information, used_m, vertical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +111,8 @@ class _Vertical:
     sigma_deg: float
 
 
-def _vertical(centers: FloatArray, points: FloatArray, ups: FloatArray | None) -> _Vertical:
+def _vertical(by_terrain: _Vertical, ups: FloatArray | None) -> _Vertical:
     """Up by the measured tilts, where these agree, else by the terrain."""
-    by_terrain = _Vertical(_up(centers, points), _LEVEL_SIGMA_DEG)
     measured = np.zeros((0, 3)) if ups is None else ups[np.isfinite(ups).all(axis=1)]
     if len(measured) < _LEAST_TILTS:
         return by_terrain
@@ -206,25 +213,43 @@ def _level(centers: FloatArray, points: FloatArray, known: BoolArray, vertical: 
     return Placement(scale, rotation, -scale * middle, "level", np.zeros_like(known), trusted=False)
 
 
-def _levelled(
-    found: Placement, centers: FloatArray, used_m: FloatArray, sigma_m: float, vertical: _Vertical
-) -> Placement:
-    """Turned about the middle of the positions used (N, 3) to the most probable attitude of the block.
+def _information(found: Placement, centers: FloatArray, used_m: FloatArray, sigma_m: float) -> FloatArray:
+    """What the positions used (N, 3) say of a small turn of the block: (3, 3), per square radian.
 
     Positions with standard deviation s that lie at r_i from their middle determine a small turn w with the information
-    sum [r_i]x^T [r_i]x / s^2, along a line none about it. Tilts or terrain say where up is, with their own standard
-    deviation. Both are weighed against each other.
+    sum [r_i]x^T [r_i]x / s^2, along a line none about it.
     """
-    from scipy.spatial.transform import Rotation
-
-    middle_m = used_m.mean(axis=0)
     errors_m = found.points(centers[found.agreeing]) - used_m
     sigma_m = max(sigma_m, float(np.sqrt((errors_m**2).mean())))
     if not found.trusted:
         sigma_m *= _DOUBTFUL
-    arms = used_m - middle_m
+    arms = used_m - used_m.mean(axis=0)
     spread = np.eye(3) * (arms**2).sum() - arms.T @ arms
-    information = spread / max(sigma_m, 1e-9) ** 2
+    return np.asarray(spread / max(sigma_m, 1e-9) ** 2)
+
+
+def _off_level(
+    found: Placement, information: FloatArray, used_m: FloatArray, by_terrain: _Vertical, by_tilts: _Vertical
+) -> bool:
+    """Whether the tilts contradict what positions and terrain say together of where up is."""
+    slope = replace(by_terrain, sigma_deg=_SLOPE_SIGMA_DEG)
+    without = _levelled(found, information, used_m, slope)
+    off_deg = np.rad2deg(np.arccos(np.clip((without.rotation @ by_tilts.up)[2], -1.0, 1.0)))
+    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(_SLOPE_SIGMA_DEG) ** 2
+    covariance = np.linalg.inv(information + level + 1e-9 * np.eye(3))
+    sigma_deg = float(np.hypot(np.rad2deg(np.sqrt(np.diag(covariance)[:2].mean())), by_tilts.sigma_deg))
+    return bool(off_deg > _TILTS_WRONG_SIGMAS * sigma_deg)
+
+
+def _levelled(found: Placement, information: FloatArray, used_m: FloatArray, vertical: _Vertical) -> Placement:
+    """Turned about the middle of the positions used (N, 3) to the most probable attitude of the block.
+
+    Positions, by their information (3, 3), and tilts or terrain, which say where up is with their own standard
+    deviation, are weighed against each other.
+    """
+    from scipy.spatial.transform import Rotation
+
+    middle_m = used_m.mean(axis=0)
     level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(vertical.sigma_deg) ** 2
     total = np.eye(3)
     for _ in range(20):

@@ -53,7 +53,7 @@ _FIRST_ERROR_PX = 12.0
 
 
 def refine(folder: Path) -> None:
-    """Triangulate and adjust every group of posed images, and tie further images to the largest.
+    """Triangulate and adjust every group of posed images, and tie further images to it, to the largest group first.
 
     A group whose parts share no points becomes several, each placed by itself.
     """
@@ -76,8 +76,9 @@ def refine(folder: Path) -> None:
         attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
         registered: list[int] = []
         if free:
-            if not facts and task["more"]:
+            if task["more"]:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
+                grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
             model, observed = _refined(pycolmap, model, folder, group["kind"], task["cameras"], observed, attitudes)
         model.update_point_3d_errors()

@@ -54,11 +54,15 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The first pass of a block. pairs: its verified matches. thresholds_px: by image_id, errors of exact matches."""
+    """The first pass of a block. pairs: its verified matches. thresholds_px: by image_id, errors of exact matches.
+
+    stated_cameras: camera_id -> Camera as it was given, where the block has another by now.
+    """
 
     block: Block
     pairs: Sequence[PairPoints]
     thresholds_px: Mapping[str, float]
+    stated_cameras: Mapping[str, Camera]
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -109,7 +113,7 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
         "corrected": sorted(found) if correct else [],
         "stays": not correct,
         "remarks": [],
-        "focal_lengths": {},
+        "focal_lengths": _focal_lengths(evidence.stated_cameras, block.cameras),
         "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
         "points": points,
         **_judged(block.poses, found),
@@ -190,7 +194,7 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": points,
         **wrong,
-        "focal_lengths": _focal_lengths(block.cameras, cameras),
+        "focal_lengths": _focal_lengths(evidence.stated_cameras, cameras),
         "outside": _outside(block, found),
         "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }

@@ -35,7 +35,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 8
+VERSION = 9
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 

@@ -45,6 +45,7 @@ class BlockRead:
     block: Block
     image_fingerprints: Mapping[str, str]
     focal_sigmas: Mapping[str, float]
+    likely_focals: Mapping[str, float]
     angles: Mapping[str, Angles]
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
@@ -76,6 +77,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         block=block,
         image_fingerprints=prints,
         focal_sigmas=inputs.focal_sigmas,
+        likely_focals=inputs.likely_focals,
         angles=inputs.angles,
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),

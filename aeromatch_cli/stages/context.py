@@ -35,7 +35,8 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it. angles: image_id -> attitude as it was given. control: surveyed points.
+    share of it. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
+    given one. angles: image_id -> attitude as it was given. control: surveyed points.
     """
 
     settings: Settings
@@ -46,6 +47,7 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
+    likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     # The pairs that are worked on, of a step of a cascade; None: all.

@@ -18,6 +18,7 @@ from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
+from aeromatch_cli.orientation.focal import better_cameras
 from aeromatch_cli.orientation.mapping import MAPPERS, Group, Mapper, Model, map_block
 from aeromatch_cli.orientation.solution import (
     Before,
@@ -52,7 +53,7 @@ from aeromatch_cli.workspace import (
 
 log = logging.getLogger("aeromatch")
 
-VERSION = 8
+VERSION = 9
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
@@ -130,6 +131,8 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     # Pairs that look alike are chosen once, for all passes.
     looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
     first, evidence = _evidence(context, first_pass.look(recipe, block) if looks else recipe)
+    if recipe.replaces:
+        context, first, evidence = _with_better_cameras(context, first, evidence)
     good = evidence.explained()
     if looks and recipe.replaces and not suffices(evidence, good):
         first, evidence = _evidence(context, recipe)
@@ -154,6 +157,19 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
         centers_m = np.array([pose.center_m for pose in solution.poses.values()])
         terrains = tuple(continued(one, new, centers_m) for one, new in zip(old, terrains, strict=True))
     return replace(solution, terrains=terrains, facts=facts)
+
+
+def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -> tuple[Context, Context, Evidence]:
+    """All three with other focal lengths, where those given cannot be right."""
+    block = evidence.block
+    camera_ids = {image.image_id: image.camera_id for image in block.images}
+    seen = evidence.pairs, block.poses, block.cameras, camera_ids, evidence.thresholds_px
+    cameras = {**block.cameras, **better_cameras(*seen, context.likely_focals)}
+    return (
+        replace(context, block=replace(context.block, cameras=cameras)),
+        replace(first, block=replace(first.block, cameras=cameras)),
+        replace(evidence, block=replace(block, cameras=cameras)),
+    )
 
 
 def _mapped(
@@ -248,7 +264,7 @@ def _evidence(context: Context, recipe: FirstPass, *, by_position: bool = True) 
     sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
     thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
-    return first, Evidence(context.block, pairs, thresholds_px)
+    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras)
 
 
 def _before(context: Context, kept: set[str]) -> Before:
@@ -269,8 +285,9 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         place = None if pose is None else (pose.center_m, pose.world_rotation, pose.sigma_position_m)
         taken = context.image_fingerprints[image.image_id], image.time
         images[image.image_id] = fingerprint(
-            taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id)
-        )
+            taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
+            context.likely_focals.get(image.camera_id),
+        )  # fmt: skip
     how: list[Any] = [settings.orient, settings.block.max_size_px, settings.block.masks]
     if isinstance(settings.pairs, Similar):
         how.append(settings.pairs)

@@ -132,6 +132,7 @@ def _context(
         image_fingerprints=found.image_fingerprints,
         given=found.block,
         focal_sigmas=found.focal_sigmas,
+        likely_focals=found.likely_focals,
         angles=found.angles,
         control=found.control,
         shard=shard,
