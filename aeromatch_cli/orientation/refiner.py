@@ -23,6 +23,7 @@ from aeromatch_cli.orientation.adjusting import (
     adjust_in_place,
     adjusted,
     arrays,
+    believed_tilts,
     connected_parts,
     drop_weak_images,
     figures,
@@ -110,6 +111,9 @@ def _refined(
 ) -> tuple[Any, dict[str, FloatArray]]:
     """The model adjusted and triangulated in turn, while that makes it better; and the observations that it used."""
     positions_m, sigmas_m = observed["positions_m"], observed["sigmas_m"]
+    if kind == "positions":
+        tilts = believed_tilts(pycolmap, model, positions_m, sigmas_m, observed["ups"], observed["rotations"])
+        observed = {**observed, "ups": tilts}
     used = image_numbers(model)
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
