@@ -147,7 +147,8 @@ def oriented(
             center_m=center_m - np.array(frame.origin_m),
             world_rotation=angles[name].rotation if name in angles else None,
             sigma_position_m=max(
-                observations[name].sigma_position_m or sigma_position_m, _LEVEL_SIGMA_M if name in level else 0.0
+                observations[name].sigma_position_m or sigma_position_m,
+                _LEVEL_SIGMA_M if np.isnan(observations[name].position[2]) else 0.0,
             ),
             sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
         )
@@ -161,7 +162,7 @@ def oriented(
 def _with_heights(grid: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], float, list[str]]:
     """Centres that all have a height, the one that was put in, and for which images: flights are about level."""
     level = [name for name, center_m in grid.items() if np.isnan(center_m[2])]
-    heights_m = [float(center_m[2]) for name, center_m in grid.items() if name not in set(level)]
+    heights_m = [center_m[2] for center_m in grid.values() if not np.isnan(center_m[2])]
     level_m = float(np.median(heights_m)) if heights_m else 0.0
     filled: dict[str, FloatArray] = {name: np.array([*grid[name][:2], level_m]) for name in level}
     return {**grid, **filled}, level_m, level
