@@ -6,7 +6,7 @@ other images and lists of other flights.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,8 @@ _MIN_IMAGES = 3
 # Lines are those of other images where they are off by this share of the block's extent, and lie nearer to some other
 # image by this factor.
 _MIXED_EXTENT, _MIXED_SHARE = 0.2, 0.25
+# Sea level lies within this of the ellipsoid everywhere, metres; the GPS of a camera adds some.
+_GEOID_M = 130.0
 _METRES_PER_DEG = 111_320.0
 
 
@@ -51,7 +53,7 @@ def agreed(
     if _of_other_images(listed * to_metres, places * to_metres):
         return found, [f"{source}: the lines look like those of other images, as the GPS of the images shows"]
     if _median_m(listed, places, to_metres) <= _SAME_M:
-        return found, []
+        return found, _other_heights(found, facts, names, source)
     if _median_m(listed[:, ::-1], places, to_metres) <= _SAME_M:
         for name, observation in observations.items():
             first, second, height = observation.position
@@ -64,6 +66,22 @@ def agreed(
     if zone:
         return found, [f"{remark}: x and y fit {zone}; give --crs {zone}"]
     return found, [f"{remark}: is it the list of another flight, or of another CRS?"]
+
+
+def _other_heights(
+    found: Mapping[str, Observation], facts: Mapping[str, ExifFacts], names: Sequence[str], source: str
+) -> list[str]:
+    """What is said where heights differ by more than the ellipsoid's from sea level ever do."""
+    heights = [(found[name].position[2], facts[name].altitude_m) for name in names]
+    off_m = [listed_m - gps_m for listed_m, gps_m in heights if gps_m is not None and np.isfinite(listed_m)]
+    median_m = float(np.median(off_m)) if len(off_m) >= _MIN_IMAGES else 0.0
+    if abs(median_m) <= _GEOID_M:
+        return []
+    side = "above" if median_m > 0 else "below"
+    return [
+        f"{source}: heights are {abs(median_m):.0f} m {side} those of the GPS of the images: are they heights above "
+        "ground or the take-off point? Ground heights (--ground) must count from the same zero"
+    ]
 
 
 def _median_m(listed: FloatArray, places: FloatArray, to_metres: FloatArray) -> float:

@@ -60,7 +60,10 @@ def utm_crs(latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> str:
     turned = (np.asarray(longitudes_deg) - first + 180.0) % 360.0 - 180.0 + first
     longitude = (float(np.median(turned)) + 180.0) % 360.0 - 180.0
     if not -80.0 <= latitude <= 84.0:
-        raise ConfigError(f"no UTM zone at latitude {latitude:.2f}: give a projected CRS with --crs")
+        raise ConfigError(
+            f"no UTM zone at latitude {latitude:.2f}: are latitude and longitude exchanged? Else give a projected CRS "
+            "with --crs"
+        )
     zone = min(int((longitude + 180.0) // 6.0) + 1, 60)
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
 

@@ -25,7 +25,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -56,7 +56,11 @@ _ALIASES = {
 # Columns that might be meant as z or alt, and might as well be heights above ground.
 _UNCLEAR_HEIGHTS = ("z", "alt", "height", "h", "elevation", "relative_altitude", "agl")
 _BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
-_RANGES = {"lat": 90.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
+_LARGEST_LATITUDE_DEG = 90.0
+# So many latitudes that are none are no slip of the pen.
+_CERTAINLY = 3
+# A latitude beyond 90 degrees may be a longitude: see _with_latitudes.
+_RANGES = {"lat": 180.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
 _LARGEST_ANGLE_DEG = 360.0
 _LINES_NAMED = 5  # of those with the same fault
 # Images by line, by what is wrong with it.
@@ -120,9 +124,32 @@ def read_poses(path: Path) -> PoseList:
         rows.append(row)
     if not rows:
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
+    rows, exchanged = _with_latitudes(path, rows)
     ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
     warnings = [_fault(path, fault, images) for fault, images in faults.items()]
-    return PoseList(tuple(rows), layout.position_kind, (*ignored, *warnings))
+    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings))
+
+
+def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], list[str]]:
+    """Rows whose latitudes are such, and a remark where the list has them exchanged with the longitudes.
+
+    Raises ConfigError where only some are beyond 90 degrees.
+    """
+    if not rows or rows[0].position_kind != "geographic":
+        return rows, []
+    placed = [(row, row.position) for row in rows if row.position is not None]
+    beyond = [(row, place[0]) for row, place in placed if abs(place[0]) > _LARGEST_LATITUDE_DEG]
+    if not beyond:
+        return rows, []
+    if len(beyond) < max(len(placed), _CERTAINLY) or any(abs(place[1]) > _LARGEST_LATITUDE_DEG for _, place in placed):
+        row, latitude = beyond[0]
+        limits = f"between {-_LARGEST_LATITUDE_DEG:g} and {_LARGEST_LATITUDE_DEG:g}"
+        raise ConfigError(
+            f"{path}, line {row.line}, column lat: {latitude:g} is out of range: expected a number {limits}"
+        )
+    turned = {row.line: replace(row, position=(place[1], place[0], place[2])) for row, place in placed}
+    remark = f"{path.name}: lat and lon are exchanged, as latitudes beyond 90 degrees show: they were put right"
+    return [turned.get(row.line, row) for row in rows], [remark]
 
 
 def _fault(path: Path, fault: str, images: Mapping[int, str]) -> str:

@@ -18,14 +18,12 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.placing import Placement, place
-from aeromatch_cli.orientation.precision import Observations, pose_sigmas
+from aeromatch_cli.orientation.results import centers_of, image_numbers, points_of
 
 # A prior focal length is taken where the cost with it is larger by no more than this share, or by so
 # many times the mean of a residual: chance lowers it by one for every unknown. The share holds for twice the prior's
 # standard deviation, and grows with the distance: what a lens model lacks also lowers the cost.
 _SAME_COST, _CHANCE = 0.05, 6.0
-# No coordinate of a keypoint is measured more exactly, in pixels.
-_LEAST_ERROR_PX = 0.03
 # Fewer images do not determine a camera's focal length, or its distortion: it stays as it was given.
 _FOCAL_IMAGES, DISTORTION_IMAGES = 3, 10
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
@@ -38,6 +36,8 @@ _FAR = 20.0
 MIN_OBSERVATIONS = 12
 # Headings are wrong beyond this, degrees.
 _WRONG_HEADING_DEG = 20.0
+# Given attitudes have an error in common of up to this, degrees: that of the mounting, or of their north.
+_COMMON_DEG = 1.0
 # So many positions hold a model in the world frame.
 _HOLDING = 3
 # A position that is so many standard deviations away is not that of the image.
@@ -111,7 +111,7 @@ def adjust_in_place(
     have been found wrong before.
     """
     ids = image_numbers(model)
-    off_m = np.linalg.norm(_centers(model, ids) - positions_m[np.array(ids, dtype=int) - 1], axis=1)
+    off_m = np.linalg.norm(centers_of(model, ids) - positions_m[np.array(ids, dtype=int) - 1], axis=1)
     used = [i for i, off in zip(ids, off_m, strict=True) if off <= _WRONG_SIGMAS * sigmas_m[i - 1]]
     used = used if len(used) >= _HOLDING else []
     _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
@@ -120,7 +120,7 @@ def adjust_in_place(
     weights = 1.0 / sigmas_m[rows] ** 2
     by_positions = np.eye(3) * (weights @ (arms_m**2).sum(axis=1)) - (arms_m * weights[:, None]).T @ arms_m
     turn = attitudes.turn(model, by_positions)
-    middle_m = _centers(model, used or image_numbers(model)).mean(axis=0)
+    middle_m = centers_of(model, used or image_numbers(model)).mean(axis=0)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn), middle_m - turn @ middle_m))
     return used
 
@@ -145,7 +145,9 @@ class Attitudes:
             return np.eye(3)
         now = np.array([model.images[i].cam_from_world().rotation.matrix() for i in self.images])
         turns = Rotation.from_matrix(self.rotations.transpose(0, 2, 1) @ now)
-        own = weights.sum() * np.eye(3)
+        # Their mean is no better than what they have in common: the mounting's error, another north.
+        common_deg = min(_COMMON_DEG, float(np.median(self.sigmas_deg)))
+        own = np.eye(3) / (1.0 / weights.sum() + np.deg2rad(common_deg) ** 2)
         mean = turns.mean(weights).as_rotvec()
         return np.asarray(Rotation.from_rotvec(np.linalg.solve(own + information, own @ mean)).as_matrix())
 
@@ -210,7 +212,7 @@ def _placed(
 ) -> Placement:
     rotations = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])
     in_model = np.einsum("nji,nj->ni", rotations, ups)
-    placement = place(_centers(model, ids), _points(model), positions_m, sigmas_m, in_model)
+    placement = place(centers_of(model, ids), points_of(model), positions_m, sigmas_m, in_model)
     rotation = pycolmap.Rotation3d(placement.rotation)
     model.transform(pycolmap.Sim3d(placement.scale, rotation, placement.translation_m))
     return placement
@@ -277,7 +279,7 @@ def drop_far_images(model: Any) -> None:
     ids = image_numbers(model)
     if not ids:
         return
-    centers = _centers(model, ids)
+    centers = centers_of(model, ids)
     apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     _drop(model, [model.images[i] for i, far in zip(ids, apart > _FAR * np.median(apart), strict=True) if far])
 
@@ -318,97 +320,6 @@ def _prior(pycolmap: ModuleType, image: Any, position_m: FloatArray, sigma_m: fl
     )
 
 
-def image_numbers(model: Any) -> list[int]:
-    return sorted(int(image_id) for image_id, image in model.images.items() if image.has_pose)
-
-
-def _centers(model: Any, ids: list[int]) -> FloatArray:
-    return np.array([model.images[i].projection_center() for i in ids])
-
-
-def _points(model: Any) -> FloatArray:
-    return np.array([model.points3D[i].xyz for i in sorted(model.points3D)]).reshape(-1, 3)
-
-
-def arrays(model: Any) -> dict[str, Any]:
-    """What the parent reads: see `mapping.Model`."""
-    ids, point_ids = image_numbers(model), sorted(model.points3D)
-    model.update_point_3d_errors()
-    points = [model.points3D[i] for i in point_ids]
-    cameras = sorted(model.cameras)
-    return {
-        "images": np.array(ids),
-        "rotations": np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
-        "centers_m": _centers(model, ids),
-        "cameras": np.array(cameras),
-        "points_m": _points(model),
-        "errors_px": np.array([point.error for point in points]),
-        **{f"params{i}": np.array(model.cameras[i].params) for i in cameras},
-    }
-
-
-def tracks_of(model: Any) -> dict[str, Any]:
-    """Which keypoints see the points: (M,) image numbers, keypoints of these, and rows of `points_m`."""
-    images, keypoints, rows = [], [], []
-    for row, number in enumerate(sorted(model.points3D)):
-        elements = model.points3D[number].track.elements
-        images += [element.image_id for element in elements]
-        keypoints += [element.point2D_idx for element in elements]
-        rows += [row] * len(elements)
-    return {
-        "track_images": np.array(images, np.int32),
-        "track_keypoints": np.array(keypoints, np.int32),
-        "track_points": np.array(rows, np.int32),
-    }
-
-
-def sigmas_of(model: Any, sigmas_m: FloatArray, cameras: dict[str, Any], attitudes: Attitudes) -> dict[str, Any]:
-    """Standard deviations (N, 3) of the poses of `arrays`: x, y, z in metres and omega, phi, kappa in degrees.
-
-    sigmas_m: of the observed positions, by number, NaN where there is none.
-    """
-    ids, tracks, lenses = image_numbers(model), tracks_of(model), sorted(model.cameras)
-    known = np.isin(tracks["track_images"], ids)
-    seen = Observations(
-        image=np.searchsorted(ids, tracks["track_images"][known]),
-        point=tracks["track_points"][known],
-        camera=np.array([lenses.index(model.images[i].camera_id) for i in ids]),
-        rotations=np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
-        centers_m=_centers(model, ids),
-        focal_px=np.array([model.cameras[k].mean_focal_length() for k in lenses]),
-        points_m=_points(model),
-        error_px=_error_px(model),
-    )
-    given_m = np.where(np.isfinite(sigmas_m), sigmas_m, np.inf)[np.array(ids) - 1]
-    given_deg = np.full(len(ids), np.inf)
-    places = [ids.index(i) for i in attitudes.images if i in ids]
-    given_deg[places] = attitudes.sigmas_deg[[i in ids for i in attitudes.images]]
-    focal = np.array([cameras[str(k)]["sigma"] for k in lenses])
-    of_position, of_angles = pose_sigmas(seen, given_m, given_deg, focal)
-    return {"sigmas_m": of_position, "sigmas_deg": of_angles}
-
-
-def _error_px(model: Any) -> float:
-    """Standard deviation of a keypoint's coordinate, from the residuals and what the unknowns have taken from them.
-
-    Distances of normally distributed residuals have the mean sqrt(pi / 2) times the standard deviation of a coordinate.
-    """
-    coordinates = 2 * model.compute_num_observations()
-    unknowns = 3 * model.num_points3D() + 6 * model.num_reg_images()
-    taken = np.sqrt(coordinates / max(coordinates - unknowns, 1))
-    spread_px = model.compute_mean_reprojection_error() / np.sqrt(np.pi / 2.0)
-    return max(float(spread_px * taken), _LEAST_ERROR_PX)
-
-
 def drop_weak_images(model: Any) -> None:
     """Take images with few points out of a model."""
     _drop(model, [i for i in model.images.values() if i.has_pose and i.num_points3D < MIN_OBSERVATIONS])
-
-
-def figures(model: Any) -> dict[str, Any]:
-    return {
-        "images": model.num_reg_images(),
-        "points": model.num_points3D(),
-        "track_length": model.compute_mean_track_length(),
-        "reprojection_error_px": model.compute_mean_reprojection_error(),
-    }

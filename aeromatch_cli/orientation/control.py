@@ -21,7 +21,8 @@ def control_figures(
     """Transformation from the adjusted block to the points, and root mean square errors; JSON-ready.
 
     cameras: image_id -> adjusted camera. `check_rmse_m` (x, y, z) is of the check points; without any, of every control
-    point under the transformation of the others (leave-one-out). None where points are too few.
+    point under the transformation of the others (leave-one-out). `offset_m`: from the block as it is to the surveyed
+    positions, median over the control points. None where points are too few.
     """
     found = {point.name: _intersected(adjusted, cameras, point) for point in points}
     seen = [point for point in points if found[point.name] is not None]
@@ -34,7 +35,8 @@ def control_figures(
         "not_measured_in_two_images": sorted(point.name for point in points if found[point.name] is None),
     }
     if len(control) < _LEAST_POINTS:
-        return figures | {"transformation": None, "control_rmse_m": None, "check_rmse_m": None, "check_kind": None}
+        unknown = ("offset_m", "transformation", "control_rmse_m", "check_rmse_m", "check_kind")
+        return figures | dict.fromkeys(unknown)
     in_block = {name: place for name, place in found.items() if place is not None}
     fit = _fit(control, in_block)
     own = _errors(fit, control, in_block)
@@ -48,7 +50,9 @@ def control_figures(
         )
     else:
         kind, independent = None, np.zeros((0, 3))
+    off_m = np.array([point.position_m - in_block[point.name] for point in control])
     return figures | {
+        "offset_m": [round(float(v), 3) for v in np.median(off_m, axis=0)],
         "transformation": _described(fit),
         "control_rmse_m": _rmse(own),
         "check_rmse_m": _rmse(independent),

@@ -19,14 +19,13 @@ import numpy as np
 from aeromatch_cli.orientation.adjusting import (
     DISTORTION_IMAGES,
     adjusted,
-    arrays,
     believed_tilts,
     drop_far_images,
     drop_weak_images,
-    figures,
     reset_lenses,
 )
 from aeromatch_cli.orientation.process import quiet_pycolmap
+from aeromatch_cli.orientation.results import arrays, figures
 
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
 _FOCAL_CHANGE = 0.1

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # More images than this would need too much memory: each is taken by itself then, its neighbours as known.
 _MAX_TOGETHER = 1500
+# An angle with a larger standard deviation, degrees, is not determined: about the line of a single strip, say.
+_UNDETERMINED_DEG = 45.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,9 @@ class Observations:
 def pose_sigmas(
     seen: Observations, sigmas_position_m: FloatArray, sigmas_angle_deg: FloatArray, sigmas_focal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees; NaN without points.
+    """Standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees.
+
+    NaN stands for unknown: an image without points, an angle that nothing determines.
 
     sigmas_position_m, sigmas_angle_deg: (N,) of the observed positions and attitudes, inf where there is none.
     sigmas_focal: (K,) of the focal lengths before the adjustment, as a share. Without any position they are those of
@@ -73,6 +77,7 @@ def pose_sigmas(
     sigmas_deg = np.sqrt(np.maximum(np.diagonal(angles, axis1=1, axis2=2), 0.0))
     unseen = np.bincount(seen.image, minlength=images) == 0
     sigmas_m[unseen], sigmas_deg[unseen] = np.nan, np.nan
+    sigmas_deg[sigmas_deg > _UNDETERMINED_DEG] = np.nan
     return sigmas_m, sigmas_deg
 
 

@@ -22,17 +22,13 @@ from aeromatch_cli.orientation.adjusting import (
     Attitudes,
     adjust_in_place,
     adjusted,
-    arrays,
     believed_tilts,
     connected_parts,
     drop_weak_images,
-    figures,
-    image_numbers,
     keep_images,
-    sigmas_of,
-    tracks_of,
 )
 from aeromatch_cli.orientation.process import quiet_pycolmap
+from aeromatch_cli.orientation.results import arrays, figures, image_numbers, sigmas_of, tracks_of
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
 _WORTH_AGAIN = 0.1
@@ -88,7 +84,8 @@ def refine(folder: Path) -> None:
         if not image_numbers(model):
             continue
         name = f"model{len(facts)}.npz"
-        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], attitudes)
+        angles_deg = dict(zip(attitudes.images, attitudes.sigmas_deg.tolist(), strict=True))
+        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], angles_deg)
         np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")

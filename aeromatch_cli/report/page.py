@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
+from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
@@ -82,7 +83,11 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         headline=_headline(images, pairs, facts, failures),
-        notices=notices(images, pairs, facts, _facts(context, "orient"), input_facts.get("warnings", [])),
+        notices=[
+            *notices(images, pairs, facts, _facts(context, "orient")),
+            *adjustment_notices(images, _facts(context, "adjust")),
+            *(Notice("warn", "Note on the input", warning) for warning in input_facts.get("warnings", [])),
+        ],
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
@@ -145,7 +150,6 @@ def notices(
     pairs: Sequence[PairRow],
     facts: Mapping[str, Any],
     judged: Mapping[str, Any],
-    warnings: Sequence[str],
 ) -> list[Notice]:
     """What needs a person's eye, the gravest first. facts: of the filter; judged: of the orientation."""
     found = []
@@ -184,7 +188,17 @@ def notices(
     if lost:
         text = "No matches on file: the match stage failed there or has not run."
         found.append(Notice("warn", _counted(lost, "pair was not judged", "pairs were not judged"), text))
-    found += [Notice("warn", "Note on the input", warning) for warning in warnings]
+    return found
+
+
+def adjustment_notices(images: Sequence[ImageRow], adjusted: Mapping[str, Any]) -> list[Notice]:
+    """Images that the bundle adjustment does not hold, and what else it found. adjusted: its facts."""
+    names = {row.image_id: row.name for row in images}
+    found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
+    outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
+    if outside:
+        text = "Their matches are exported, but they have no adjusted pose and see no point."
+        found.insert(0, Notice("bad", _counted(len(outside), "image", "images") + " not oriented", text, outside))
     return found
 
 
@@ -198,18 +212,23 @@ def _facts(context: Context, stage: str) -> dict[str, Any]:
     return dict(read_json(path)["facts"]) if path.is_file() else {}
 
 
+def _camera_words(cameras: Mapping[str, Camera]) -> str:
+    """One camera a line: its model, size and parameters."""
+    words = []
+    for camera_id, camera in sorted(cameras.items()):
+        params = ", ".join(f"{value:g}" for value in camera.params)
+        words.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
+    more = [f"and {len(words) - 10} more"] if len(words) > 10 else []
+    return "\n".join(words[:10] + more)
+
+
 def _block_facts(context: Context) -> list[tuple[str, str]]:
     block = context.block
-    cameras = []
-    for camera_id, camera in sorted(block.cameras.items()):
-        params = ", ".join(f"{value:g}" for value in camera.params)
-        cameras.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
-    more = [f"and {len(cameras) - 10} more"] if len(cameras) > 10 else []
     return [
         ("World frame", f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"),
         ("Ground", block.ground_source),
         ("Ground sampling distance", "unknown" if block.gsd_m is None else f"{block.gsd_m:.3g} m"),
-        ("Cameras", "\n".join(cameras[:10] + more)),
+        ("Cameras", _camera_words(block.cameras)),
         ("Images in", context.settings.block.images),
     ]
 
@@ -226,8 +245,8 @@ def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     if facts["sigma_position_m"] is not None:
         sigmas = f"{facts['sigma_position_m']:.3g} m, {facts['sigma_angle_deg']:.2g}°"
         found.append(("Standard deviations of the poses", f"{sigmas}, median"))
-    if facts["outside"]:
-        found.append(("Not oriented", "\n".join(f"{i}: {reason}" for i, reason in facts["outside"].items())))
+    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts["cameras"].items()}
+    found.append(("Cameras after the adjustment", _camera_words(cameras)))
     control = facts["control"]
     if control and control["control_rmse_m"]:
         found.append(("Control points", f"{control['control']}, RMSE {_metres(control['control_rmse_m'])}"))

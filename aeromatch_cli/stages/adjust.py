@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.stages import orient
@@ -24,7 +26,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.strategies.orienters import FirstPass
+from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 from aeromatch_cli.workspace import (
     file_digest,
     fingerprint,
@@ -35,7 +37,11 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 9
+VERSION = 10
+# A focal length that the adjustment changed by more than this share is said.
+_FOCAL_SHARE = 0.01
+# Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
+_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS = 10.0, 5.0
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 
@@ -70,12 +76,13 @@ def run(context: Context) -> StageReport:
 
 
 def adjusted_block(context: Context) -> AdjustedBlock | None:
-    """What is on file for the present results; None without orientation."""
+    """What is on file for the present results; None without orientation, or where no image could be adjusted."""
     groups = orient.groups(context) if isinstance(context.settings.orient, FirstPass) else []
     made_now = replace(context, overwrite=False)
     if not groups or _on_file(made_now).get("fingerprint") != _fingerprint(context, groups):
         return None
-    return read_adjusted(context.workspace.adjusted)
+    found = read_adjusted(context.workspace.adjusted)
+    return found if found.poses else None
 
 
 def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
@@ -115,19 +122,65 @@ def _write(context: Context, adjusted: AdjustedBlock, report: StageReport) -> No
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
     observations = sum(len(track) for track in adjusted.tracks.values())
-    sigmas = np.array([(np.mean(p.sigmas_m), np.mean(p.sigmas_deg)) for p in adjusted.poses.values()]).reshape(-1, 2)
-    known = len(sigmas) > 0 and bool(np.isfinite(sigmas).any())
+    control = _control(context, adjusted)
     return {
         "images": len(adjusted.poses),
         "points": len(adjusted.points_m),
         "track_length": round(observations / max(1, len(adjusted.points_m)), 3),
         "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
-        "sigma_position_m": float(np.nanmedian(sigmas[:, 0])) if known else None,
-        "sigma_angle_deg": float(np.nanmedian(sigmas[:, 1])) if known else None,
+        "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in adjusted.poses.values()]),
+        "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
         "groups": [dict(one) for one in figures],
+        "cameras": {
+            camera_id: [camera.model, camera.width_px, camera.height_px, list(camera.params)]
+            for camera_id, camera in sorted(adjusted.cameras.items())
+        },
         "outside": _reasons(context, adjusted),
-        "control": _control(context, adjusted),
+        "control": control,
+        "remarks": _remarks(context, adjusted, control),
     }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    """Of those that are known; None where none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else None
+
+
+def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, Any] | None) -> list[str]:
+    """What a person should know of the adjusted block, one sentence each."""
+    if not adjusted.poses:
+        words = "no image could be oriented from the verified matches: export/colmap/sparse has no points"
+        kept = isinstance(context.settings.orient, GivenPoses)
+        return [f"{words}. They do not fit the given poses; use orient=global instead of given" if kept else words]
+    remarks = []
+    before, used = context.block.cameras, {i.camera_id for i in context.block.images if i.image_id in adjusted.poses}
+    for camera_id in sorted(used):
+        old_px, new_px = focal_px(before[camera_id]), focal_px(adjusted.cameras[camera_id])
+        if abs(new_px / old_px - 1.0) > _FOCAL_SHARE:
+            remarks.append(f"focal length of {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before")
+    return remarks + _control_remarks(context, None if control is None else control["offset_m"])
+
+
+def _control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:
+    """What is said of control points that lie far from where the given positions of the images put them."""
+    if offset_m is None or context.block.crs == LOCAL:
+        return []
+    east_m, north_m, up_m = offset_m
+    across_m = float(np.hypot(east_m, north_m))
+    sigma_m = max((pose.sigma_position_m for pose in context.given.poses.values()), default=0.0)
+    limit_m = max(_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS * sigma_m)
+    if across_m > limit_m:
+        return [
+            f"the control points lie {across_m:,.0f} m beside where the given positions of the images put them: is the "
+            "CRS in the first line of their file right, or are x and y exchanged?"
+        ]
+    if abs(up_m) > limit_m:
+        return [
+            f"the control points lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} the heights at which the "
+            "given positions of the images put them: do both count from the same zero (ellipsoid, sea level)?"
+        ]
+    return []
 
 
 def _control(context: Context, adjusted: AdjustedBlock) -> dict[str, Any] | None:

@@ -10,15 +10,15 @@ from aeromatch_cli.stages import enhance, filter  # noqa: A004
 from aeromatch_cli.stages.stage_report import StageReport
 
 
-def stage_lines(stage: StageReport, *, part: bool) -> list[str]:
-    """Counts and time of a stage, and what it found. part: of a shard."""
+def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
+    """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
     counts = (
         f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
         f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
     )
     if stage.stage == "filter":
-        return [counts, *_filter_lines(stage, part=part)]
-    return [counts, *(_adjust_lines(stage) if stage.stage == "adjust" else _picture_lines(stage))]
+        return [counts, *_filter_lines(stage, names, part=part)]
+    return [counts, *(_adjust_lines(stage, names) if stage.stage == "adjust" else _picture_lines(stage))]
 
 
 def _picture_lines(stage: StageReport) -> list[str]:
@@ -38,7 +38,7 @@ def _picture_lines(stage: StageReport) -> list[str]:
     return [f"          {'; '.join(words)}"] if words else []
 
 
-def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
+def _filter_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
     """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
     facts = stage.facts
     states = ", ".join(f"{count} {state}" for state, count in facts["pairs"].items()) or "none"
@@ -52,8 +52,8 @@ def _filter_lines(stage: StageReport, *, part: bool) -> list[str]:
     else:
         lines.append("          all images are connected")
     if facts["weakly_tied"]:
-        names = facts["weakly_tied"]
-        lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(names)}")
+        weak = [names[i] for i in facts["weakly_tied"]]
+        lines.append(f"          weakly tied (< {filter.WEAK_MATCHES} matches): {_listed(weak)}")
     return lines
 
 
@@ -61,6 +61,7 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     """How the block was oriented, and what of that which was given is wrong. facts: of the stage orient."""
     if "method" not in facts:
         return []
+    names = {image.image_id: image.name for image in block.images}
     matched, explained = facts["images_matched"], facts["given_poses_explained"]
     attitudes = sum(pose.world_rotation is not None for pose in given.poses.values())
     explains = f"given poses explain the matches of {explained} of {matched} images"
@@ -68,18 +69,21 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
         unjudged = "no matches to judge the given poses by" if attitudes else "no matches to find it by"
         words = [explains if matched else unjudged]
     else:
-        sizes = ", ".join(str(model["images"]) for model in facts["models"]) or "none"
-        words = [f"from the pictures: {sizes} of {len(block.images)} images", *([explains] if attitudes else [])]
+        sizes = [str(model["images"]) for model in facts["models"]] or ["none"]
+        found = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
+        words = [f"from the pictures: {found} of {len(block.images)} images", *([explains] if attitudes else [])]
+        if facts["frame"] == "own" and given.crs != block.crs:
+            words.append(f"in a local frame, not in {given.crs}")
     for camera_id, (before, found) in facts["focal_lengths"].items():
         kept = ", but the given one is kept" if facts["stays"] else ""
         words.append(f"focal length of {camera_id}: {found:.0f} px instead of {before:.0f} px{kept}")
     for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
         if facts[what]:
-            named = _listed([f"{i} ({value:.0f} {unit})" for i, value in facts[what].items()])
+            named = _listed([f"{names[i]} ({value:.0f} {unit})" for i, value in facts[what].items()])
             done = "kept, as orient=given asks" if facts["stays"] else "corrected"
             words.append(f"{what.replace('_', ' ')} given and {done}: {named}")
     if facts["outside"]:
-        words.append(f"not oriented: {_listed(facts['outside'])}")
+        words.append(f"not oriented: {_listed([names[i] for i in facts['outside']])}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
 
 
@@ -93,11 +97,11 @@ def frame_remarks(record: Mapping[str, Any]) -> list[str]:
     return [f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary"]
 
 
-def _adjust_lines(stage: StageReport) -> list[str]:
+def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     """Figures of the bundle adjustment, and images that it could not tie."""
     facts = stage.facts
     if not facts.get("points"):
-        return []
+        return [f"          {line}" for line in facts.get("remarks", ())]
     words = [
         f"{facts['images']} of {stage.items} images oriented, {facts['points']} points in {facts['track_length']:.1f} "
         f"images each, reprojection error {facts['reprojection_error_px']:.2f} px"
@@ -106,7 +110,10 @@ def _adjust_lines(stage: StageReport) -> list[str]:
         sizes = ", ".join(str(group["images"]) for group in facts["groups"])
         words.append(f"{len(facts['groups'])} groups of images, each oriented by itself: {sizes}")
     words += _control_words(facts["control"])
-    words += [f"not oriented: {image_id}: {reason}" for image_id, reason in list(facts["outside"].items())[:10]]
+    words += facts["remarks"]
+    outside = list(facts["outside"].items())
+    words += [f"not oriented: {names[image_id]}: {reason}" for image_id, reason in outside[:10]]
+    words += [f"not oriented: {len(outside) - 10} more, listed in the report"] if len(outside) > 10 else []
     return [f"          {line}" for line in words]
 
 

@@ -207,8 +207,9 @@ def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
 def _result(command: str, context: Context, reports: list[StageReport], said: _Said) -> Result:
     failures = _all_failures(command, context, reports)
     lines = said.rest(reports[1].facts["summary"])
+    names = {image.image_id: image.name for image in context.block.images}
     for stage in reports:
-        lines += stage_lines(stage, part=context.shard is not None)
+        lines += stage_lines(stage, names, part=context.shard is not None)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")
