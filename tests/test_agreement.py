@@ -47,6 +47,18 @@ def test_a_list_that_agrees_is_not_questioned(folder: Path) -> None:
     assert remarks(read(folder, "x,y,z", *xy.T, crs="EPSG:32633")) == []
 
 
+def test_heights_of_another_zero_are_said(folder: Path) -> None:
+    """The pictures say 300 m; as above the ground the list says 60, as above sea level 255."""
+    lines = "\n".join(f"{n}.jpg,{LATITUDES[n]:.7f},{LONGITUDES[n]:.7f},HEIGHT" for n in range(IMAGES))
+    said = {}
+    for height_m in ("60", "255", "700"):
+        (folder / "list.csv").write_text("image,lat,lon,alt\n" + lines.replace("HEIGHT", height_m))
+        said[height_m] = remarks(read_inputs(folder / "images", poses=str(folder / "list.csv")))
+    assert said["255"] == []
+    assert "heights are 240 m below those of the GPS" in said["60"][0]
+    assert "heights are 400 m above those of the GPS" in said["700"][0]
+
+
 def test_exchanged_latitudes_and_longitudes_are_put_right(folder: Path) -> None:
     right = read(folder, "lat,lon,alt", LATITUDES, LONGITUDES)
     swapped = read(folder, "lat,lon,alt", LONGITUDES, LATITUDES)

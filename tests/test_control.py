@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.stages import adjust
 from aeromatch_cli.synthetic import load_truth
 
 IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
@@ -57,6 +60,7 @@ def test_check_points_show_their_own_error(truth: Truth) -> None:
     points = surveyed(truth, rows, offsets_m, set(rows[7:]))
     figures = control_figures(adjusted_truth(truth), cameras(truth), points)
     assert (figures["control"], figures["check"], figures["check_kind"]) == (7, 3, "check points")
+    np.testing.assert_allclose(figures["offset_m"], 0.0, atol=1e-6)
     assert figures["check_rmse_m"] == [0.03, 0.04, 0.12]
     assert max(figures["control_rmse_m"]) < 1e-6
     assert figures["transformation"]["scale"] == pytest.approx(1.0, abs=1e-9)
@@ -156,3 +160,21 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
     assert "RMSE at leave one out" in outcome.stdout
     assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "words"),
+    [
+        ((0.3, -0.2, 0.1), []),
+        ((0.0, 500_000.0, 0.0), ["500,000 m beside"]),
+        ((0.0, 0.0, -47.0), ["47.0 m below"]),
+    ],
+)
+def test_control_points_of_another_place_are_said(truth: Truth, offset_m: tuple, words: list[str]) -> None:
+    """Given positions have 0.5 m: 10 m is the limit."""
+    context = SimpleNamespace(block=truth.block, given=truth.block)
+    said = adjust.control_remarks(context, offset_m)
+    assert len(said) == len(words)
+    assert all(word in line for word, line in zip(words, said, strict=True))
+    local = SimpleNamespace(block=replace(truth.block, crs="local"), given=truth.block)
+    assert adjust.control_remarks(local, offset_m) == []

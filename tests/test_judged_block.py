@@ -80,8 +80,7 @@ def test_surveyed_poses_are_held_against_single_wrong_ones(site: Site, rendered:
 
     site.rewrite_poses(change)
     outcome = site("orient", "--set", "orient=given")
-    name = site.names()[1].replace(".", "_")
-    assert f"wrong attitudes given and kept, as orient=given asks: {name} (1" in outcome.stdout
+    assert f"wrong attitudes given and kept, as orient=given asks: {site.names()[1]} (1" in outcome.stdout
     assert attitude_errors(site, rendered)[1] > 100.0
 
 
@@ -92,6 +91,16 @@ def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:
     assert "all kappas are off by 180 degrees" in outcome.stderr
     errors = attitude_errors(site, rendered)
     assert min(errors) > 179.0
+
+
+def test_surveyed_poses_that_fit_nothing_are_said(site: Site) -> None:
+    site.rewrite_poses(lambda rows: turned(rows, 180.0))
+    outcome = site("run", "--set", "orient=given")
+    words = "They do not fit the given poses; use orient=global instead of given"
+    assert words in outcome.stdout
+    assert words in (site.work / "report" / "index.html").read_text()
+    posed = (site.work / "export" / "colmap" / "sparse" / "images.txt").read_text()
+    assert all(name in posed for name in site.names())
 
 
 def test_a_third_of_the_attitudes_wrong_settles_in_one_run(site: Site, rendered: Path) -> None:

@@ -191,6 +191,21 @@ def test_measured_tilts_level_a_block_over_a_slope() -> None:
     assert tilts_off(truth, by_tilts.rotations(rotations)) < 0.6
 
 
+@pytest.mark.parametrize("lean_deg", [0.0, 14.0])
+def test_tilts_that_contradict_the_positions_do_not_count(lean_deg: float) -> None:
+    """Over level ground: tilts with an error in common, as that of a list in other units, against positions."""
+    truth = flight()
+    _, points = matches(truth)
+    centers, rotations, moved = model_of(truth, points)
+    positions = np.array([pose.center_m for pose in truth.values()])
+    positions = positions + np.random.default_rng(4).normal(0.0, 1.0, positions.shape)
+    lean = Rotation.from_euler("x", lean_deg, degrees=True).as_matrix()
+    measured = np.array([(pose.world_rotation @ lean)[:, 2] for pose in truth.values()])
+    in_model = np.einsum("nji,nj->ni", rotations, measured)
+    found = place(centers, moved, positions, np.full(len(centers), 1.0), in_model)
+    assert tilts_off(truth, found.rotations(rotations)) < 2.0
+
+
 def test_tilts_that_contradict_each_other_or_the_terrain_do_not_count() -> None:
     _, centers, _, points, ups = tilted_block(0.5)
     nowhere, none = np.full((len(centers), 3), np.nan), np.full(len(centers), np.nan)

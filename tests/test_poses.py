@@ -147,3 +147,14 @@ def test_the_largest_deviation_of_an_axis_counts(tmp_path: Path) -> None:
     assert rows[0].sigma_position_m == 0.5
     with pytest.raises(ConfigError, match="a standard deviation is positive"):
         read_poses(write(tmp_path, "image,x,y,z,sigma_z_m\na.jpg,1,2,3,-1\n"))
+
+
+def test_latitudes_beyond_90_degrees_are_longitudes(tmp_path: Path) -> None:
+    path = tmp_path / "list.csv"
+    path.write_text("image,lat,lon,alt\n" + "".join(f"{n},{116.0 + n},40.{n},{n}\n" for n in range(3)))
+    found = read_poses(path)
+    assert [row.position for row in found.rows] == [(40.0, 116.0, 0.0), (40.1, 117.0, 1.0), (40.2, 118.0, 2.0)]
+    assert "lat and lon are exchanged" in found.warnings[0]
+    path.write_text("image,lat,lon,alt\na,116,40,1\nb,40,116,1\nc,116,40,1\n")
+    with pytest.raises(ConfigError, match="line 2, column lat: 116 is out of range"):
+        read_poses(path)

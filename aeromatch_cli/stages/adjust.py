@@ -159,10 +159,10 @@ def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, An
         old_px, new_px = focal_px(before[camera_id]), focal_px(adjusted.cameras[camera_id])
         if abs(new_px / old_px - 1.0) > _FOCAL_SHARE:
             remarks.append(f"focal length of {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before")
-    return remarks + _control_remarks(context, None if control is None else control["offset_m"])
+    return remarks + control_remarks(context, None if control is None else control["offset_m"])
 
 
-def _control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:
+def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:
     """What is said of control points that lie far from where the given positions of the images put them."""
     if offset_m is None or context.block.crs == LOCAL:
         return []
