@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -89,3 +91,18 @@ def test_positions_hold_the_frame() -> None:
     )  # fmt: skip
     again, _ = pose_sigmas(moved, known, np.full(9, np.inf), np.array([0.01]))
     np.testing.assert_allclose(np.linalg.norm(again, axis=1), np.linalg.norm(sigmas_m, axis=1), rtol=1e-6)
+
+
+def test_a_strip_alone_leaves_its_roll_unknown_unless_something_levels_it() -> None:
+    """Nine images along x with positions to 2 m: heading 2 m over the strip's spread, omega by the level alone."""
+    seen = network()
+    centers = np.array([[10.0 * (n - 4), 20.0, 100.0] for n in range(9)])
+    strip = replace(seen, centers_m=centers)
+    known = np.full(9, 2.0), np.full(9, np.inf), np.array([1e-6])
+    _, alone = pose_sigmas(strip, *known)
+    assert np.isnan(alone[:, 0]).all()
+    _, levelled = pose_sigmas(strip, *known, level_sigma_deg=1.5)
+    expected_deg = np.rad2deg(2.0 / np.sqrt((centers[:, 0] ** 2).sum()))
+    np.testing.assert_allclose(levelled[:, 0], 1.5, rtol=0.05)
+    np.testing.assert_allclose(levelled[:, 2], expected_deg, rtol=0.1)
+    assert (levelled[:, 1] < min(1.5, expected_deg)).all()

@@ -22,6 +22,8 @@ Reading = Callable[[Angles], FloatArray]
 _AGREE_DEG = 5.0
 # How far from level the frame of the pictures may be: positions with errors level a small block no better.
 _FRAME_DEG = 5.0
+# A turn of all headings by fewer standard deviations of the frame's north is none.
+_FREE_SIGMAS = 3.0
 # Another reading must be better by this factor than the angles as they were read.
 _BETTER = 0.4
 # Among readings that fit, the first whose median is at most this factor and these degrees above the best.
@@ -48,11 +50,14 @@ class Recognised:
     error_deg: float
 
 
-def recognised(given: Mapping[str, Angles], found: Mapping[str, FloatArray]) -> Recognised | None:
+def recognised(
+    given: Mapping[str, Angles], found: Mapping[str, FloatArray], north_sigma_deg: float = 0.0
+) -> Recognised | None:
     """The reading of the given angles that explains the attitudes found; None where they agree as they are, or none
     does.
 
-    found: image_id -> (3, 3) cam_from_world, in the world frame by positions.
+    found: image_id -> (3, 3) cam_from_world, in the world frame by positions. north_sigma_deg: how exactly these say
+    where north is.
     """
     ids = sorted(given.keys() & found.keys())
     if len(ids) < _MIN_IMAGES:
@@ -60,33 +65,35 @@ def recognised(given: Mapping[str, Angles], found: Mapping[str, FloatArray]) -> 
     ids = ids[:: 1 + len(ids) // _MOST_IMAGES]
     angles = [given[i] for i in ids]
     true = np.array([found[i] for i in ids])
-    as_read = _median_deg(np.array([one.rotation for one in angles]), true)
+    free_deg = _FREE_SIGMAS * north_sigma_deg
+    as_read = _median_deg(np.array([one.rotation for one in angles]), true, free_deg)
     limit_deg = min(_AGREE_DEG, _BETTER * as_read)
-    fits = [fit for fit in _fits(angles, true) if fit.error_deg <= limit_deg]
+    fits = [fit for fit in _fits(angles, true, free_deg) if fit.error_deg <= limit_deg]
     if not fits:
         return None
     near_deg = _NEARLY * min(fit.error_deg for fit in fits) + _NEARLY_DEG
     return next(fit for fit in fits if fit.error_deg <= near_deg)
 
 
-def _fits(angles: list[Angles], true: FloatArray) -> Iterator[Recognised]:
+def _fits(angles: list[Angles], true: FloatArray, free_deg: float) -> Iterator[Recognised]:
     """Every reading and how well it fits, single faults before two at once."""
     readings = [("", _as_read), *_readings(angles)]
     for words, reading in readings[1:]:
-        yield Recognised(words, reading, _median_deg(np.array([reading(one) for one in angles]), true))
+        yield Recognised(words, reading, _median_deg(np.array([reading(one) for one in angles]), true, free_deg))
     for words, reading in readings:
         rotations = np.array([reading(one) for one in angles])
         turn_deg = _heading_deg(true.transpose(0, 2, 1) @ rotations)
-        error_deg = _median_deg(rotations @ rotation_z(turn_deg).T, true)
-        if abs(turn_deg) > _LEAST_TURN_DEG and error_deg < _BETTER * _median_deg(rotations, true):
+        error_deg = _median_deg(rotations @ rotation_z(turn_deg).T, true, free_deg)
+        turned = abs(turn_deg) > max(_LEAST_TURN_DEG, free_deg)
+        if turned and error_deg < _BETTER * _median_deg(rotations, true, free_deg):
             said = _turn_words("yaws" if angles[0].kind == "yaw_pitch_roll" else "headings", turn_deg, angles)
             yield Recognised(" and ".join(filter(None, (words, said))), _turned(reading, turn_deg), error_deg)
         if not words:
             turn_deg = _heading_deg(true @ rotations.transpose(0, 2, 1))
-            error_deg = _median_deg(rotation_z(turn_deg) @ rotations, true)
+            error_deg = _median_deg(rotation_z(turn_deg) @ rotations, true, free_deg)
             said = _turn_words("kappas", turn_deg, angles) if angles[0].kind == "omega_phi_kappa" else (
                 f"the images are turned by {_rounded(turn_deg)} degrees in the camera")  # fmt: skip
-            if abs(turn_deg) > _LEAST_TURN_DEG:
+            if abs(turn_deg) > max(_LEAST_TURN_DEG, free_deg):
                 yield Recognised(said, partial(_turned_in_camera, turn_deg), error_deg)
 
 
@@ -164,12 +171,14 @@ def _heading_deg(turns: FloatArray) -> float:
     return quarter_deg if quarter_deg and abs(turn_deg - quarter_deg) < _NEAR_QUARTER_DEG else turn_deg
 
 
-def _median_deg(rotations: FloatArray, true: FloatArray) -> float:
-    """Median angle between attitudes, degrees, but for a small tilt that all have in common: the frame's own error."""
+def _median_deg(rotations: FloatArray, true: FloatArray, free_deg: float) -> float:
+    """Median angle between attitudes, degrees, but for what all have in common by the frame's own error: a small tilt,
+    and a turn about the vertical of up to free_deg.
+    """
     from scipy.spatial.transform import Rotation
 
     turns = Rotation.from_matrix(true.transpose(0, 2, 1) @ rotations)
-    tilts = np.median(turns.as_rotvec(degrees=True), axis=0) * [1.0, 1.0, 0.0]
-    if np.linalg.norm(tilts) > _FRAME_DEG:
-        tilts = np.zeros(3)
-    return float(np.median(np.rad2deg((Rotation.from_rotvec(-tilts, degrees=True) * turns).magnitude())))
+    common = np.median(turns.as_rotvec(degrees=True), axis=0)
+    common[:2] *= np.linalg.norm(common[:2]) <= _FRAME_DEG
+    common[2] *= abs(common[2]) <= free_deg
+    return float(np.median(np.rad2deg((Rotation.from_rotvec(-common, degrees=True) * turns).magnitude())))

@@ -49,7 +49,7 @@ class Placement:
     by the terrain, scale and origin arbitrary). agreeing: (N,) which positions were used; False where there is none.
     trusted: whether nearly all positions agree with the pictures as well as their standard deviations say.
     contradiction: why given positions were not used: "mirrored" (they fit only with the ground above the cameras),
-    "scattered" (they do not fit), else "".
+    "scattered" (they do not fit), else "". level_sigma_deg: how exactly tilts or terrain say where up is.
     """
 
     scale: float
@@ -59,6 +59,7 @@ class Placement:
     agreeing: BoolArray
     trusted: bool
     contradiction: str = ""
+    level_sigma_deg: float = np.inf
 
     def points(self, points: FloatArray) -> FloatArray:
         """World points (N, 3) of model points (N, 3)."""
@@ -263,7 +264,8 @@ def _levelled(found: Placement, information: FloatArray, used_m: FloatArray, ver
             break
         total = Rotation.from_rotvec(step).as_matrix() @ total
     moved = total @ (found.translation_m - middle_m) + middle_m
-    return replace(found, rotation=total @ found.rotation, translation_m=moved)
+    rotation = total @ found.rotation
+    return replace(found, rotation=rotation, translation_m=moved, level_sigma_deg=vertical.sigma_deg)
 
 
 def _up(centers: FloatArray, points: FloatArray) -> FloatArray:

@@ -43,14 +43,19 @@ class Observations:
 
 
 def pose_sigmas(
-    seen: Observations, sigmas_position_m: FloatArray, sigmas_angle_deg: FloatArray, sigmas_focal: FloatArray
+    seen: Observations,
+    sigmas_position_m: FloatArray,
+    sigmas_angle_deg: FloatArray,
+    sigmas_focal: FloatArray,
+    level_sigma_deg: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
     """Standard deviations (N, 3) of x, y, z in metres and (N, 3) of omega, phi, kappa in degrees.
 
     NaN stands for unknown: an image without points, an angle that nothing determines.
 
     sigmas_position_m, sigmas_angle_deg: (N,) of the observed positions and attitudes, inf where there is none.
-    sigmas_focal: (K,) of the focal lengths before the adjustment, as a share. Without any position they are those of
+    sigmas_focal: (K,) of the focal lengths before the adjustment, as a share. level_sigma_deg: of the tilt of the
+    whole block, where something else than positions levels it. Without any position they are those of
     the block's shape, whatever its place and scale.
     """
     from scipy import sparse
@@ -65,6 +70,7 @@ def pose_sigmas(
         diagonal[3 + axis : size : 6] = weights
     diagonal[size:] = 1.0 / (seen.focal_px * sigmas_focal) ** 2
     normal = normal + sparse.diags(diagonal)
+    normal = normal + _levelling(seen, level_sigma_deg) if weights.any() else normal
     if images <= _MAX_TOGETHER:
         inverse = _inverse(normal.toarray(), None if weights.any() else _free_movements(seen))
         blocks = np.array([inverse[k : k + 6, k : k + 6] for k in range(0, size, 6)])
@@ -79,6 +85,19 @@ def pose_sigmas(
     sigmas_m[unseen], sigmas_deg[unseen] = np.nan, np.nan
     sigmas_deg[sigmas_deg > _UNDETERMINED_DEG] = np.nan
     return sigmas_m, sigmas_deg
+
+
+def _levelling(seen: Observations, sigma_deg: float) -> sparse.csr_matrix:
+    """What is known of the block's tilt, as observations of every image that together are as exact as that."""
+    from scipy import sparse
+
+    images, cameras = len(seen.centers_m), len(seen.focal_px)
+    # Nothing is open by more than half a turn: what nothing else determines keeps the equations regular by that.
+    sigmas = np.deg2rad([min(sigma_deg, 180.0), min(sigma_deg, 180.0), 180.0])
+    across = np.einsum("nij,j,nkj->nik", seen.rotations, 1.0 / (images * sigmas**2), seen.rotations)
+    blocks = np.zeros((images, 6, 6))
+    blocks[:, :3, :3] = across
+    return sparse.csr_matrix(sparse.block_diag([*blocks, np.zeros((cameras, cameras))]))
 
 
 def _reduced(seen: Observations) -> sparse.csr_matrix:

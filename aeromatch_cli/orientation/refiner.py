@@ -56,7 +56,7 @@ def refine(folder: Path) -> None:
     """
     pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
-    priors = dict(np.load(folder / "priors.npz"))
+    priors = {**np.load(folder / "priors.npz"), "level_deg": np.array(np.inf)}
     facts: list[dict[str, Any]] = []
     waiting = deque(task["groups"])
     grouped = {number for group in task["groups"] for number in group["images"]}
@@ -85,7 +85,7 @@ def refine(folder: Path) -> None:
             continue
         name = f"model{len(facts)}.npz"
         angles_deg = dict(zip(attitudes.images, attitudes.sigmas_deg.tolist(), strict=True))
-        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], angles_deg)
+        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], angles_deg, float(observed["level_deg"]))
         np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
@@ -111,13 +111,14 @@ def _refined(
     if kind == "positions":
         tilts = believed_tilts(pycolmap, model, positions_m, sigmas_m, observed["ups"], observed["rotations"])
         observed = {**observed, "ups": tilts}
-    used = image_numbers(model)
+    used, level_deg = image_numbers(model), np.inf
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
         before = model.compute_mean_reprojection_error()
         if kind == "positions":
             placement = adjusted(pycolmap, model, cameras, positions_m, sigmas_m, observed["ups"], _COST_TOLERANCE)
+            level_deg = placement.level_sigma_deg
             used = [i for i, agrees in zip(image_numbers(model), placement.agreeing, strict=True) if agrees]
         else:
             used = adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
@@ -129,7 +130,7 @@ def _refined(
     unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
     sigmas_m = sigmas_m.copy()
     sigmas_m[unused] = np.nan
-    return model, {**observed, "sigmas_m": sigmas_m}
+    return model, {**observed, "sigmas_m": sigmas_m, "level_deg": np.array(level_deg)}
 
 
 def _found(kind: str) -> bool:

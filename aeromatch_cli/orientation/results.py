@@ -62,12 +62,12 @@ def tracks_of(model: Any) -> dict[str, Any]:
 
 
 def sigmas_of(
-    model: Any, sigmas_m: FloatArray, cameras: dict[str, Any], attitudes_deg: Mapping[int, float]
+    model: Any, sigmas_m: FloatArray, cameras: dict[str, Any], attitudes_deg: Mapping[int, float], level_deg: float
 ) -> dict[str, Any]:
     """Standard deviations (N, 3) of the poses of `arrays`: x, y, z in metres and omega, phi, kappa in degrees.
 
     sigmas_m: of the observed positions, by number, NaN where there is none. attitudes_deg: those of the observed
-    attitudes.
+    attitudes. level_deg: of the block's tilt, see `pose_sigmas`.
     """
     ids, tracks, lenses = image_numbers(model), tracks_of(model), sorted(model.cameras)
     known = np.isin(tracks["track_images"], ids)
@@ -84,7 +84,7 @@ def sigmas_of(
     given_m = np.where(np.isfinite(sigmas_m), sigmas_m, np.inf)[np.array(ids) - 1]
     given_deg = np.array([attitudes_deg.get(i, np.inf) for i in ids])
     focal = np.array([cameras[str(k)]["sigma"] for k in lenses])
-    of_position, of_angles = pose_sigmas(seen, given_m, given_deg, focal)
+    of_position, of_angles = pose_sigmas(seen, given_m, given_deg, focal, level_deg)
     return {"sigmas_m": of_position, "sigmas_deg": of_angles}
 
 

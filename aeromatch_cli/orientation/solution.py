@@ -35,6 +35,8 @@ _SIGMA_ANGLE_DEG = 0.2
 _SIGMA_POSITION_SHARE = 0.005
 # Beyond so many standard deviations, and so many degrees, a given position or attitude is wrong and not just inexact.
 _WRONG_SIGMAS, _WRONG_DEG = 5.0, 15.0
+# North is unknown.
+_UNKNOWN_NORTH_DEG = 180.0
 # A focal length that differs by more than this share is said.
 _FOCAL_SHARE = 0.02
 # Pictures of one place differ by less, in pixels of the stored images.
@@ -169,7 +171,7 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         cameras |= {k: old for k, old in before.cameras.items() if kept and _same_lens(model.cameras.get(k), old)}
     beside = {i for model in models if model.kind == "level" for i in model.rotations}
     own = bool(models) and found.keys() <= beside
-    convention = None if own else _convention(models, angles)
+    convention = None if own else _convention(models, angles, block.poses)
     outside = block.poses.keys() - found.keys()
     if own:
         poses = {}  # given positions are in another frame
@@ -208,9 +210,21 @@ def _same_lens(found: Camera | None, old: Camera) -> bool:
     return abs(focal_px(found) / focal_px(old) - 1.0) <= SAME_SHARE
 
 
-def _convention(models: Sequence[Model], angles: Mapping[str, Angles]) -> Recognised | None:
-    placed = [model.rotations for model in models if model.kind == "positions"]
-    return recognised(angles, {i: rotation for one in placed for i, rotation in one.items()})
+def _convention(models: Sequence[Model], angles: Mapping[str, Angles], given: Mapping[str, Pose]) -> Recognised | None:
+    """By the models that positions have placed."""
+    placed = [model for model in models if model.kind == "positions"]
+    north = [_north_sigma_deg(model, given) for model in placed]
+    rotations = {i: rotation for model in placed for i, rotation in model.rotations.items()}
+    return recognised(angles, rotations, max(north, default=0.0))
+
+
+def _north_sigma_deg(model: Model, given: Mapping[str, Pose]) -> float:
+    """Standard deviation of a model's turn about the vertical, from the given positions of its images."""
+    placed = [i for i in model.centers_m if i in given]
+    centers_m = np.array([model.centers_m[i][:2] for i in placed]).reshape(-1, 2)
+    spread_m = float(np.sqrt(((centers_m - centers_m.mean(axis=0)) ** 2).sum())) if placed else 0.0
+    sigma_m = float(np.median([given[i].sigma_position_m for i in placed])) if placed else 0.0
+    return float(np.rad2deg(sigma_m / spread_m)) if spread_m > 0.0 else _UNKNOWN_NORTH_DEG
 
 
 def _convention_remarks(convention: Recognised | None) -> list[str]:

@@ -37,6 +37,8 @@ from aeromatch_cli.workspace import fingerprint, read_json, write_text
 MAX_TABLE_ROWS = 2000
 MAX_FAILURE_ROWS = 300
 MAX_LISTED = 30
+# Of adjusted poses: the facts of the stage adjust, and their units.
+_SIGMAS = (("sigma_position_m", "m"), ("sigma_angle_deg", "degrees"))
 _STATE_RANK = {"rejected": 0, "not verifiable": 1, NOT_JUDGED: 2}
 
 
@@ -242,9 +244,9 @@ def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
         ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
     ]
-    if facts["sigma_position_m"] is not None:
-        sigmas = f"{facts['sigma_position_m']:.3g} m, {facts['sigma_angle_deg']:.2g}°"
-        found.append(("Standard deviations of the poses", f"{sigmas}, median"))
+    sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in _SIGMAS if facts[key] is not None]
+    if sigmas:
+        found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
     cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts["cameras"].items()}
     found.append(("Cameras after the adjustment", _camera_words(cameras)))
     control = facts["control"]
