@@ -70,6 +70,11 @@ class Workspace:
         return self.orientation / "adjusted.npz"
 
     @property
+    def dropped(self) -> Path:
+        """Verified matches that contradict the adjusted block."""
+        return self.orientation / "dropped.npz"
+
+    @property
     def first_pass(self) -> Workspace:
         """The first pass is a small workspace of its own."""
         return Workspace(self.orientation / "first_pass")

@@ -186,7 +186,7 @@ def test_broken_files(tmp_path: Path, text: str | bytes, expected: str) -> None:
 
 def test_missing_sources(tmp_path: Path) -> None:
     assert "did you mean 'baseline'?" in fault("baselin")
-    assert "neither a YAML file nor a preset" in fault(str(tmp_path))
+    assert f"--images {tmp_path}" in fault(str(tmp_path))
     assert "No such file" in fault(str(tmp_path / "none.yaml"))
 
 

@@ -53,7 +53,7 @@ app = typer.Typer(
     help="Verified, evenly spread tie points for aerial image blocks.",
     epilog=as_epilog(
         (
-            "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
+            "aeromatch run --images IMGS --workspace WORK",
             "aeromatch run --help",
         )
     ),

@@ -7,8 +7,12 @@ from typing import Annotated
 
 import typer
 
+# The preset of a command that names none.
+AUTO = "auto"
+
 Config = Annotated[
-    str, typer.Argument(metavar="CONFIG|PRESET", help="Preset (baseline, fusion, polar, oblique), or a YAML file.")
+    str,
+    typer.Argument(metavar="CONFIG|PRESET", help="Preset: auto, baseline, fusion, polar, oblique; or a YAML file."),
 ]
 Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Folder of images, searched recursively.")]
 Poses = Annotated[

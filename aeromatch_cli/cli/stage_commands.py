@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from aeromatch_cli.cli.options import (
+    AUTO,
     Cameras,
     Config,
     ControlFile,
@@ -40,6 +41,7 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     "run": (
         "Do everything, over all overlapping pairs: from the orientation to the report.",
         (
+            "aeromatch run --images IMGS",
             "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
             "aeromatch run fusion --images IMGS --poses poses.csv --crs EPSG:32633",
             "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=8000",
@@ -95,7 +97,7 @@ def stage_command(name: str) -> Callable[..., None]:
 
     def command(
         context: typer.Context,
-        config: Config,
+        config: Config = AUTO,
         images: Images = None,
         poses: Poses = None,
         cameras: Cameras = None,

@@ -96,6 +96,8 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     if not is_yaml and source in preset_names():
         text, origin, folder = read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
+    elif path.is_dir():
+        raise ConfigError(f"{source!r} is a folder: give a folder of images with --images, as in: --images {source}")
     elif is_yaml or path.is_file():
         text, origin, folder = read_text(path), str(path), path.absolute().parent
     else:

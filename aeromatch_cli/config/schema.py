@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Union
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.consistencies import CONSISTENCIES
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.strategies.extractors import EXTRACTORS
@@ -152,6 +153,9 @@ class Settings(_Section):
         min_length=1,  # without a filter no pair is ever verified
         description="Which matches are kept: a chain of filters; each gets what the previous one kept.",
     )
+    consistency: _choice(CONSISTENCIES) = Field(  # type: ignore[valid-type]
+        CONSISTENCIES["block"](), description="What is done about verified matches that contradict the adjusted block."
+    )
     export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
         (EXPORTERS["colmap"](),), description="Programs for which the result is written: a list."
     )
@@ -216,5 +220,6 @@ FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
     "match": MATCHERS,
     "cascade": STEPS,
     "filter": FILTERS,
+    "consistency": CONSISTENCIES,
     "export": EXPORTERS,
 }

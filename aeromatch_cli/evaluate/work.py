@@ -21,6 +21,7 @@ from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
+from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.workspace import Workspace, file_digest
 
@@ -140,13 +141,13 @@ def _judged(
 
 def _verified(workspace: Workspace) -> dict[tuple[str, str], VerifiedEntry]:
     """Verdicts of the pairs on the list: what an older list left behind does not count."""
-    found, rows = {}, dict[str, dict[str, VerifiedEntry]]()
+    found, rows, final = {}, dict[str, dict[str, VerifiedEntry]](), FinalEntries(workspace)
     for pair in read_pairs(workspace.pairs):
         if pair.image_id0 not in rows:
             rows[pair.image_id0] = read_verified_row(workspace.verified(pair.image_id0))
         entry = rows[pair.image_id0].get(pair.image_id1)
         if entry is not None:
-            found[pair.image_id0, pair.image_id1] = entry
+            found[pair.image_id0, pair.image_id1] = final(pair.image_id0, entry)
     return found
 
 

@@ -24,6 +24,7 @@ from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.figures import evenly_chosen
 from aeromatch_cli.report.rows import PairRow
+from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
 
@@ -76,7 +77,8 @@ def _preview(context: Context, row: PairRow) -> str:
     entry: VerifiedEntry | MatchEntry | None
     if row.state == "verified":
         path = workspace.verified(ids[0])
-        entry = judged = read_verified_row(path).get(ids[1])
+        judged = read_verified_row(path).get(ids[1])
+        entry = judged = FinalEntries(workspace)(ids[0], judged) if judged else None
         errors = judged.verdict.errors_px if judged else None
     else:
         path = workspace.matches(ids[0])

@@ -24,15 +24,27 @@ from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import match_points, verified_pairs
+from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.workspace import Workspace, read_json
 
 T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
 COVERAGE_CELLS = 16
 NOT_JUDGED = "not judged"
-_STAGE_ORDER = ("orient", "pairs", "enhance", "simulate", "extract", "match", "filter", "adjust", "export")
+_STAGE_ORDER = (
+    "orient",
+    "pairs",
+    "enhance",
+    "simulate",
+    "extract",
+    "match",
+    "filter",
+    "adjust",
+    "consistency",
+    "export",
+)
 
 
 @dataclass(frozen=True)
@@ -149,7 +161,7 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
     judged: dict[tuple[str, str], PairRow] = {}
     tied: Counter[str] = Counter()
     matches: Counter[str] = Counter()
-    for pair, entry in verified_pairs(context):
+    for pair, entry in final_pairs(context):
         row = judged[pair.image_id0, pair.image_id1] = _pair_row(context, pair, entry)
         if row.state == "verified":
             coverage.add(pair, entry)

@@ -85,6 +85,11 @@ def adjusted_block(context: Context) -> AdjustedBlock | None:
     return found if found.poses else None
 
 
+def current_fingerprint(context: Context) -> str:
+    """Of the adjustment of the present results."""
+    return _fingerprint(context, orient.groups(context))
+
+
 def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     given = {i: (pose.center_m, pose.sigma_position_m) for i, pose in context.given.poses.items()}
     block = context.block

@@ -12,9 +12,11 @@ from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import outdated_pairs, verified_pairs
+from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents
+
+_Verified = Callable[[Context], Judged]
 
 
 def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
@@ -30,8 +32,15 @@ def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
     return replace(context, pairs=tuple(pairs)), outdated
 
 
-def contents_of(context: Context, adjusted: AdjustedBlock | None = None) -> ExportContents:
-    """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time."""
+def contents_of(
+    context: Context,
+    adjusted: AdjustedBlock | None = None,
+    verified: _Verified = verified_pairs,
+) -> ExportContents:
+    """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time.
+
+    verified: where the verified matches come from.
+    """
 
     def keypoints_px(image_id: str) -> FloatArray:
         path = context.workspace.features(image_id)
@@ -39,8 +48,8 @@ def contents_of(context: Context, adjusted: AdjustedBlock | None = None) -> Expo
         return read_keypoints(path)[0] if path.exists() else np.zeros((0, 2), np.float32)
 
     if not context.settings.match.reads_pixels:
-        return _contents(context, keypoints_px, _pairs(context), adjusted)
-    matched = list(_matched(context))
+        return _contents(context, keypoints_px, _pairs(context, verified), adjusted)
+    matched = list(_matched(context, verified))
     tracks = tracks_of(matched, keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id]))
 
     def with_measured_px(image_id: str) -> FloatArray:
@@ -65,15 +74,15 @@ def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairCont
         yield PairContents(item.pair, tracks.raw[key], tracks.verified[key], verdict.model_kind, verdict.model)
 
 
-def _pairs(context: Context) -> Iterator[PairContents]:
-    for item in _matched(context):
+def _pairs(context: Context, verified: _Verified) -> Iterator[PairContents]:
+    for item in _matched(context, verified):
         verdict, kept = item.verified.verdict, item.verified.matches.indices
         yield PairContents(item.pair, item.raw.indices, kept, verdict.model_kind, verdict.model)
 
 
-def _matched(context: Context) -> Iterator[MatchedPair]:
+def _matched(context: Context, verified: _Verified) -> Iterator[MatchedPair]:
     row_id, row = "", dict[str, MatchEntry]()
-    for pair, entry in verified_pairs(context):
+    for pair, entry in verified(context):
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_match_row(context.workspace.matches(pair.image_id0))
         found = row.get(pair.image_id1)

@@ -9,6 +9,7 @@ from typing import Any
 
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.stages.adjust import adjusted_block
+from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint
@@ -42,6 +43,7 @@ def run(context: Context) -> StageReport:
         sorted(context.guessed_cameras),
         [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in context.pairs],
         None if adjusted is None else file_digest(context.workspace.adjusted),
+        file_digest(context.workspace.dropped) if context.workspace.dropped.is_file() else None,
     ]
     wanted = fingerprint(context.settings.export, contents)
     report.items, report.fingerprint = len(context.settings.export), wanted
@@ -79,7 +81,7 @@ def _complete(folders: list[Path], facts: Mapping[str, Any]) -> bool:
 
 
 def _run_task(task: ExportTask) -> dict[str, Any]:
-    contents = contents_of(task.context, adjusted_block(task.context))
+    contents = contents_of(task.context, adjusted_block(task.context), final_pairs)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
     files = [path.relative_to(task.folder).as_posix() for path in summary.files]
     return {"name": task.folder.name, **asdict(summary), "files": files}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +34,8 @@ from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_a
 
 # Keypoints (K, 2) of an image, stored pixels, and their colours (K, 3) where the extractor kept them.
 Side = tuple[FloatArray, NDArray[np.uint8] | None]
+# Pairs and their verdicts, in the order of pairs.csv.
+Judged = Iterator[tuple[Pair, VerifiedEntry]]
 # An image with fewer verified matches than this over all its pairs is called weakly tied.
 WEAK_MATCHES = 50
 
@@ -191,7 +193,7 @@ def outdated_pairs(context: Context) -> list[Pair]:
     return outdated
 
 
-def verified_pairs(context: Context) -> Iterator[tuple[Pair, VerifiedEntry]]:
+def verified_pairs(context: Context) -> Judged:
     """Judged pairs in the order of pairs.csv: stale rows of older pair lists cannot leak."""
     row_id, row = "", dict[str, VerifiedEntry]()
     for pair in context.pairs:
@@ -202,12 +204,17 @@ def verified_pairs(context: Context) -> Iterator[tuple[Pair, VerifiedEntry]]:
             yield pair, entry
 
 
-def summarise(context: Context, root: Mapping[str, str]) -> dict[str, Any]:
-    """States of the pairs, verified matches, connected components (root: see `components`) and weakly tied images."""
+def summarise(
+    context: Context, root: Mapping[str, str], verified: Callable[[Context], Judged] = verified_pairs
+) -> dict[str, Any]:
+    """States of the pairs, verified matches, connected components (root: see `components`) and weakly tied images.
+
+    verified: where the verified matches come from.
+    """
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()
     matches = 0
-    for pair, entry in verified_pairs(context):
+    for pair, entry in verified(context):
         states[entry.verdict.state] += 1
         if entry.verdict.state == "verified":
             count = len(entry.matches.indices)
@@ -223,8 +230,10 @@ def summarise(context: Context, root: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def components(context: Context) -> dict[str, str]:
-    """image_id -> the image that stands for all those that verified pairs connect with it."""
+def components(context: Context, verified: Callable[[Context], Judged] = verified_pairs) -> dict[str, str]:
+    """image_id -> the image that stands for all those that verified pairs connect with it. verified: as in
+    `summarise`.
+    """
     parent = {image.image_id: image.image_id for image in context.block.images}
 
     def root(image_id: str) -> str:
@@ -233,7 +242,7 @@ def components(context: Context) -> dict[str, str]:
             image_id = parent[image_id]
         return image_id
 
-    for pair, entry in verified_pairs(context):
+    for pair, entry in verified(context):
         if entry.verdict.state == "verified":
             roots = sorted((root(pair.image_id0), root(pair.image_id1)))
             parent[roots[1]] = roots[0]

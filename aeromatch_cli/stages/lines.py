@@ -13,11 +13,13 @@ from aeromatch_cli.stages.stage_report import StageReport
 def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
     """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
     counts = (
-        f"{stage.stage:<9} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
+        f"{stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
         f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
     )
     if stage.stage == "filter":
         return [counts, *_filter_lines(stage, names, part=part)]
+    if stage.stage == "consistency":
+        return [counts, *_consistency_lines(stage)]
     return [counts, *(_adjust_lines(stage, names) if stage.stage == "adjust" else _picture_lines(stage))]
 
 
@@ -115,6 +117,16 @@ def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     words += [f"not oriented: {names[image_id]}: {reason}" for image_id, reason in outside[:10]]
     words += [f"not oriented: {len(outside) - 10} more, listed in the report"] if len(outside) > 10 else []
     return [f"          {line}" for line in words]
+
+
+def _consistency_lines(stage: StageReport) -> list[str]:
+    """What was dropped."""
+    facts = stage.facts
+    if not facts["dropped_matches"]:
+        return []
+    pairs = f", and with them {facts['rejected_pairs']} pairs" if facts["rejected_pairs"] else ""
+    words = f"{facts['dropped_matches']} matches contradict the adjusted block{pairs}"
+    return [f"          {words}; {facts['verified_matches']} verified matches are left"]
 
 
 def _control_words(control: Mapping[str, Any] | None) -> list[str]:

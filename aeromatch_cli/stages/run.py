@@ -17,6 +17,7 @@ from aeromatch_cli.stages import (
     adjust,
     cascade,
     check,
+    consistency,
     enhance,
     export,
     extract,
@@ -49,7 +50,7 @@ SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
 # What a command rests on: everything before it in this chain.
-_CHAIN = ("orient", "pairs", "extract", "match", "filter", "adjust", "export", "report")
+_CHAIN = ("orient", "pairs", "extract", "match", "filter", "adjust", "consistency", "export", "report")
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,12 @@ def _attempt(
 
 
 def _one_stage(command: str, context: Context) -> list[StageReport]:
-    before = [adjust.run(replace(context, overwrite=False))] if command == "export" else []
-    return [*before, STAGES[command](context)]
+    if command == "adjust":
+        return [adjust.run(context), consistency.run(context)]
+    if command == "export":
+        kept = replace(context, overwrite=False)
+        return [adjust.run(kept), consistency.run(kept), export.run(context)]
+    return [STAGES[command](context)]
 
 
 def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
@@ -173,7 +178,7 @@ def _run_all(context: Context) -> list[StageReport]:
         if not reports[-1].facts["verified_matches"]:
             report.run(context)
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
-        reports += [adjust.run(context), export.run(context)]
+        reports += [adjust.run(context), consistency.run(context), export.run(context)]
         reports.append(_current_page(context) or report.run(context))
     return reports
 

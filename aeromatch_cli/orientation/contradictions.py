@@ -1,0 +1,208 @@
+"""Which verified matches contradict the adjusted block.
+
+Repeated patterns (facades, roof tiles, rows of plants) pass every test of two views when the repetition runs along the
+epipolar lines, or the geometry of the pair was itself estimated from such matches. The adjusted block knows better: it
+holds the pair's geometry from all images, and a point that two images see has its place in every third one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
+from aeromatch_cli.geometry.cameras import focal_px, world_rays
+
+# A match is not exact where its error exceeds the limit, and the pair's median error by this factor: an image that the
+# block holds less exactly than others has larger errors in all of its matches.
+_MEDIANS = 4.0
+# Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
+_LEAST_ANGLE_DEG = 0.5
+# Standard deviation of a keypoint, pixels: the place of a point along its ray is as uncertain as this makes it.
+_KEYPOINT_PX = 1.0
+_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest distance from the epipolar lines of the adjusted block, and from the place in a third image, pixels."""
+
+    epipolar_px: float
+    third_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedKeypoints:
+    """Verified matches of two images: keypoint indices (M, 2)."""
+
+    image_id0: str
+    image_id1: str
+    indices: IntArray
+
+
+def contradicting(
+    block: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    keypoints_px: Callable[[str], FloatArray],
+    pairs: Sequence[MatchedKeypoints],
+    limits: Limits,
+) -> list[BoolArray]:
+    """Of every pair, which matches (M,) contradict the block; none in pairs of images that it does not hold together.
+
+    cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
+    its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
+    images lie beside the place of its point there than lie on it. Groups of images that no point connects have a frame
+    each, less exact than matches: pairs between them are not judged.
+    """
+    group = _groups(block)
+    held = [p for p in pairs if p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1)]
+    view = _Rays.of(block, cameras, keypoints_px, sorted({i for p in held for i in (p.image_id0, p.image_id1)}))
+    ends = [view.keypoints_of(pair) for pair in held]
+    ties = _Ties.of(len(view.rays), ends)
+    found = {id(pair): _judged(view, ties, *end, limits) for pair, end in zip(held, ends, strict=True)}
+    return [found.get(id(pair), np.zeros(len(pair.indices), dtype=bool)) for pair in pairs]
+
+
+def _groups(block: AdjustedBlock) -> dict[str, int]:
+    """image_id -> number of its group: images that points connect."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    ids = sorted(block.poses)
+    tracks = [block.tracks.get(i, np.zeros((0, 2), np.int32))[:, 1] for i in ids]
+    rows = np.repeat(np.arange(len(ids)), [len(one) for one in tracks])
+    points = np.concatenate([np.zeros(0, np.int64), *tracks])
+    size = len(ids) + len(block.points_m)
+    graph = sparse.coo_matrix((np.ones(len(rows)), (rows, len(ids) + points)), shape=(size, size))
+    _, labels = connected_components(graph, directed=False)
+    return dict(zip(ids, labels[: len(ids)].tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """All keypoints of the block in one row. rays: (K, 3) in the world; image: (K,) rows of centers_m (N, 3) and
+    focal_px (N,). first: image_id -> its first keypoint."""
+
+    rays: FloatArray
+    image: IntArray
+    centers_m: FloatArray
+    focal_px: FloatArray
+    first: Mapping[str, int]
+
+    @classmethod
+    def of(
+        cls,
+        block: AdjustedBlock,
+        cameras: Mapping[str, Camera],
+        keypoints_px: Callable[[str], FloatArray],
+        image_ids: Sequence[str],
+    ) -> _Rays:
+        rays = [world_rays(cameras[i], block.poses[i].rotation, np.asarray(keypoints_px(i), float)) for i in image_ids]
+        counts = [len(one) for one in rays]
+        return cls(
+            rays=np.concatenate([np.zeros((0, 3)), *rays]),
+            image=np.repeat(np.arange(len(image_ids)), counts),
+            centers_m=np.array([block.poses[i].center_m for i in image_ids]).reshape(-1, 3),
+            focal_px=np.array([focal_px(cameras[i]) for i in image_ids]),
+            first=dict(zip(image_ids, np.cumsum([0, *counts]).tolist(), strict=False)),
+        )
+
+    def keypoints_of(self, pair: MatchedKeypoints) -> tuple[IntArray, IntArray]:
+        """(M,) keypoints of either image, as rows of the block."""
+        return (
+            pair.indices[:, 0].astype(np.int64) + self.first[pair.image_id0],
+            pair.indices[:, 1].astype(np.int64) + self.first[pair.image_id1],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Ties:
+    """Which keypoints each keypoint is matched with: those from start[k] to start[k + 1]."""
+
+    start: IntArray
+    others: IntArray
+
+    @classmethod
+    def of(cls, keypoints: int, ends: Sequence[tuple[IntArray, IntArray]]) -> _Ties:
+        here = np.concatenate([np.zeros(0, np.int64), *(end for both in ends for end in both)])
+        there = np.concatenate([np.zeros(0, np.int64), *(end for both in ends for end in both[::-1])])
+        order = np.argsort(here, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(here, minlength=keypoints))])
+        return cls(start, there[order])
+
+    def of_keypoints(self, keypoints: IntArray) -> tuple[IntArray, IntArray]:
+        """(T,) rows of the keypoints (M,) asked for, and the keypoints that these are matched with."""
+        counts = self.start[keypoints + 1] - self.start[keypoints]
+        rows = np.repeat(np.arange(len(keypoints)), counts)
+        within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return rows, self.others[self.start[keypoints][rows] + within]
+
+
+def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: Limits) -> BoolArray:
+    """Which matches (M,) of one pair contradict the block."""
+    if not len(ends0):
+        return np.zeros(0, dtype=bool)
+    image0, image1 = view.image[ends0[0]], view.image[ends1[0]]
+    between_m = view.centers_m[image1] - view.centers_m[image0]
+    rays0, rays1 = view.rays[ends0], view.rays[ends1]
+    error_px = _epipolar_px(between_m, rays0, rays1, view.focal_px[image0], view.focal_px[image1])
+    beside = error_px > max(limits.epipolar_px, _MEDIANS * float(np.median(error_px)))
+    depth_m, angle_rad = _depths(between_m, rays0, rays1)
+    meet = angle_rad > np.deg2rad(_LEAST_ANGLE_DEG)
+    behind = meet & (depth_m <= 0.0)
+    # Where the point may lie along its ray, by the error of a keypoint.
+    shift_m = depth_m * _KEYPOINT_PX / (view.focal_px[image1] * np.maximum(angle_rad, 1e-6))
+    points = view.centers_m[image0] + rays0 * depth_m[:, None]
+    shifted = points + rays0 * shift_m[:, None]
+    usable = meet & ~behind
+    balance = np.zeros(len(ends0), dtype=np.int64)
+    for ends, other in ((ends0, image1), (ends1, image0)):
+        rows, third = ties.of_keypoints(ends)
+        known = usable[rows] & (view.image[third] != other)
+        rows, third = rows[known], third[known]
+        away_px = _away_px(view, third, points[rows])
+        allowed_px = np.maximum(limits.third_px, _SIGMAS * _apart_px(view, third, points[rows], shifted[rows]))
+        np.add.at(balance, rows, np.where(away_px <= allowed_px, 1, -1))
+    return np.asarray(beside | behind | (balance < 0))
+
+
+def _epipolar_px(
+    between_m: FloatArray, rays0: FloatArray, rays1: FloatArray, focal0_px: float, focal1_px: float
+) -> FloatArray:
+    """(M,) distance of matched rays from coplanarity with the base, shared between both images (Sampson), pixels."""
+    normals0, normals1 = np.cross(between_m, rays0), np.cross(between_m, rays1)
+    across = (rays1 * normals0).sum(axis=1)
+    # Per pixel of either image the triple product changes by the length of the other's plane normal over f.
+    per_px = np.hypot(np.linalg.norm(normals0, axis=1) / focal1_px, np.linalg.norm(normals1, axis=1) / focal0_px)
+    return np.asarray(np.abs(across) / np.maximum(per_px, 1e-12))
+
+
+def _depths(between_m: FloatArray, rays0: FloatArray, rays1: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(M,) distance along rays0 to where the rays meet, negative behind either camera, and the angle between them."""
+    cosine = (rays0 * rays1).sum(axis=1)
+    sine2 = np.maximum(1.0 - cosine**2, 1e-18)
+    along0, along1 = rays0 @ between_m, rays1 @ between_m
+    depth0, depth1 = (along0 - cosine * along1) / sine2, (cosine * along0 - along1) / sine2
+    return np.where(depth1 > 0.0, depth0, -np.abs(depth0)), np.arcsin(np.minimum(np.sqrt(sine2), 1.0))
+
+
+def _away_px(view: _Rays, keypoints: IntArray, points_m: FloatArray) -> FloatArray:
+    """(T,) how far keypoints lie from where their images see the points, pixels near the image's middle."""
+    there = _towards(view, keypoints, points_m)
+    away = np.linalg.norm(np.cross(view.rays[keypoints], there), axis=1)
+    facing = (view.rays[keypoints] * there).sum(axis=1) > 0.0
+    return np.asarray(np.where(facing, away, np.inf) * view.focal_px[view.image[keypoints]])
+
+
+def _apart_px(view: _Rays, keypoints: IntArray, points_m: FloatArray, others_m: FloatArray) -> FloatArray:
+    """(T,) how far apart the images of the keypoints see two points, pixels."""
+    turned = np.cross(_towards(view, keypoints, points_m), _towards(view, keypoints, others_m))
+    return np.asarray(np.linalg.norm(turned, axis=1) * view.focal_px[view.image[keypoints]])
+
+
+def _towards(view: _Rays, keypoints: IntArray, points_m: FloatArray) -> FloatArray:
+    """(T, 3) unit vectors from the images of keypoints to points."""
+    ways = points_m - view.centers_m[view.image[keypoints]]
+    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12))

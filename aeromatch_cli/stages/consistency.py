@@ -1,0 +1,107 @@
+"""consistency: drops verified matches that contradict the adjusted block.
+
+The verified rows stay as they are; which of their matches are dropped is written to the workspace's orientation folder,
+for all who read final results.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
+from aeromatch_cli.formats.rows import VerifiedEntry
+from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages.contents import contents_of, with_current_pairs
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import Judged, select, verified_pairs
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.strategies.consistencies import BlockConsistency
+from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
+
+VERSION = 1
+
+
+def run(context: Context) -> StageReport:
+    """Write dropped.npz where it is not up to date."""
+    report = StageReport("consistency")
+    recipe = context.settings.consistency
+    adjusted = None
+    if isinstance(recipe, BlockConsistency) and not context.settings.match.reads_pixels:
+        context, _ = with_current_pairs(context)
+        adjusted = adjust.adjusted_block(context)
+    path = context.workspace.dropped
+    if adjusted is None or not isinstance(recipe, BlockConsistency):
+        report.facts = {"dropped_matches": 0, "rejected_pairs": 0}
+        with translated_os_errors(path):
+            path.unlink(missing_ok=True)
+        return report.write(context.workspace)
+    report.items = len(context.pairs)
+    report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context))
+    last = context.workspace.stage_report("consistency")
+    if not context.overwrite and path.is_file() and last.is_file():
+        before = read_json(last)
+        if before.get("fingerprint") == report.fingerprint:
+            report.skipped, report.facts = report.items, before["facts"]
+            return report.write(context.workspace)
+    with context.executor.step("consistency"):
+        cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
+        entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
+        pairs = [MatchedKeypoints(p.image_id0, p.image_id1, entry.matches.indices) for p, entry in entries]
+        limits = Limits(recipe.epipolar_px, recipe.third_image_px)
+        masks = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
+    dropped: Dropped = {
+        (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
+        for (pair, entry), mask in zip(entries, masks, strict=True)
+        if mask.any()
+    }
+    write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
+    report.facts = _facts(context)
+    report.done = report.items
+    return report.write(context.workspace)
+
+
+def _facts(context: Context) -> dict[str, Any]:
+    counts = [
+        (len(before.matches.indices), len(after.matches.indices), after.verdict.state == "verified")
+        for (_, before), (_, after) in zip(verified_pairs(context), final_pairs(context), strict=True)
+        if before.verdict.state == "verified"
+    ]
+    kept = sum(after for _, after, verified in counts if verified)
+    return {
+        "verified_matches": kept,
+        "dropped_matches": sum(before for before, _, _ in counts) - kept,
+        "rejected_pairs": sum(not verified for _, _, verified in counts),
+    }
+
+
+def final_pairs(context: Context) -> Judged:
+    """Judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block."""
+    final = FinalEntries(context.workspace)
+    for pair, entry in verified_pairs(context):
+        yield pair, final(pair.image_id0, entry)
+
+
+class FinalEntries:
+    """What is left of verified entries, by what a workspace has on file; all, where that is of other results."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._dropped, self._least = read_dropped(workspace.dropped)
+
+    def __call__(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
+        made_of, rows = self._dropped.get((image_id0, entry.image_id1), ("", None))
+        if rows is None or made_of != entry.fingerprint:
+            return entry
+        keep = np.ones(len(entry.matches.indices), dtype=bool)
+        keep[rows] = False
+        left, verdict = select(entry.matches, keep), entry.verdict
+        errors = None if verdict.errors_px is None else verdict.errors_px[keep]
+        rejected = {**verdict.rejected, "consistency": int((~keep).sum())}
+        verdict = replace(verdict, keep=np.ones(len(left.indices), dtype=bool), errors_px=errors, rejected=rejected)
+        if len(left.indices) < self._least:
+            words = f"contradicts the adjusted block: {len(left.indices)} of {len(keep)} matches agree with it"
+            verdict = replace(verdict, state="rejected", reason=words)
+        return replace(entry, matches=left, verdict=verdict)

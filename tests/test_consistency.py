@@ -1,0 +1,136 @@
+"""Matches that contradict the adjusted block: found in exact blocks, dropped from a workspace's results."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Site
+from test_control import adjusted_truth, cameras
+from test_export_colmap import Truth, make_truth
+
+from aeromatch_cli.data import AdjustedBlock, FloatArray, IntArray
+from aeromatch_cli.formats.dropped import read_dropped, write_dropped
+from aeromatch_cli.geometry.cameras import project, world_rays
+from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
+
+LIMITS = Limits(1.5, 4.0)
+WRONG = 12
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return make_truth()
+
+
+def matched(truth: Truth) -> list[MatchedKeypoints]:
+    return [MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified) for p in truth.pairs]
+
+
+def held_together(truth: Truth, groups: list[set[str]]) -> AdjustedBlock:
+    """The true block; the images of each group see one point together."""
+    block = adjusted_truth(truth)
+    tracks = {i: np.array([[0, row]], np.int32) for row, group in enumerate(groups) for i in group}
+    poses = {i: pose for i, pose in block.poses.items() if i in tracks}
+    return replace(
+        block, points_m=np.zeros((len(groups), 3)), errors_px=np.zeros(len(groups)), tracks=tracks, poses=poses
+    )
+
+
+def judged(truth: Truth, keypoints: dict[str, FloatArray], pairs: list[MatchedKeypoints]) -> list[FloatArray]:
+    return contradicting(
+        held_together(truth, [set(truth.block.poses)]), cameras(truth), keypoints.__getitem__, pairs, LIMITS
+    )
+
+
+def noisy(truth: Truth) -> dict[str, FloatArray]:
+    rng = np.random.default_rng(5)
+    return {i: k + rng.normal(0.0, 0.3, k.shape) for i, k in truth.keypoints_px.items()}
+
+
+def test_right_matches_agree_with_the_block(truth: Truth) -> None:
+    found = np.concatenate(judged(truth, noisy(truth), matched(truth)))
+    assert len(found) > 1000
+    assert found.mean() < 0.01
+
+
+def test_matches_beside_the_epipolar_line_are_found(truth: Truth) -> None:
+    pairs = matched(truth)
+    wrong = pairs[0].indices.copy()
+    wrong[:WRONG, 1] = np.roll(wrong[:WRONG, 1], 1)
+    found = judged(truth, noisy(truth), [replace(pairs[0], indices=wrong), *pairs[1:]])
+    assert found[0][:WRONG].sum() >= WRONG - 1
+    assert found[0][WRONG:].mean() < 0.05
+
+
+def along_the_line(truth: Truth, keypoints: dict[str, FloatArray], indices: IntArray) -> tuple[FloatArray, IntArray]:
+    """Keypoints of img1 with others where it would see the points of WRONG matches at 1.15 times their distance."""
+    pose0, pose1 = truth.block.poses["img0"], truth.block.poses["img1"]
+    rays = world_rays(cameras(truth)["img0"], pose0.world_rotation, keypoints["img0"][indices[:WRONG, 0]])
+    points = pose0.center_m + rays * (115.0 / -rays[:, 2:])
+    there = project(cameras(truth)["img1"], pose1.world_rotation, pose1.center_m, points)
+    more = np.concatenate([keypoints["img1"], there])
+    wrong = indices.copy()
+    wrong[:WRONG, 1] = len(keypoints["img1"]) + np.arange(WRONG)
+    return more, wrong
+
+
+def test_matches_along_the_epipolar_line_are_found_by_third_images(truth: Truth) -> None:
+    """A repeated pattern: nothing in the two images contradicts it."""
+    keypoints, pairs = noisy(truth), matched(truth)
+    assert (pairs[0].image_id0, pairs[0].image_id1) == ("img0", "img1")
+    keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices)
+    changed = [replace(pairs[0], indices=wrong), *pairs[1:]]
+    assert not judged(truth, keypoints, changed[:1])[0].any()
+    found = judged(truth, keypoints, changed)
+    tied = np.array([sum(k in p.indices[:, 0] for p in pairs[1:5]) > 0 for k in wrong[:WRONG, 0]])
+    assert tied.sum() >= WRONG - 3
+    assert found[0][:WRONG][tied].all()
+    assert np.concatenate([found[0][WRONG:], *found[1:]]).mean() < 0.02
+
+
+def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:
+    """img0 is not oriented, img5 by itself."""
+    held = held_together(truth, [{"img1", "img2", "img3", "img4"}, {"img5"}])
+    pairs = [replace(p, indices=np.roll(p.indices, 1, axis=0) * [1, 0]) for p in matched(truth)]
+    found = contradicting(held, cameras(truth), noisy(truth).__getitem__, pairs, LIMITS)
+    for pair, wrong in zip(pairs, found, strict=True):
+        assert wrong.shape == (len(pair.indices),)
+        together = {pair.image_id0, pair.image_id1} <= {"img1", "img2", "img3", "img4"}
+        assert wrong.any() is np.bool_(together)
+
+
+def test_what_is_dropped_is_read_again(tmp_path: Path) -> None:
+    path = tmp_path / "dropped.npz"
+    assert read_dropped(path) == ({}, 0)
+    dropped = {("a", "b"): ("x", np.array([1, 5], np.int32)), ("a", "c"): ("y", np.array([0], np.int32))}
+    with path.open("wb") as stream:
+        write_dropped(stream, dropped, 15)
+    found, least = read_dropped(path)
+    assert least == 15
+    assert {key: (made_of, rows.tolist()) for key, (made_of, rows) in found.items()} == {
+        ("a", "b"): ("x", [1, 5]),
+        ("a", "c"): ("y", [0]),
+    }
+
+
+@pytest.mark.slow
+def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site) -> None:
+    """A strict limit drops some matches; a change of it runs no stage before consistency again."""
+    outcome = done_site("run", "--set", "consistency.epipolar_px=0.3")
+    assert outcome.code == 0
+    stages = outcome.facts["stages"]
+    assert {stages[name]["done"] for name in ("extract", "match", "filter", "adjust")} == {0}
+    facts, before = stages["consistency"]["facts"], stages["filter"]["facts"]["verified_matches"]
+    assert 0 < facts["dropped_matches"] < before / 2
+    assert facts["verified_matches"] == before - facts["dropped_matches"]
+    assert stages["export"]["facts"]["colmap"]["verified_matches"] == facts["verified_matches"]
+    assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
+    assert f"{facts['verified_matches']:,}" in (done_site.work / "report" / "index.html").read_text()
+    none = done_site("run", "--set", "consistency=none")
+    assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before
+    assert not (done_site.work / "orientation" / "dropped.npz").exists()
+    assert json.loads((done_site.work / "reports" / "consistency.json").read_text())["facts"]["dropped_matches"] == 0
