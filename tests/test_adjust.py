@@ -129,6 +129,26 @@ def test_an_image_outside_is_tied_by_its_points(truth: Truth) -> None:
     assert off_deg[5] < 0.5
 
 
+def test_groups_that_matches_tie_become_one(truth: Truth) -> None:
+    """A first pass has put three images 40 m and 9 degrees beside the others; final matches tie them all."""
+    contents = disturbed(truth, 0)
+    turn = Rotation.from_rotvec([3.0, -2.0, 8.0], degrees=True).as_matrix()
+    poses = {
+        i: replace(pose, center_m=turn @ pose.center_m + [40.0, 0.0, 5.0], world_rotation=pose.world_rotation @ turn.T)
+        if i in ("img2", "img4", "img5")
+        else pose
+        for i, pose in contents.block.poses.items()
+    }
+    apart = replace(contents, block=replace(contents.block, poses=poses))
+    groups = [Group("positions", ("img0", "img1", "img3")), Group("level", ("img2", "img4", "img5"))]
+    observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
+    adjusted, figures = refine_block(apart, observed, groups, fixed=False)
+    assert [(one["kind"], one["images"]) for one in figures] == [("positions", 6)]
+    off_m, off_deg = errors(truth, adjusted)
+    assert np.abs(off_m).max() < 0.5
+    assert off_deg.max() < 0.5
+
+
 def test_every_group_ties_its_images_outside(truth: Truth) -> None:
     """Two flights in one folder: each group lacks its last image, and finds it."""
     again = make_truth("second")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -27,6 +27,7 @@ from aeromatch_cli.orientation.adjusting import (
     drop_weak_images,
     keep_images,
 )
+from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import quiet_pycolmap
 from aeromatch_cli.orientation.results import arrays, figures, image_numbers, sigmas_of, tracks_of
 
@@ -45,6 +46,7 @@ _FEWEST_INLIERS = 8
 # Elements of rotations that were written and read again.
 _SAME = 1e-6
 _NONE = np.zeros(0)
+_NOWHERE = np.full(3, np.nan)
 # Poses that are not exact yet: points of the first round may be so far off, and are filtered as usual from then on.
 _FIRST_ERROR_PX = 12.0
 
@@ -59,6 +61,8 @@ def refine(folder: Path) -> None:
     priors = {**np.load(folder / "priors.npz"), "level_deg": np.array(np.inf)}
     facts: list[dict[str, Any]] = []
     waiting = deque(task["groups"])
+    if len(waiting) > 1 and not task["fixed"]:
+        waiting = deque(_joined_groups(pycolmap, folder, task["groups"]))
     grouped = {number for group in task["groups"] for number in group["images"]}
     while waiting:
         group = waiting.popleft()
@@ -89,6 +93,41 @@ def refine(folder: Path) -> None:
         np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+
+
+def _joined_groups(pycolmap: ModuleType, folder: Path, groups: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Groups of which those that final matches tie are one; the poses on file are moved with them."""
+    parts = []
+    for group in sorted(groups, key=lambda one: (one["kind"] == "level", -len(one["images"]))):
+        model = _triangulated(pycolmap, _posed(pycolmap, folder, set(group["images"])), folder, rough=True)
+        parts.append(_part(group["kind"], model))
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        pairs = [pycolmap.pair_id_to_image_pair(k) for k in opened.read_two_view_geometries()[0]]
+        matches = {(a, b): opened.read_two_view_geometry(a, b).inlier_matches for a, b in pairs}
+    found = joined(parts, matches)
+    if len(found) < len(parts):
+        model = pycolmap.Reconstruction(folder / "sparse")
+        for part in found:
+            for number, rotation in part.rotations.items():
+                pose = np.column_stack([rotation, -rotation @ part.centers_m[number]])
+                image = model.images[number]
+                image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+        model.write(folder / "sparse")
+    return [{"kind": part.kind, "images": sorted(part.rotations)} for part in found]
+
+
+def _part(kind: str, model: Any) -> Part:
+    images = {number: model.images[number] for number in image_numbers(model)}
+    points_m = {
+        number: np.array([model.points3D[p.point3D_id].xyz if p.has_point3D() else _NOWHERE for p in image.points2D])
+        for number, image in images.items()
+    }
+    return Part(
+        kind,
+        {number: image.cam_from_world().rotation.matrix() for number, image in images.items()},
+        {number: image.projection_center() for number, image in images.items()},
+        {number: points.reshape(-1, 3) for number, points in points_m.items()},
+    )
 
 
 def _without_positions(priors: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
