@@ -2,7 +2,8 @@
 
 Every step is a small workspace of its own below WORK/steps, made by the stages extract, match and filter. A pair takes
 a further step where its verified matches are few for its overlap, or leave parts of the overlap empty. Whether it does
-depends on this pair alone, so that shards agree. `union` joins what the steps have found.
+depends on this pair, and of steps whose features cost much and matches little on others of its images: a shard leaves
+such pairs to the command that ends the work of all shards. `union` joins what the steps have found.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from aeromatch_cli.strategies.steps import LearnedFeatures, LiftedShadows, Step
 
 # The first step of every cascade.
 FIRST = "first"
+# Why a pair takes a step that it does not need.
+_BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
 _LEAST_MATCHES = 30
 
@@ -116,6 +119,9 @@ def _steps(context: Context) -> Iterator[StepContext]:
         found = evidence_of([step.context for step in steps], steps[-1].reasons)
         reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
         left = {key: reason for key, reason in reasons.items() if reason}
+        if recipe.cheap_to_match:
+            looked_at = {image_id for key in left for image_id in key}
+            left = {key: reason or _BOTH_KNOWN for key, reason in reasons.items() if reason or set(key) <= looked_at}
         own = settings.model_copy(update={"cascade": (), **_RECIPES[type(recipe)](recipe)})
         steps.append(_step(context, recipe.name, own, left))
         yield steps[-1]

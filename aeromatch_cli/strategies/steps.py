@@ -7,7 +7,7 @@ the matches of all steps of a pair are verified together.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -15,8 +15,12 @@ from aeromatch_cli.strategies import Strategy
 
 
 class Step(Strategy):
-    """What all steps have in common: which pairs take them."""
+    """What all steps have in common: which pairs take them.
 
+    cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
+    """
+
+    cheap_to_match: ClassVar[bool] = False
     below_matches: int = Field(
         600,
         ge=1,
@@ -38,6 +42,7 @@ class Step(Strategy):
 class LearnedFeatures(Step):
     """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search."""
 
+    cheap_to_match: ClassVar[bool] = True
     name: Literal["learned"] = "learned"
 
 
