@@ -15,6 +15,7 @@ from test_export_colmap import Truth, make_truth
 from aeromatch_cli.data import AdjustedBlock, FloatArray, IntArray
 from aeromatch_cli.formats.dropped import read_dropped, write_dropped
 from aeromatch_cli.geometry.cameras import project, world_rays
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 
 LIMITS = Limits(1.5, 4.0)
@@ -41,9 +42,10 @@ def held_together(truth: Truth, groups: list[set[str]]) -> AdjustedBlock:
 
 
 def judged(truth: Truth, keypoints: dict[str, FloatArray], pairs: list[MatchedKeypoints]) -> list[FloatArray]:
-    return contradicting(
-        held_together(truth, [set(truth.block.poses)]), cameras(truth), keypoints.__getitem__, pairs, LIMITS
-    )
+    block = held_together(truth, [set(truth.block.poses)])
+    masks, doubtful = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, LIMITS)
+    assert doubtful == []
+    return masks
 
 
 def noisy(truth: Truth) -> dict[str, FloatArray]:
@@ -95,12 +97,27 @@ def test_matches_along_the_epipolar_line_are_found_by_third_images(truth: Truth)
 def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:
     """img0 is not oriented, img5 by itself."""
     held = held_together(truth, [{"img1", "img2", "img3", "img4"}, {"img5"}])
-    pairs = [replace(p, indices=np.roll(p.indices, 1, axis=0) * [1, 0]) for p in matched(truth)]
-    found = contradicting(held, cameras(truth), noisy(truth).__getitem__, pairs, LIMITS)
+    pairs = []
+    for pair in matched(truth):
+        indices = pair.indices.copy()
+        indices[:WRONG, 1] = np.roll(indices[:WRONG, 1], 1)
+        pairs.append(replace(pair, indices=indices))
+    found, doubtful = contradicting(held, cameras(truth), noisy(truth).__getitem__, pairs, LIMITS)
+    assert doubtful == []
     for pair, wrong in zip(pairs, found, strict=True):
         assert wrong.shape == (len(pair.indices),)
         together = {pair.image_id0, pair.image_id1} <= {"img1", "img2", "img3", "img4"}
-        assert wrong.any() is np.bool_(together)
+        assert wrong.any() == together
+
+
+def test_an_image_in_a_wrong_place_is_named_and_its_matches_stay(truth: Truth) -> None:
+    block = held_together(truth, [set(truth.block.poses)])
+    turn = from_omega_phi_kappa(0.0, 0.0, 20.0)
+    poses = {**block.poses, "img2": replace(block.poses["img2"], rotation=block.poses["img2"].rotation @ turn)}
+    wrong = replace(block, poses=poses)
+    masks, doubtful = contradicting(wrong, cameras(truth), noisy(truth).__getitem__, matched(truth), LIMITS)
+    assert doubtful == ["img2"]
+    assert np.concatenate(masks).mean() < 0.01
 
 
 def test_what_is_dropped_is_read_again(tmp_path: Path) -> None:

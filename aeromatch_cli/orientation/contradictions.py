@@ -7,6 +7,7 @@ holds the pair's geometry from all images, and a point that two images see has i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,9 @@ from aeromatch_cli.geometry.cameras import focal_px, world_rays
 _MEDIANS = 4.0
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
+# An image with a larger share of contradicting matches is held in a wrong place: where facades repeat, a tenth of the
+# matches of an image in its right place contradict.
+_MANY = 0.3
 # Standard deviation of a keypoint, pixels: the place of a point along its ray is as uncertain as this makes it.
 _KEYPOINT_PX = 1.0
 _SIGMAS = 3.0
@@ -48,21 +52,57 @@ def contradicting(
     keypoints_px: Callable[[str], FloatArray],
     pairs: Sequence[MatchedKeypoints],
     limits: Limits,
-) -> list[BoolArray]:
+) -> tuple[list[BoolArray], list[str]]:
     """Of every pair, which matches (M,) contradict the block; none in pairs of images that it does not hold together.
+    And the images whose adjusted poses too many of their matches contradict: there the block is wrong, and nothing is said
+    of their matches.
 
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
     images lie beside the place of its point there than lie on it. Groups of images that no point connects have a frame
     each, less exact than matches: pairs between them are not judged.
     """
-    group = _groups(block)
+    group, doubtful = _groups(block), set[str]()
+    while True:
+        masks = _masks(block, cameras, keypoints_px, pairs, limits, group)
+        worse = _worst_held(pairs, masks)
+        if not worse:
+            return masks, sorted(doubtful)
+        doubtful |= worse
+        group = {image_id: number for image_id, number in group.items() if image_id not in worse}
+
+
+def _masks(
+    block: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    keypoints_px: Callable[[str], FloatArray],
+    pairs: Sequence[MatchedKeypoints],
+    limits: Limits,
+    group: Mapping[str, int],
+) -> list[BoolArray]:
+    """Of every pair, which matches contradict the block. group: of the images that are judged."""
     held = [p for p in pairs if p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1)]
     view = _Rays.of(block, cameras, keypoints_px, sorted({i for p in held for i in (p.image_id0, p.image_id1)}))
     ends = [view.keypoints_of(pair) for pair in held]
     ties = _Ties.of(len(view.rays), ends)
     found = {id(pair): _judged(view, ties, *end, limits) for pair, end in zip(held, ends, strict=True)}
     return [found.get(id(pair), np.zeros(len(pair.indices), dtype=bool)) for pair in pairs]
+
+
+def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray]) -> set[str]:
+    """Images too many of whose matches contradict the block, where none of those that they are paired with is worse."""
+    wrong, whole = Counter[str](), Counter[str]()
+    for pair, mask in zip(pairs, masks, strict=True):
+        for image_id in (pair.image_id0, pair.image_id1):
+            wrong[image_id] += int(mask.sum())
+            whole[image_id] += len(mask)
+    share = {image_id: wrong[image_id] / count for image_id, count in whole.items() if count}
+    bad = {image_id for image_id, value in share.items() if value > _MANY}
+    for pair in pairs:
+        ends = (pair.image_id0, pair.image_id1)
+        if set(ends) <= bad:
+            bad.discard(min(ends, key=lambda image_id: (share[image_id], image_id)))
+    return bad
 
 
 def _groups(block: AdjustedBlock) -> dict[str, int]:

@@ -88,7 +88,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         headline=_headline(images, pairs, facts, failures),
         notices=[
             *notices(images, pairs, facts, _facts(context, "orient")),
-            *adjustment_notices(images, _facts(context, "adjust")),
+            *adjustment_notices(images, _facts(context, "adjust"), _facts(context, "consistency").get("doubtful", ())),
             *(Notice("warn", "Note on the input", warning) for warning in input_facts.get("warnings", [])),
         ],
         max_listed=MAX_LISTED,
@@ -194,14 +194,22 @@ def notices(
     return found
 
 
-def adjustment_notices(images: Sequence[ImageRow], adjusted: Mapping[str, Any]) -> list[Notice]:
-    """Images that the bundle adjustment does not hold, and what else it found. adjusted: its facts."""
+def adjustment_notices(
+    images: Sequence[ImageRow], adjusted: Mapping[str, Any], doubtful: Sequence[str]
+) -> list[Notice]:
+    """Images that the bundle adjustment does not hold, and what else it found. adjusted: its facts. doubtful: images
+    whose adjusted poses their matches contradict.
+    """
     names = {row.image_id: row.name for row in images}
     found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
     outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
     if outside:
         text = "Their matches are exported, but they have no adjusted pose and see no point."
         found.insert(0, Notice("bad", _counted(len(outside), "image", "images") + " not oriented", text, outside))
+    if doubtful:
+        title = _counted(len(doubtful), "adjusted pose is doubtful", "adjusted poses are doubtful")
+        text = "Too many verified matches of these images contradict their adjusted poses."
+        found.insert(0, Notice("bad", title, text, tuple(names.get(i, i) for i in doubtful)))
     return found
 
 

@@ -35,7 +35,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None or not isinstance(recipe, BlockConsistency):
-        report.facts = {"dropped_matches": 0, "rejected_pairs": 0}
+        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "doubtful": []}
         with translated_os_errors(path):
             path.unlink(missing_ok=True)
         return report.write(context.workspace)
@@ -52,14 +52,14 @@ def run(context: Context) -> StageReport:
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
         pairs = [MatchedKeypoints(p.image_id0, p.image_id1, entry.matches.indices) for p, entry in entries]
         limits = Limits(recipe.epipolar_px, recipe.third_image_px)
-        masks = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
+        masks, doubtful = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
         for (pair, entry), mask in zip(entries, masks, strict=True)
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    report.facts = _facts(context)
+    report.facts = {**_facts(context), "doubtful": doubtful}
     report.done = report.items
     return report.write(context.workspace)
 

@@ -19,7 +19,7 @@ def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> 
     if stage.stage == "filter":
         return [counts, *_filter_lines(stage, names, part=part)]
     if stage.stage == "consistency":
-        return [counts, *_consistency_lines(stage)]
+        return [counts, *_consistency_lines(stage, names)]
     return [counts, *(_adjust_lines(stage, names) if stage.stage == "adjust" else _picture_lines(stage))]
 
 
@@ -119,14 +119,16 @@ def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     return [f"          {line}" for line in words]
 
 
-def _consistency_lines(stage: StageReport) -> list[str]:
-    """What was dropped."""
+def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
+    """What was dropped, and images that the adjusted block seems to hold in a wrong place."""
     facts = stage.facts
+    doubtful = _listed([names[i] for i in facts["doubtful"]])
+    lines = [f"          too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
     if not facts["dropped_matches"]:
-        return []
+        return lines
     pairs = f", and with them {facts['rejected_pairs']} pairs" if facts["rejected_pairs"] else ""
     words = f"{facts['dropped_matches']} matches contradict the adjusted block{pairs}"
-    return [f"          {words}; {facts['verified_matches']} verified matches are left"]
+    return [f"          {words}; {facts['verified_matches']} verified matches are left", *lines]
 
 
 def _control_words(control: Mapping[str, Any] | None) -> list[str]:
