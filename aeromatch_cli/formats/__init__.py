@@ -86,7 +86,8 @@ are not known; `camera`: camera_id.
 - `fingerprint`; `files`: SHA-256 of `adjusted.npz` and `orientation.csv`.
 - `facts`: `images`, `points`, `track_length` (images per point, mean), `reprojection_error_px` (mean),
   `sigma_position_m`, `sigma_angle_deg` (medians over the images), `groups` (the same figures of each), `outside`
-  (image_id -> why it is not oriented).
+  (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
+  `control` (errors at ground control points, or null).
 
 ### orientation/adjusted.npz
 
@@ -98,6 +99,16 @@ N images, P points, O observations, C cameras.
 - `track_images`, `track_keypoints`, `track_points` (O,) int32: row of `images`, keypoint of that image, row of
   `points_m`.
 - `cameras` (2, C) str: camera_id, and model, width and height; `params` (C,) str: as in `cameras.csv`.
+
+### orientation/dropped.npz
+
+Verified matches that contradict the adjusted block, of D pairs. Whoever reads results goes without them: `export`,
+`report` and `evaluate` do.
+
+- `images` (D, 2) str: image ids; `fingerprints` (D,) str: of the pair's entry in `verified/`, for which alone this
+  holds.
+- `counts` (D,) int64: matches dropped, `rows` (sum of counts,) int32: which rows of the pair's matches.
+- `least`: a pair that keeps fewer matches is rejected.
 
 ### orientation/first_pass/
 
@@ -180,6 +191,8 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
+- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `doubtful` (images
+  that the block seems to hold in a wrong place).
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).

@@ -54,8 +54,9 @@ def contradicting(
     limits: Limits,
 ) -> tuple[list[BoolArray], list[str]]:
     """Of every pair, which matches (M,) contradict the block; none in pairs of images that it does not hold together.
-    And the images whose adjusted poses too many of their matches contradict: there the block is wrong, and nothing is said
-    of their matches.
+
+    Also image ids: those whose adjusted poses too many of their matches contradict. There the block is wrong, and none
+    of their matches counts as contradicting.
 
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
