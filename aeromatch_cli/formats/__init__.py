@@ -56,7 +56,8 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   rest. `files`: SHA-256 of the other files.
 - `facts`: `method` (`given`: the given poses explain the matches; `pictures`: a mapper oriented the block),
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
-  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `wrong_attitudes`
+  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `by_one_pair`
+  (images placed by one pair and their position), `wrong_attitudes`
   (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
   (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
   and the one found, pixels, where they differ by more than 2 %), `stays` (whether wrong given poses were kept,

@@ -27,6 +27,7 @@ from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.resection import resected
 from aeromatch_cli.orientation.soundness import FEWEST_IMAGES
 from aeromatch_cli.orientation.strips import predicted
+from aeromatch_cli.orientation.tying import tied_by_pairs
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
 _MOST = 0.6
@@ -171,6 +172,12 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         cameras |= {k: old for k, old in before.cameras.items() if kept and _same_lens(model.cameras.get(k), old)}
     beside = {i for model in models if model.kind == "level" for i in model.rotations}
     own = bool(models) and found.keys() <= beside
+    # The mapper's own points are few: it leans on the longest tracks.
+    lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
+    placed = {i: pose for i, pose in found.items() if i not in beside}
+    tied = tied_by_pairs(evidence.pairs, placed, block.poses, lenses, evidence.thresholds_px)
+    found |= {i: pose for i, (pose, _) in tied.items() if i not in found}
+    groups = _groups_with(models, {i: anchor for i, (_, anchor) in tied.items()})
     convention = None if own else _convention(models, angles, block.poses)
     outside = block.poses.keys() - found.keys()
     if own:
@@ -183,8 +190,6 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         for image_id in outside - evidence.consistent():
             poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
     poses |= found
-    # The mapper's own points are few: it leans on the longest tracks.
-    lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
     terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
     wrong = _judged(block.poses, {i: pose for i, pose in found.items() if i not in beside}, convention, angles)
     facts = {
@@ -192,7 +197,8 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         "stays": False,
         "frame": "own" if own else "world",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],
-        "groups": [{"kind": model.kind, "images": sorted(model.rotations)} for model in models],
+        "groups": groups,
+        "by_one_pair": sorted(tied),
         "calibrated": sorted({k for model in models for k in model.cameras}),
         "points": points,
         **wrong,
@@ -201,6 +207,15 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
     }
     return Solution(cameras, poses, terrains, facts)
+
+
+def _groups_with(models: Sequence[Model], anchors: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Images of every model, and those tied to them. anchors: tied image -> the image that it was tied to, which may
+    be a tied one itself, earlier in order."""
+    groups = [(model.kind, set(model.rotations)) for model in models]
+    for image_id, anchor in anchors.items():
+        next(images for _, images in groups if anchor in images).add(image_id)
+    return [{"kind": kind, "images": sorted(images)} for kind, images in groups]
 
 
 def _same_lens(found: Camera | None, old: Camera) -> bool:

@@ -73,7 +73,9 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     else:
         sizes = [str(model["images"]) for model in facts["models"]] or ["none"]
         found = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
-        words = [f"from the pictures: {found} of {len(block.images)} images", *([explains] if attitudes else [])]
+        more = len(facts["by_one_pair"])
+        also = f", {more} more by their positions and a pair each" if more else ""
+        words = [f"from the pictures: {found} of {len(block.images)} images{also}", *([explains] if attitudes else [])]
         if facts["frame"] == "own" and given.crs != block.crs:
             words.append(f"in a local frame, not in {given.crs}")
     for camera_id, (before, found) in facts["focal_lengths"].items():

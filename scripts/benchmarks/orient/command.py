@@ -175,6 +175,8 @@ def main(arguments: Sequence[str]) -> None:
     options.add_output(parser)
     args = options.parse(parser, arguments, {"keypoints": 1000})
     rows = []
+    if args.data == Path() and any(":" not in block for block in args.blocks):
+        parser.error("blocks without a flight are folders: give --data DIR, or SCENE:FLIGHT to render")
     for row in rows_of(args):
         rows.append(row)
         print(json.dumps(row), file=sys.stderr, flush=True)
