@@ -32,6 +32,8 @@ from aeromatch_cli.strategies.steps import LearnedFeatures, LiftedShadows, Step
 
 # The first step of every cascade.
 FIRST = "first"
+# Pairs that overlap by less tie images that others tie better: fewer matches are enough, wherever they lie.
+_TYING_OVERLAP = 0.4
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
@@ -65,10 +67,10 @@ class Evidence:
     def falls_short_of(self, step: Step) -> str:
         """Why the pair takes the step, "" where it need not."""
         share = self.overlap if np.isfinite(self.overlap) else 1.0
-        least = max(_LEAST_MATCHES, round(step.below_matches * share))
+        least = max(_LEAST_MATCHES, round(step.below_matches * share * min(1.0, share / _TYING_OVERLAP)))
         if self.verified < least:
             return f"{self.verified} verified matches of {least} that the overlap promises"
-        if self.coverage < step.below_coverage:
+        if share >= _TYING_OVERLAP and self.coverage < step.below_coverage:
             return f"verified matches in {100 * self.coverage:.0f} % of the overlap"
         return ""
 

@@ -25,14 +25,14 @@ class Step(Strategy):
         600,
         ge=1,
         description="The step is taken by pairs with fewer verified matches than this times the share of the image "
-        "that overlaps. Larger: more pairs take it, more time.",
+        "that overlaps; fewer still are enough where that is less than 40 %. Larger: more pairs take it, more time.",
     )
     below_coverage: float = Field(
         0.7,
         ge=0.0,
         le=1.0,
-        description="And by pairs whose verified matches lie in less than this share of the cells of the overlap (8 x "
-        "8 in the image). Larger: more pairs take it, more time.",
+        description="And by pairs with an overlap of 40 % or more whose verified matches lie in less than this share "
+        "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
     )
     keypoints: int = Field(
         4000, ge=1, description="Largest number of descriptors per image of this step. Larger: more time and memory."

@@ -1,0 +1,64 @@
+"""Preset auto: what runs where none is named, and what an easy block is spared."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+
+import pytest
+from conftest import Site, invoke
+
+from aeromatch_cli.config import load
+
+# Small pictures have few matches: with so many a pair is an easy one.
+EASY = ("--set", "cascade.learned.below_matches=60", "--set", "cascade.learned.below_coverage=0")
+
+
+def test_commands_take_auto_where_no_preset_is_named(tmp_path) -> None:
+    outcome = invoke("check", "--images", tmp_path, "--workspace", tmp_path / "work")
+    assert outcome.code == 3
+    assert "no image" in outcome.stderr
+    settings = load("auto")
+    assert [step.name for step in settings.cascade] == ["learned"]
+    assert settings.match.guided
+
+
+def test_a_folder_in_the_place_of_a_preset_is_pointed_out(tmp_path) -> None:
+    outcome = invoke("run", tmp_path)
+    assert outcome.code == 2
+    assert f"--images {tmp_path}" in outcome.stderr
+
+
+# Where the processor multiplies bytes fast, distances between SIFT descriptors are computed by torch: not here.
+_RUN = """
+import sys
+from aeromatch_cli.cli import main
+from aeromatch_cli.strategies.matchers.descriptors import scan
+scan._has_integer_product = lambda: False
+try:
+    main()
+finally:
+    print("torch" in sys.modules)
+"""
+
+
+@pytest.mark.slow
+def test_an_easy_block_never_loads_torch(site: Site) -> None:
+    arguments = [str(argument) for argument in ("run", *site.options("--executor", "serial", *EASY))]
+    done = subprocess.run([sys.executable, "-c", _RUN, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "pairs settled: 100 % by first, 0 % by learned" in done.stdout
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+@pytest.mark.slow
+def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
+    outcome = invoke("run", *site.options("--json"))
+    assert outcome.code == 0
+    with (site.work / "steps.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    taken = [row for row in rows if row["steps"] == "first+learned"]
+    assert taken
+    assert all(row["reasons"].startswith("learned: ") for row in taken)
+    assert outcome.facts["stages"]["match"]["facts"]["settled_by"]["learned"] == len(taken)
