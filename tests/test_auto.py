@@ -61,4 +61,6 @@ def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
     taken = [row for row in rows if row["steps"] == "first+learned"]
     assert taken
     assert all(row["reasons"].startswith("learned: ") for row in taken)
+    page = (site.work / "report" / "index.html").read_text()
+    assert page.count(">first+learned</td>") == len(taken)
     assert outcome.facts["stages"]["match"]["facts"]["settled_by"]["learned"] == len(taken)

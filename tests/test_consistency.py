@@ -146,6 +146,7 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert facts["verified_matches"] == before - facts["dropped_matches"]
     assert stages["export"]["facts"]["colmap"]["verified_matches"] == facts["verified_matches"]
     assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
+    assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, points in facts["ties"].values())
     assert f"{facts['verified_matches']:,}" in (done_site.work / "report" / "index.html").read_text()
     none = done_site("run", "--set", "consistency=none")
     assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before

@@ -207,7 +207,10 @@ def test_page_shows_headline_tables_and_reasons(full):
     ac = row_with(page, "pair-table", "a.png", str(escape(NASTY)))
     assert ac[5:7] == ["12", "0"]
     assert ac[9:12] == ["rejected", "", "8 inliers of 12 matches"]
-    assert row_with(page, "image-table", "sub/d.png")[1:] == ["full", "", "", "100", "2", "0", "0", "0", "weakly tied."]
+    assert row_with(page, "image-table", "sub/d.png")[1:] == [
+        *("full", "", "", "100", "2", "0", "0", "0", "", ""),
+        "weakly tied.",
+    ]
     assert row_with(page, "stage-table", "extract")[3:7] == ["5", "4", "0", "1"]
     assert "name: poselib" in words  # the settings
 
@@ -290,6 +293,8 @@ def test_page_without_poses_features_or_verified_pairs(tmp_path):
         "1",
         "0",
         "0",
+        "",
+        "",
         "",
         "no features. weakly tied.",
     ]

@@ -111,6 +111,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         previews=previews(context, pairs),
         error_limits_px=ERROR_LIMITS_PX,
         pairs=_worst_pairs(pairs),
+        has_steps=any(row.steps for row in pairs),
         pair_count=len(pairs),
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),

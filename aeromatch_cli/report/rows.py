@@ -11,7 +11,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -49,7 +49,10 @@ _STAGE_ORDER = (
 
 @dataclass(frozen=True)
 class PairRow:
-    """One pair of pairs.csv and what became of it. NaN where unknown. chosen_by: the rule that proposed the pair."""
+    """One pair of pairs.csv and what became of it. NaN where unknown.
+
+    chosen_by: the rule that proposed the pair. steps, step_reasons: of a cascade, which steps the pair took, and why.
+    """
 
     image_id0: str
     image_id1: str
@@ -65,6 +68,8 @@ class PairRow:
     reason: str
     model_kind: str
     rejects: Mapping[str, int]
+    steps: str = ""
+    step_reasons: str = ""
 
     @property
     def share(self) -> float:
@@ -77,7 +82,8 @@ class ImageRow:
 
     pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match. views: virtual
     views that its features come from, None where none are on file. shadow: share of the picture that the enhancement
-    treated as shadow, None where it looks for none.
+    treated as shadow, None where it looks for none. ninths: how many of the image (3 x 3) hold a point of the adjusted
+    block, points_of_three: its points that three or more images see; None where it is not adjusted.
     """
 
     image_id: str
@@ -91,6 +97,8 @@ class ImageRow:
     coverage: float | None
     views: int | None = None
     shadow: float | None = None
+    ninths: int | None = None
+    points_of_three: int | None = None
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,12 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
             tied.update((pair.image_id0, pair.image_id1))
             matches.update({pair.image_id0: row.verified, pair.image_id1: row.verified})
     pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(context, p, None) for p in context.pairs]
+    steps = _steps(context)
+    for place, row in enumerate(pairs):
+        taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
+        pairs[place] = replace(row, steps=taken, step_reasons=reasons)
+    report = context.workspace.stage_report("consistency")
+    ties = read_json(report)["facts"].get("ties", {}) if report.is_file() else {}
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     images = []
     for image in context.block.images:
@@ -185,9 +199,19 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
                 coverage=coverage.share(image.image_id),
                 views=_fact(context.workspace.views(image.image_id), "views", len),
                 shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
+                ninths=ties.get(image.image_id, (None, None))[0],
+                points_of_three=ties.get(image.image_id, (None, None))[1],
             )
         )
     return pairs, images
+
+
+def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:
+    """Which steps every pair took, and why; nothing without a cascade."""
+    if not context.settings.cascade or not context.workspace.steps.is_file():
+        return {}
+    rows = read_csv(context.workspace.steps)
+    return {(row["image_id0"], row["image_id1"]): (row["steps"], row["reasons"]) for row in rows}
 
 
 def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
+from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.stages import adjust
@@ -22,7 +24,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
 
-VERSION = 1
+VERSION = 2
 
 
 def run(context: Context) -> StageReport:
@@ -35,7 +37,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None or not isinstance(recipe, BlockConsistency):
-        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "doubtful": []}
+        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "doubtful": [], "ties": {}}
         with translated_os_errors(path):
             path.unlink(missing_ok=True)
         return report.write(context.workspace)
@@ -59,7 +61,7 @@ def run(context: Context) -> StageReport:
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    report.facts = {**_facts(context), "doubtful": doubtful}
+    report.facts = {**_facts(context), "doubtful": doubtful, "ties": _ties(context, adjusted)}
     report.done = report.items
     return report.write(context.workspace)
 
@@ -76,6 +78,22 @@ def _facts(context: Context) -> dict[str, Any]:
         "dropped_matches": sum(before for before, _, _ in counts) - kept,
         "rejected_pairs": sum(not verified for _, _, verified in counts),
     }
+
+
+def _ties(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
+    """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, and its points that three or
+    more images see: a block adjustment wants both."""
+    seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
+    for track in adjusted.tracks.values():
+        seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
+    found = {}
+    for image_id, track in sorted(adjusted.tracks.items()):
+        image = context.image_by_id[image_id]
+        places = read_keypoints(context.workspace.features(image_id))[0][track[:, 0]]
+        cells = np.clip(np.floor((places + 0.5) * 3.0 / (image.width_px, image.height_px)), 0, 2).astype(int)
+        ninths = len(np.unique(cells[:, 0] + 3 * cells[:, 1]))
+        found[image_id] = [ninths, int((seen[track[:, 1]] > 2).sum())]
+    return found
 
 
 def final_pairs(context: Context) -> Judged:

@@ -126,6 +126,13 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     facts = stage.facts
     doubtful = _listed([names[i] for i in facts["doubtful"]])
     lines = [f"          too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
+    if facts["ties"]:
+        whole = sum(ninths == 9 for ninths, _ in facts["ties"].values())
+        many = sorted(points for _, points in facts["ties"].values())[len(facts["ties"]) // 2]
+        lines.append(
+            f"          points in all nine ninths of {whole} of {len(facts['ties'])} images; {many} points per image "
+            "are seen by three or more (median)"
+        )
     if not facts["dropped_matches"]:
         return lines
     pairs = f", and with them {facts['rejected_pairs']} pairs" if facts["rejected_pairs"] else ""

@@ -12,7 +12,7 @@ from typing import Any
 from aeromatch_cli.config import FAMILIES, Settings, load
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
-from aeromatch_cli.stages import adjust, orient
+from aeromatch_cli.stages import adjust, consistency, orient
 from aeromatch_cli.stages.versions import PIPELINE_VERSION
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
@@ -22,7 +22,11 @@ Versions = Mapping[str, Version]
 # command, commit, date, machine, trained_on, versions; null where unknown.
 Stamp = dict[str, Any]
 REPOSITORY = Path(__file__).parent.parent.parent
-_ORIENTATION: Versions = {"stage.orient": orient.VERSION, "stage.adjust": adjust.VERSION}
+_ORIENTATION: Versions = {
+    "stage.orient": orient.VERSION,
+    "stage.adjust": adjust.VERSION,
+    "stage.consistency": consistency.VERSION,
+}
 _DIGITS = 12  # of a SHA-256 that tell weights apart
 _SOME = ("sheffield", "caliterra", "brighton")
 _MOST = ("sheffield", "caliterra", "seneca", "brighton")
