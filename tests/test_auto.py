@@ -53,6 +53,13 @@ def test_an_easy_block_never_loads_torch(site: Site) -> None:
 
 
 @pytest.mark.slow
+def test_check_says_what_further_steps_may_take(site: Site) -> None:
+    outcome = invoke("check", *site.options("--json"))
+    assert outcome.facts["estimate"]["seconds_of_further_steps"] > 0.0
+    assert "further   learned: up to" in outcome.stdout
+
+
+@pytest.mark.slow
 def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
     outcome = invoke("run", *site.options("--json"))
     assert outcome.code == 0

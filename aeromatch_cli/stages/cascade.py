@@ -124,9 +124,19 @@ def _steps(context: Context) -> Iterator[StepContext]:
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
             left = {key: reason or _BOTH_KNOWN for key, reason in reasons.items() if reason or set(key) <= looked_at}
-        own = settings.model_copy(update={"cascade": (), **_RECIPES[type(recipe)](recipe)})
-        steps.append(_step(context, recipe.name, own, left))
+        steps.append(_step(context, recipe.name, _own(context, recipe), left))
         yield steps[-1]
+
+
+def further(context: Context) -> list[Context]:
+    """The steps after the first, each with all pairs."""
+    reasons = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
+    return [_step(context, recipe.name, _own(context, recipe), reasons).context for recipe in context.settings.cascade]
+
+
+def _own(context: Context, recipe: Step) -> Settings:
+    """The settings of a further step."""
+    return context.settings.model_copy(update={"cascade": (), **_RECIPES[type(recipe)](recipe)})
 
 
 def _step(context: Context, name: str, settings: Settings, reasons: Mapping[Key, str]) -> StepContext:

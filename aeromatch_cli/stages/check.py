@@ -12,7 +12,7 @@ from typing import Any
 
 from aeromatch_cli.data import Features, Image, Pair
 from aeromatch_cli.images.source import Source, read_source
-from aeromatch_cli.stages import extract, first_pass, simulate
+from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
@@ -133,6 +133,7 @@ def run(context: Context, reading_s: float, *, oriented: bool) -> Check:
     estimate = _estimate(context, largest_px, timed, _time_pairs(context, sampled, timed), reading_s)
     estimate["readable_images"] = len(images) - len(failures)
     estimate["seconds_to_orient"] = 0.0 if oriented else _orientation_s(context, sampled)
+    estimate["seconds_of_further_steps"] = _further_s(context, sampled)
     if estimate["seconds"] is not None:
         estimate["seconds"] = round(estimate["seconds"] + (estimate["seconds_to_orient"] or 0.0), 1)
     return Check(_lines(context, estimate, len(images)), estimate, failures)
@@ -146,17 +147,35 @@ def _orientation_s(context: Context, sampled: Sequence[Pair]) -> float | None:
         return None
     posed = sum(pose.world_rotation is not None for pose in block.poses.values()) == len(block.images)
     recipe = first_pass.look(recipe, block) if posed else recipe
-    first = replace(first_pass.prepared(context, recipe), pairs=(sampled[0],))
-    ids = sampled[0].image_id0, sampled[0].image_id1
-    trials = [_Trial(extract.task_of(first, image_id), sample=True) for image_id in ids]
+    costs = _costs(first_pass.prepared(context, recipe), sampled[0])
+    if costs is None:
+        return None
+    every_s = len(block.images) * costs[0] + first_pass.count_pairs(context, recipe) * costs[1]
+    return round(every_s / context.executor.jobs + (0.0 if posed else _MAPPING_S * len(block.images)), 1)
+
+
+def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
+    """Seconds that the further steps of a cascade take where every pair needs them; None where that is unknown."""
+    every_s = 0.0
+    for step in cascade.further(context):
+        costs = _costs(step, sampled[0]) if sampled else None
+        if costs is None:
+            return None
+        every_s += len(context.block.images) * costs[0] + len(context.pairs) * costs[1]
+    return round(every_s / context.executor.jobs, 1)
+
+
+def _costs(context: Context, pair: Pair) -> tuple[float, float] | None:
+    """Seconds of an image and of a pair, by a trial of one; None where its images cannot be read."""
+    ids = pair.image_id0, pair.image_id1
+    one = replace(context, pairs=(pair,))
+    trials = [_Trial(extract.task_of(one, image_id), sample=True) for image_id in ids]
     outcomes = context.executor.run(_try_image, trials, "check")
     timed = {i: outcome.value for i, outcome in zip(ids, outcomes, strict=True) if outcome.value is not None}
     if len(timed) < len(ids):
         return None
-    pair_s = _mean([tried.seconds for tried in _time_pairs(first, first.pairs, timed)])
-    image_s = _mean([tried.seconds for tried in timed.values()])
-    every_s = len(block.images) * image_s + first_pass.count_pairs(context, recipe) * pair_s
-    return round(every_s / context.executor.jobs + (0.0 if posed else _MAPPING_S * len(block.images)), 1)
+    tried = _time_pairs(one, one.pairs, timed)
+    return _mean([one.seconds for one in timed.values()]), _mean([one.seconds for one in tried])
 
 
 def _sample(context: Context) -> list[Pair]:
@@ -236,6 +255,7 @@ def _existing(path: Path) -> Path:
 def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str, ...]:
     seconds = estimate["seconds"]
     duration = "unknown (the sample could not be read)" if seconds is None else f"about {_duration(seconds)}"
+    further_s, names = estimate["seconds_of_further_steps"], " and ".join(s.name for s in context.settings.cascade)
     orient_s = estimate["seconds_to_orient"] or 0.0
     orienting = f"orient    about {_duration(orient_s)} of that; pairs above are those of the poses as they are given"
     return (
@@ -243,6 +263,7 @@ def _lines(context: Context, estimate: dict[str, Any], images: int) -> tuple[str
         f"pairs     {estimate['pairs']}",
         f"time      {duration} with {context.executor.jobs} jobs",
         *([orienting] if seconds is not None and orient_s else []),
+        *([f"further   {names}: up to {_duration(further_s)} more, where all pairs need it"] if further_s else []),
         f"memory    about {estimate['memory_mb']} MB with {context.executor.jobs} jobs",
         f"disk      about {estimate['disk_mb']} MB needed, {estimate['disk_free_mb']} MB free",
     )
