@@ -24,6 +24,14 @@ def test_commands_take_auto_where_no_preset_is_named(tmp_path) -> None:
     assert settings.match.guided
 
 
+@pytest.mark.slow
+def test_a_single_stage_follows_the_workspace_where_no_preset_is_named(done_site: Site) -> None:
+    """The site's own settings, baseline with few keypoints: nothing is made again by another recipe."""
+    outcome = invoke("extract", "--workspace", done_site.work, "--json")
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["extract"]["done"] == 0
+
+
 def test_a_folder_in_the_place_of_a_preset_is_pointed_out(tmp_path) -> None:
     outcome = invoke("run", tmp_path)
     assert outcome.code == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from test_export_colmap import Truth, make_truth
 from aeromatch_cli.data import AdjustedBlock, FloatArray, IntArray
 from aeromatch_cli.formats.dropped import read_dropped, write_dropped
 from aeromatch_cli.geometry.cameras import project, world_rays
+from aeromatch_cli.geometry.epipolar import triangulate
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 
-LIMITS = Limits(1.5, 4.0)
+LIMITS = Limits(epipolar_px=1.5, alone_px=1.5, medians=4.0, third_px=4.0, confirm_px=0.0)
 WRONG = 12
 
 
@@ -68,11 +70,17 @@ def test_matches_beside_the_epipolar_line_are_found(truth: Truth) -> None:
     assert found[0][WRONG:].mean() < 0.05
 
 
-def along_the_line(truth: Truth, keypoints: dict[str, FloatArray], indices: IntArray) -> tuple[FloatArray, IntArray]:
-    """Keypoints of img1 with others where it would see the points of WRONG matches at 1.15 times their distance."""
+def along_the_line(
+    truth: Truth, keypoints: dict[str, FloatArray], indices: IntArray, away: float = 1.15
+) -> tuple[FloatArray, IntArray]:
+    """Keypoints of img1 with others where it would see the points of WRONG matches at `away` times their distance."""
     pose0, pose1 = truth.block.poses["img0"], truth.block.poses["img1"]
-    rays = world_rays(cameras(truth)["img0"], pose0.world_rotation, keypoints["img0"][indices[:WRONG, 0]])
-    points = pose0.center_m + rays * (115.0 / -rays[:, 2:])
+    rays = [
+        world_rays(cameras(truth)[i], truth.block.poses[i].world_rotation, keypoints[i][indices[:WRONG, side]])
+        for side, i in enumerate(("img0", "img1"))
+    ]
+    points = triangulate(pose0.center_m, rays[0], pose1.center_m, rays[1])
+    points = pose0.center_m + away * (points - pose0.center_m)
     there = project(cameras(truth)["img1"], pose1.world_rotation, pose1.center_m, points)
     more = np.concatenate([keypoints["img1"], there])
     wrong = indices.copy()
@@ -92,6 +100,22 @@ def test_matches_along_the_epipolar_line_are_found_by_third_images(truth: Truth)
     assert tied.sum() >= WRONG - 3
     assert found[0][:WRONG][tied].all()
     assert np.concatenate([found[0][WRONG:], *found[1:]]).mean() < 0.02
+
+
+def test_third_images_must_confirm_where_that_is_asked(truth: Truth) -> None:
+    """Keypoints of img1 some 5 px along their epipolar lines: near enough for third images not to speak against
+    them, too far to confirm them."""
+    keypoints, pairs = noisy(truth), matched(truth)
+    keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices, 1.02)
+    changed = [replace(pairs[0], indices=wrong), *pairs[1:]]
+    strict = replace(LIMITS, third_px=12.0, confirm_px=1.0)
+    block = held_together(truth, [set(truth.block.poses)])
+    for limits, least in ((replace(LIMITS, third_px=12.0), 0.0), (strict, 0.5)):
+        found, _ = contradicting(block, cameras(truth), keypoints.__getitem__, changed, limits)
+        share = found[0][:WRONG].mean()
+        assert share >= least
+        assert least > 0.0 or share < 0.1
+        assert np.concatenate([found[0][WRONG:], *found[1:]]).mean() < 0.05
 
 
 def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:
@@ -148,6 +172,14 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
     assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, points in facts["ties"].values())
     assert f"{facts['verified_matches']:,}" in (done_site.work / "report" / "index.html").read_text()
+    refused = done_site("run", "--set", "consistency.epipolar_px=0.3", "--set", "consistency.min_matches=100000")
+    facts = refused.facts["stages"]["consistency"]["facts"]
+    exported = refused.facts["stages"]["export"]["facts"]["colmap"]
+    assert facts["rejected_pairs"] > 0
+    assert facts["verified_matches"] == exported["verified_matches"]
+    with sqlite3.connect(done_site.work / "export" / "colmap" / "database.db") as database:
+        (rows,) = database.execute("SELECT COALESCE(SUM(rows), 0) FROM two_view_geometries").fetchone()
+    assert rows == facts["verified_matches"]
     none = done_site("run", "--set", "consistency=none")
     assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before
     assert not (done_site.work / "orientation" / "dropped.npz").exists()

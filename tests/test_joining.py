@@ -58,6 +58,16 @@ def test_parts_that_share_no_place_stay_apart() -> None:
     assert len(joined([first, given], MATCHES)) == 2
 
 
+def test_a_small_part_that_ties_two_others_ties_them_all() -> None:
+    """The largest part and the second share nothing; the third shares points with both."""
+    parts = [part("positions", 1, places()), part("positions", 3, places(1)), part("level", 5, places())]
+    bridge = np.concatenate([places()[:100], places(1)[:100]])
+    parts[2] = elsewhere(part("level", 5, bridge))
+    matches = {(1, 5): MATCHES[2, 3][:100], (3, 6): MATCHES[2, 3][100:] - [100, 0]}
+    (found,) = joined(parts, matches)
+    assert sorted(found.rotations) == [1, 2, 3, 4, 5, 6]
+
+
 def test_keypoints_without_a_point_do_not_count() -> None:
     points = places()
     points[40:] = np.nan

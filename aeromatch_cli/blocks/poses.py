@@ -133,7 +133,7 @@ def read_poses(path: Path) -> PoseList:
 def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], list[str]]:
     """Rows whose latitudes are such, and a remark where the list has them exchanged with the longitudes.
 
-    Raises ConfigError where only some are beyond 90 degrees.
+    Raises ConfigError where only some, or fewer than three, are beyond 90 degrees, and where both columns are.
     """
     if not rows or rows[0].position_kind != "geographic":
         return rows, []

@@ -11,8 +11,12 @@ import typer
 AUTO = "auto"
 
 Config = Annotated[
-    str,
-    typer.Argument(metavar="CONFIG|PRESET", help="Preset: auto, baseline, fusion, polar, oblique; or a YAML file."),
+    str | None,
+    typer.Argument(
+        metavar="CONFIG|PRESET",
+        help="Preset (auto, baseline, fusion, polar, oblique), or a YAML file. Default: auto; for a single stage the "
+        "settings that the workspace has.",
+    ),
 ]
 Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Folder of images, searched recursively.")]
 Poses = Annotated[

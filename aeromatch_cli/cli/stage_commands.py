@@ -36,6 +36,8 @@ from aeromatch_cli.cli.progress import progress_shown
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
 
+# Commands that start anew where no preset is named.
+_WHOLE = ("run", "check")
 # Name: what the command does, and examples.
 STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     "run": (
@@ -97,7 +99,7 @@ def stage_command(name: str) -> Callable[..., None]:
 
     def command(
         context: typer.Context,
-        config: Config = AUTO,
+        config: Config = None,
         images: Images = None,
         poses: Poses = None,
         cameras: Cameras = None,
@@ -125,13 +127,27 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.config import load
             from aeromatch_cli.stages.run import execute
 
-            settings = load(config, set_ or (), as_texts(block), run=as_texts(run), workspace=_absolute(workspace))
+            settings = load(
+                _recipe(config, name, workspace),
+                set_ or (),
+                as_texts(block),
+                run=as_texts(run),
+                workspace=_absolute(workspace),
+            )
             shown = progress_shown(quiet)
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=said(quiet))
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)
 
     return command
+
+
+def _recipe(config: str | None, command: str, workspace: Path | None) -> str:
+    """What a command follows that names no preset: the workspace's own settings for single stages, else `auto`."""
+    if config is not None:
+        return config
+    own = Path("aeromatch-work" if workspace is None else workspace) / "config.yaml"
+    return str(own) if command not in _WHOLE and own.is_file() else AUTO
 
 
 def _absolute(path: Path | None) -> str | None:

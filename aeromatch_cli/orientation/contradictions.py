@@ -16,25 +16,33 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
 
-# A match is not exact where its error exceeds the limit, and the pair's median error by this factor: an image that the
-# block holds less exactly than others has larger errors in all of its matches.
-_MEDIANS = 4.0
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
 # An image with a larger share of contradicting matches is held in a wrong place: where facades repeat, a tenth of the
 # matches of an image in its right place contradict.
 _MANY = 0.3
+# Images in wrong places are taken out in so many rounds at most.
+_MOST_ROUNDS = 10
 # Standard deviation of a keypoint, pixels: the place of a point along its ray is as uncertain as this makes it.
 _KEYPOINT_PX = 1.0
-_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Largest distance from the epipolar lines of the adjusted block, and from the place in a third image, pixels."""
+    """When a match contradicts the block, in pixels.
+
+    epipolar_px: distance from its epipolar line; alone_px: the same where no third image knows its keypoints. medians:
+    in a pair whose median distance times this is larger, that counts: an image that the block holds less exactly than
+    others has larger distances in all of its matches. third_px: distance of a third image's keypoint from the place of
+    the point there. confirm_px: nearer than this one of them must be, where there are any; 0 for never. Where the rays
+    leave the point's place in a third image open by more than a pixel, both grow with that.
+    """
 
     epipolar_px: float
+    alone_px: float
+    medians: float
     third_px: float
+    confirm_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,50 +68,50 @@ def contradicting(
 
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
-    images lie beside the place of its point there than lie on it. Groups of images that no point connects have a frame
-    each, less exact than matches: pairs between them are not judged.
+    images lie beside the place of its point there than lie on it; see also `Limits`. Groups of images that no point
+    connects have a frame each, less exact than matches: pairs between them are not judged.
     """
     group, doubtful = _groups(block), set[str]()
-    while True:
-        masks = _masks(block, cameras, keypoints_px, pairs, limits, group)
+    view = _Rays.of(block, cameras, keypoints_px, sorted(group.keys() & _images(pairs)))
+    masks: list[BoolArray | None] = []
+    for _ in range(_MOST_ROUNDS):
+        masks = _masks(view, pairs, limits, group)
         worse = _worst_held(pairs, masks)
         if not worse:
-            return masks, sorted(doubtful)
+            break
         doubtful |= worse
         group = {image_id: number for image_id, number in group.items() if image_id not in worse}
+    else:  # so many images in wrong places: the block itself is no judge
+        masks = [None] * len(pairs)
+    none = [np.zeros(len(pair.indices), dtype=bool) for pair in pairs]
+    return [nothing if mask is None else mask for mask, nothing in zip(masks, none, strict=True)], sorted(doubtful)
+
+
+def _images(pairs: Sequence[MatchedKeypoints]) -> set[str]:
+    return {image_id for pair in pairs for image_id in (pair.image_id0, pair.image_id1)}
 
 
 def _masks(
-    block: AdjustedBlock,
-    cameras: Mapping[str, Camera],
-    keypoints_px: Callable[[str], FloatArray],
-    pairs: Sequence[MatchedKeypoints],
-    limits: Limits,
-    group: Mapping[str, int],
-) -> list[BoolArray]:
-    """Of every pair, which matches contradict the block. group: of the images that are judged."""
-    held = [p for p in pairs if p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1)]
-    view = _Rays.of(block, cameras, keypoints_px, sorted({i for p in held for i in (p.image_id0, p.image_id1)}))
-    ends = [view.keypoints_of(pair) for pair in held]
-    ties = _Ties.of(len(view.rays), ends)
-    found = {id(pair): _judged(view, ties, *end, limits) for pair, end in zip(held, ends, strict=True)}
-    return [found.get(id(pair), np.zeros(len(pair.indices), dtype=bool)) for pair in pairs]
+    view: _Rays, pairs: Sequence[MatchedKeypoints], limits: Limits, group: Mapping[str, int]
+) -> list[BoolArray | None]:
+    """Of every pair, which matches contradict the block; None where it is not judged. group: of the images that are."""
+    held = [p.image_id0 in group and group[p.image_id0] == group.get(p.image_id1) for p in pairs]
+    ends = [view.keypoints_of(pair) if judged else None for pair, judged in zip(pairs, held, strict=True)]
+    ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
+    return [None if both is None else _judged(view, ties, *both, limits) for both in ends]
 
 
-def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray]) -> set[str]:
+def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | None]) -> set[str]:
     """Images too many of whose matches contradict the block, where none of those that they are paired with is worse."""
     wrong, whole = Counter[str](), Counter[str]()
     for pair, mask in zip(pairs, masks, strict=True):
         for image_id in (pair.image_id0, pair.image_id1):
-            wrong[image_id] += int(mask.sum())
-            whole[image_id] += len(mask)
+            wrong[image_id] += 0 if mask is None else int(mask.sum())
+            whole[image_id] += 0 if mask is None else len(mask)
     share = {image_id: wrong[image_id] / count for image_id, count in whole.items() if count}
     bad = {image_id for image_id, value in share.items() if value > _MANY}
-    for pair in pairs:
-        ends = (pair.image_id0, pair.image_id1)
-        if set(ends) <= bad:
-            bad.discard(min(ends, key=lambda image_id: (share[image_id], image_id)))
-    return bad
+    both = [(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= bad]
+    return bad - {min(ends, key=lambda image_id: (share[image_id], image_id)) for ends in both}
 
 
 def _groups(block: AdjustedBlock) -> dict[str, int]:
@@ -189,7 +197,6 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
     between_m = view.centers_m[image1] - view.centers_m[image0]
     rays0, rays1 = view.rays[ends0], view.rays[ends1]
     error_px = _epipolar_px(between_m, rays0, rays1, view.focal_px[image0], view.focal_px[image1])
-    beside = error_px > max(limits.epipolar_px, _MEDIANS * float(np.median(error_px)))
     depth_m, angle_rad = _depths(between_m, rays0, rays1)
     meet = angle_rad > np.deg2rad(_LEAST_ANGLE_DEG)
     behind = meet & (depth_m <= 0.0)
@@ -198,15 +205,20 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
     points = view.centers_m[image0] + rays0 * depth_m[:, None]
     shifted = points + rays0 * shift_m[:, None]
     usable = meet & ~behind
-    balance = np.zeros(len(ends0), dtype=np.int64)
+    asked, near, on = (np.zeros(len(ends0), dtype=np.int64) for _ in range(3))
     for ends, other in ((ends0, image1), (ends1, image0)):
         rows, third = ties.of_keypoints(ends)
         known = usable[rows] & (view.image[third] != other)
         rows, third = rows[known], third[known]
-        away_px = _away_px(view, third, points[rows])
-        allowed_px = np.maximum(limits.third_px, _SIGMAS * _apart_px(view, third, points[rows], shifted[rows]))
-        np.add.at(balance, rows, np.where(away_px <= allowed_px, 1, -1))
-    return np.asarray(beside | behind | (balance < 0))
+        open_px = np.maximum(_apart_px(view, third, points[rows], shifted[rows]), 1.0)
+        away = _away_px(view, third, points[rows]) / open_px
+        np.add.at(asked, rows, 1)
+        np.add.at(near, rows, away <= limits.third_px)
+        np.add.at(on, rows, away <= limits.confirm_px)
+    least_px = limits.medians * float(np.median(error_px))
+    beside = error_px > np.maximum(np.where(asked > 0, limits.epipolar_px, limits.alone_px), least_px)
+    unconfirmed = (asked > 0) & (on == 0) if limits.confirm_px > 0.0 else np.zeros(len(ends0), dtype=bool)
+    return np.asarray(beside | behind | (2 * near < asked) | unconfirmed)
 
 
 def _epipolar_px(

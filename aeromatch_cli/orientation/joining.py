@@ -58,6 +58,13 @@ def joined(parts: Sequence[Part], matches: Mapping[tuple[int, int], IntArray]) -
 
     parts: those placed by positions before others, the largest first. matches: verified ones (M, 2) by image numbers.
     """
+    found = list(parts)
+    while len(again := _joined_once(found, matches)) < len(found):  # a part may tie two that came before it
+        found = again
+    return again
+
+
+def _joined_once(parts: Sequence[Part], matches: Mapping[tuple[int, int], IntArray]) -> list[Part]:
     found: list[Part] = []
     for part in parts:
         for row, target in enumerate(found):

@@ -82,7 +82,8 @@ def refine_block(
     """The block adjusted from its poses and verified pairs, and figures of every group.
 
     A given rotation is an observation in groups of kind "given", where the block still has it. groups: the largest
-    first; images of none are tied to the first of which they share enough points. fixed: poses and cameras stay,
+    first; those that matches tie become one, and images of none are tied to the first of which they share enough
+    points. fixed: poses and cameras stay,
     points are triangulated all the same. Raises InputError where pycolmap stops.
     """
     block = contents.block

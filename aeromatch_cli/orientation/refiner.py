@@ -113,6 +113,7 @@ def _joined_groups(pycolmap: ModuleType, folder: Path, groups: Sequence[dict[str
                 image = model.images[number]
                 image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
         model.write(folder / "sparse")
+    found.sort(key=lambda part: -len(part.rotations))
     return [{"kind": part.kind, "images": sorted(part.rotations)} for part in found]
 
 

@@ -36,8 +36,12 @@ _SIGMA_ANGLE_DEG = 0.2
 _SIGMA_POSITION_SHARE = 0.005
 # Beyond so many standard deviations, and so many degrees, a given position or attitude is wrong and not just inexact.
 _WRONG_SIGMAS, _WRONG_DEG = 5.0, 15.0
+# A model knows north well enough to judge headings to a few degrees.
+_NORTH_KNOWN_DEG = 1.0
 # North is unknown.
 _UNKNOWN_NORTH_DEG = 180.0
+# Nor is one whose difference the frame's own north leaves open by so many of its standard deviations.
+_OPEN_SIGMAS = 3.0
 # A focal length that differs by more than this share is said.
 _FOCAL_SHARE = 0.02
 # Pictures of one place differ by less, in pixels of the stored images.
@@ -175,8 +179,9 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
     # The mapper's own points are few: it leans on the longest tracks.
     lenses = {image.image_id: cameras[image.camera_id] for image in block.images}
     placed = {i: pose for i, pose in found.items() if i not in beside}
-    tied = tied_by_pairs(evidence.pairs, placed, block.poses, lenses, evidence.thresholds_px)
-    found |= {i: pose for i, (pose, _) in tied.items() if i not in found}
+    loose = {i: pose for i, pose in block.poses.items() if i not in found}
+    tied = tied_by_pairs(evidence.pairs, placed, loose, lenses, evidence.thresholds_px)
+    found |= {i: pose for i, (pose, _) in tied.items()}
     groups = _groups_with(models, {i: anchor for i, (_, anchor) in tied.items()})
     convention = None if own else _convention(models, angles, block.poses)
     outside = block.poses.keys() - found.keys()
@@ -191,7 +196,9 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
             poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
     poses |= found
     terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
-    wrong = _judged(block.poses, {i: pose for i, pose in found.items() if i not in beside}, convention, angles)
+    north_deg = {i: _north_sigma_deg(model, block.poses) for model in models for i in model.rotations}
+    judged_poses = {i: pose for i, pose in found.items() if i not in beside}
+    wrong = _judged(block.poses, judged_poses, convention, angles, north_deg)
     facts = {
         "method": "pictures",
         "stays": False,
@@ -228,9 +235,12 @@ def _same_lens(found: Camera | None, old: Camera) -> bool:
 def _convention(models: Sequence[Model], angles: Mapping[str, Angles], given: Mapping[str, Pose]) -> Recognised | None:
     """By the models that positions have placed."""
     placed = [model for model in models if model.kind == "positions"]
-    north = [_north_sigma_deg(model, given) for model in placed]
-    rotations = {i: rotation for model in placed for i, rotation in model.rotations.items()}
-    return recognised(angles, rotations, max(north, default=0.0))
+    north_deg = [_north_sigma_deg(model, given) for model in placed]
+    # Only the models that know north about as well as the best one: a short strip knows little of it.
+    known_deg = max(2.0 * min(north_deg, default=0.0), _NORTH_KNOWN_DEG)
+    sure = [(model, sigma) for model, sigma in zip(placed, north_deg, strict=True) if sigma <= known_deg]
+    rotations = {i: rotation for model, _ in sure for i, rotation in model.rotations.items()}
+    return recognised(angles, rotations, max((sigma for _, sigma in sure), default=0.0))
 
 
 def _north_sigma_deg(model: Model, given: Mapping[str, Pose]) -> float:
@@ -264,8 +274,11 @@ def _judged(
     found: Mapping[str, Pose],
     convention: Recognised | None = None,
     as_given: Mapping[str, Angles] | None = None,
+    north_deg: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres.
+
+    north_deg: image_id -> standard deviation of north in the frame of what was found, where it is not exact.
 
     convention: how the angles as they were given are to be read, where they are wrong as a whole.
     """
@@ -275,7 +288,8 @@ def _judged(
         }
         given = {**given, **read}
     angles = {i: round(error, 1) for i, error in attitude_errors_deg(given, found).items()}
-    limits_deg = {i: max(_WRONG_DEG, _WRONG_SIGMAS * given[i].sigma_angle_deg) for i in angles}
+    open_deg = {i: _OPEN_SIGMAS * (north_deg or {}).get(i, 0.0) for i in angles}
+    limits_deg = {i: max(_WRONG_DEG, _WRONG_SIGMAS * given[i].sigma_angle_deg, open_deg[i]) for i in angles}
     shifts = {i: round(error, 2) for i, error in position_errors_m(given, found).items()}
     limits = {i: _WRONG_SIGMAS * (given[i].sigma_position_m + found[i].sigma_position_m) for i in shifts}
     return {

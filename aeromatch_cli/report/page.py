@@ -86,11 +86,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         headline=_headline(images, pairs, facts, failures),
-        notices=[
-            *notices(images, pairs, facts, _facts(context, "orient")),
-            *adjustment_notices(images, _facts(context, "adjust"), _facts(context, "consistency").get("doubtful", ())),
-            *(Notice("warn", "Note on the input", warning) for warning in input_facts.get("warnings", [])),
-        ],
+        notices=_all_notices(context, images, pairs, facts, input_facts.get("warnings", [])),
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
@@ -147,6 +143,21 @@ def _headline(
     ]
     parted = [(text.partition(" "), bad) for text, bad in tiles]
     return [(count, words, "bad" if bad else "") for (count, _, words), bad in parted]
+
+
+def _all_notices(
+    context: Context,
+    images: Sequence[ImageRow],
+    pairs: Sequence[PairRow],
+    facts: Mapping[str, Any],
+    warnings: Sequence[str],
+) -> list[Notice]:
+    """The gravest first."""
+    doubtful = _facts(context, "consistency").get("doubtful", ())
+    found = notices(images, pairs, facts, _facts(context, "orient"))
+    found += adjustment_notices(images, _facts(context, "adjust"), doubtful)
+    found += [Notice("warn", "Note on the input", warning) for warning in warnings]
+    return sorted(found, key=lambda notice: notice.level != "bad")
 
 
 def notices(
@@ -257,8 +268,9 @@ def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in _SIGMAS if facts[key] is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
-    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts["cameras"].items()}
-    found.append(("Cameras after the adjustment", _camera_words(cameras)))
+    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts.get("cameras", {}).items()}
+    if cameras:
+        found.append(("Cameras after the adjustment", _camera_words(cameras)))
     control = facts["control"]
     if control and control["control_rmse_m"]:
         found.append(("Control points", f"{control['control']}, RMSE {_metres(control['control_rmse_m'])}"))

@@ -1,7 +1,7 @@
 """What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
 
 Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
-`summary` and `warnings` of pairs and `wrong_attitudes` of orient (page.py).
+`summary` and `warnings` of pairs, those of orient and adjust (page.py), `ties` and `doubtful` of consistency.
 """
 
 from __future__ import annotations
@@ -311,7 +311,7 @@ def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
     for path in sorted(workspace.evaluation.glob("*.png")):
         coded = base64.b64encode(path.read_bytes()).decode("ascii")
         pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
-    filtered = workspace.stage_report("filter")
-    outdated = filtered.is_file() and filtered.stat().st_mtime > stated.stat().st_mtime
+    made = [workspace.stage_report(stage) for stage in ("filter", "consistency")]
+    outdated = any(path.is_file() and path.stat().st_mtime > stated.stat().st_mtime for path in made)
     summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
     return EvaluationFigures(summary, pictures, outdated)

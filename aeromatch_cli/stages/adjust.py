@@ -93,7 +93,8 @@ def current_fingerprint(context: Context) -> str:
 def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     given = {i: (pose.center_m, pose.sigma_position_m) for i, pose in context.given.poses.items()}
     block = context.block
-    state = [sorted(block.cameras.items()), sorted(block.poses.items()), sorted(given.items())]
+    ids = sorted(image.image_id for image in block.images)
+    state = [ids, sorted(block.cameras.items()), sorted(block.poses.items()), sorted(given.items())]
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
@@ -173,7 +174,8 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
         return []
     east_m, north_m, up_m = offset_m
     across_m = float(np.hypot(east_m, north_m))
-    sigma_m = max((pose.sigma_position_m for pose in context.given.poses.values()), default=0.0)
+    sigmas_m = [pose.sigma_position_m for pose in context.given.poses.values()]
+    sigma_m = float(np.median(sigmas_m)) if sigmas_m else 0.0
     limit_m = max(_FAR_CONTROL_M, _FAR_CONTROL_SIGMAS * sigma_m)
     if across_m > limit_m:
         return [

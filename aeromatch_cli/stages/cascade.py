@@ -2,8 +2,9 @@
 
 Every step is a small workspace of its own below WORK/steps, made by the stages extract, match and filter. A pair takes
 a further step where its verified matches are few for its overlap, or leave parts of the overlap empty. Whether it does
-depends on this pair, and of steps whose features cost much and matches little on others of its images: a shard leaves
-such pairs to the command that ends the work of all shards. `union` joins what the steps have found.
+depends on this pair, and of steps whose features cost much and matches little on others of its images: a shard takes
+such pairs as far as it sees them, the command that ends the work of all shards the rest. `union` joins what the steps
+have found.
 """
 
 from __future__ import annotations

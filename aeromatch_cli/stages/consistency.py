@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, Verdict
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
-from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, select, verified_pairs
@@ -24,7 +24,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
 
-VERSION = 2
+VERSION = 3
 
 
 def run(context: Context) -> StageReport:
@@ -32,12 +32,14 @@ def run(context: Context) -> StageReport:
     report = StageReport("consistency")
     recipe = context.settings.consistency
     adjusted = None
-    if isinstance(recipe, BlockConsistency) and not context.settings.match.reads_pixels:
+    if isinstance(recipe, BlockConsistency) and not context.settings.match.reads_pixels and orient.groups(context):
         context, _ = with_current_pairs(context)
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None or not isinstance(recipe, BlockConsistency):
         report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "doubtful": [], "ties": {}}
+        if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
+            report.facts["remark"] = f"not done: match {context.settings.match.name} measures points without keypoints"
         with translated_os_errors(path):
             path.unlink(missing_ok=True)
         return report.write(context.workspace)
@@ -49,11 +51,14 @@ def run(context: Context) -> StageReport:
         if before.get("fingerprint") == report.fingerprint:
             report.skipped, report.facts = report.items, before["facts"]
             return report.write(context.workspace)
+    # A killed run must not leave what the report of an earlier one vouches for.
+    with translated_os_errors(last):
+        last.unlink(missing_ok=True)
     with context.executor.step("consistency"):
         cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
         pairs = [MatchedKeypoints(p.image_id0, p.image_id1, entry.matches.indices) for p, entry in entries]
-        limits = Limits(recipe.epipolar_px, recipe.third_image_px)
+        limits = Limits(recipe.epipolar_px, recipe.alone_px, recipe.medians, recipe.third_image_px, recipe.confirm_px)
         masks, doubtful = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
@@ -72,10 +77,9 @@ def _facts(context: Context) -> dict[str, Any]:
         for (_, before), (_, after) in zip(verified_pairs(context), final_pairs(context), strict=True)
         if before.verdict.state == "verified"
     ]
-    kept = sum(after for _, after, verified in counts if verified)
     return {
-        "verified_matches": kept,
-        "dropped_matches": sum(before for before, _, _ in counts) - kept,
+        "verified_matches": sum(after for _, after, verified in counts if verified),
+        "dropped_matches": sum(before - after for before, after, verified in counts if verified),
         "rejected_pairs": sum(not verified for _, _, verified in counts),
     }
 
@@ -121,5 +125,8 @@ class FinalEntries:
         verdict = replace(verdict, keep=np.ones(len(left.indices), dtype=bool), errors_px=errors, rejected=rejected)
         if len(left.indices) < self._least:
             words = f"contradicts the adjusted block: {len(left.indices)} of {len(keep)} matches agree with it"
-            verdict = replace(verdict, state="rejected", reason=words)
+            nothing = np.zeros(0, dtype=bool)
+            rejected["consistency"] = len(keep)
+            verdict = Verdict(nothing, "rejected", words, rejected=rejected)
+            left = select(left, np.zeros(len(left.indices), dtype=bool))
         return replace(entry, matches=left, verdict=verdict)

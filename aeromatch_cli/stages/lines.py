@@ -98,7 +98,10 @@ def frame_remarks(record: Mapping[str, Any]) -> list[str]:
         return []
     if record["facts"]["frame"] == "own":
         return ["without usable positions the result is in a frame of its own: scale, north and place are arbitrary"]
-    return [f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary"]
+    return [
+        f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary, "
+        "unless final matches tie them"
+    ]
 
 
 def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
@@ -116,7 +119,7 @@ def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     words += _control_words(facts["control"])
     words += facts["remarks"]
     outside = list(facts["outside"].items())
-    words += [f"not oriented: {names[image_id]}: {reason}" for image_id, reason in outside[:10]]
+    words += [f"not oriented: {names.get(image_id, image_id)}: {reason}" for image_id, reason in outside[:10]]
     words += [f"not oriented: {len(outside) - 10} more, listed in the report"] if len(outside) > 10 else []
     return [f"          {line}" for line in words]
 
@@ -133,9 +136,11 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
             f"          points in all nine ninths of {whole} of {len(facts['ties'])} images; {many} points per image "
             "are seen by three or more (median)"
         )
-    if not facts["dropped_matches"]:
+    if "remark" in facts:
+        lines.append(f"          {facts['remark']}")
+    if not facts["dropped_matches"] and not facts["rejected_pairs"]:
         return lines
-    pairs = f", and with them {facts['rejected_pairs']} pairs" if facts["rejected_pairs"] else ""
+    pairs = f", {facts['rejected_pairs']} pairs as a whole" if facts["rejected_pairs"] else ""
     words = f"{facts['dropped_matches']} matches contradict the adjusted block{pairs}"
     return [f"          {words}; {facts['verified_matches']} verified matches are left", *lines]
 

@@ -41,8 +41,6 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
     "simulate": simulate.run,
     "extract": extract.run,
     "filter": filter.run,
-    "adjust": adjust.run,
-    "export": export.run,
     "report": report.run,
 }
 # Stages whose items are independent: these can be cut into shards, the others need everything.
@@ -172,7 +170,7 @@ def _joined(context: Context) -> Context:
 
 
 def _run_all(context: Context) -> list[StageReport]:
-    """extract, match, filter; then export and report."""
+    """extract, match, filter; then adjust, consistency, export and report."""
     context, reports = _to_filter(context)
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -13,19 +13,36 @@ from aeromatch_cli.strategies import Strategy
 class BlockConsistency(Strategy):
     """Drops verified matches that contradict the adjusted block: its epipolar lines, and places in third images."""
 
-    drops: ClassVar[bool] = True
     name: Literal["block"] = "block"
     epipolar_px: float = Field(
         1.5,
         gt=0.0,
-        description="Largest distance of a match from the epipolar lines of the adjusted block, undistorted pixels; "
-        "more in pairs that the block holds less exactly. Larger: more matches, less accurate ones.",
+        description="Largest distance of a match from the epipolar lines of the adjusted block, pixels. Larger: more "
+        "matches, less accurate ones.",
+    )
+    alone_px: float = Field(
+        1.5,
+        gt=0.0,
+        description="The same for a match whose keypoints no third image knows. Larger: more matches, more of them "
+        "wrong.",
+    )
+    medians: float = Field(
+        4.0,
+        ge=1.0,
+        description="Both distances are at least this many times the median of the pair: some images are held less "
+        "exactly than others. Larger: more matches, less accurate ones.",
     )
     third_image_px: float = Field(
         4.0,
         gt=0.0,
-        description="Largest distance of a keypoint of a third image from the place of the point there, pixels. "
-        "Larger: fewer matches are dropped.",
+        description="A keypoint of a third image speaks for the match up to this distance from the place of the point "
+        "there, pixels, beyond it against. Larger: fewer matches are dropped.",
+    )
+    confirm_px: float = Field(
+        0.0,
+        ge=0.0,
+        description="Where third images know the keypoints of a match, one of them must lie this near to the place "
+        "of the point there, pixels; 0 = none needs to. Smaller, but for 0: fewer matches, fewer of them wrong.",
     )
     min_matches: int = Field(
         15, ge=1, description="A pair that keeps fewer matches is rejected. Larger: fewer pairs, fewer of them wrong."
@@ -35,7 +52,6 @@ class BlockConsistency(Strategy):
 class NoConsistency(Strategy):
     """Verified matches stay as the two images alone verify them."""
 
-    drops: ClassVar[bool] = False
     name: Literal["none"] = "none"
 
 

@@ -23,6 +23,7 @@ from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute
 from aeromatch_cli.synthetic import load_truth
@@ -106,7 +107,7 @@ def _preset(work: Path, truth: RenderedTruth, name0: str, name1: str, preset: st
     """The verified matches of the pair in the workspace."""
     workspace = Workspace(work)
     ids = {image.name: image.image_id for image in read_images(workspace.images)}
-    entry = read_verified_row(workspace.verified(ids[name0]))[ids[name1]]
+    entry = FinalEntries(workspace)(ids[name0], read_verified_row(workspace.verified(ids[name0]))[ids[name1]])
     all_px = [read_features(workspace.features(ids[name])).keypoints_px for name in (name0, name1)]
     points = match_points(entry.matches, *all_px)
     return _judged(f"preset {preset}", truth, (name0, name1), all_px, points, entry.matches.scores)
