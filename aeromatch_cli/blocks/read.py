@@ -146,10 +146,8 @@ def block_inputs(
     camera_file = lists.camera_file
     likely_focals, remarks = contradicting_exif(assignment, facts) if camera_file is not None else ({}, [])
     warnings += remarks
-    if lists.pose_list is not None:
-        stated_crs = crs if crs != AUTO or camera_file is None else camera_file.crs or crs
-        observations, remarks = agreed(observations, facts, stated_crs, f"pose list {lists.poses}")
-        warnings += remarks
+    observations, remarks = _agreeing(lists, observations, facts, crs)
+    warnings += remarks
     located = oriented(
         observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
     )
@@ -158,9 +156,7 @@ def block_inputs(
     warnings += _level_flight(located, facts)
     stated = _stated_ground(camera_file, frame, Path(lists.cameras).name)
     hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
-    if lists.poses == EXIF:  # tilts of images without a position
-        alone = {name: angles_of_exif(fact, lists.angles) for name, fact in facts.items() if name not in angles}
-        angles |= {name: one for name, one in alone.items() if one is not None}
+    angles |= _angles_alone(lists, facts, angles)
     ids = image_ids(facts)
     return BlockInputs(
         images=_images(ids, facts, assignment.camera_ids),
@@ -298,6 +294,24 @@ def _observations(
     for note, count in notes.items():
         remarks.append(f"{count} of {len(facts)} images: {note}")
     return observations, remarks
+
+
+def _agreeing(
+    lists: GivenLists, observations: dict[str, Observation], facts: Mapping[str, ExifFacts], crs: str
+) -> tuple[dict[str, Observation], list[str]]:
+    """Those of a pose list, put right by the GPS of the images, and remarks."""
+    if lists.pose_list is None:
+        return observations, []
+    stated = lists.camera_file.crs if lists.camera_file is not None and crs == AUTO else None
+    return agreed(observations, facts, stated or crs, f"pose list {lists.poses}")
+
+
+def _angles_alone(lists: GivenLists, facts: Mapping[str, ExifFacts], known: Mapping[str, Angles]) -> dict[str, Angles]:
+    """Angles of images without a position, whose tilts count."""
+    if lists.poses != EXIF:
+        return {}
+    alone = {name: angles_of_exif(fact, lists.angles) for name, fact in facts.items() if name not in known}
+    return {name: one for name, one in alone.items() if one is not None}
 
 
 def _with_exif_heights(

@@ -45,14 +45,9 @@ def prepare(
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
     workspace cannot be written.
     """
-    if isinstance(settings.pairs, Similar) and not isinstance(settings.orient, FirstPass):
-        raise ConfigError(
-            "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "
-            "orient, or pairs=exhaustive"
-        )
     report = StageReport("pairs")
     workspace = Workspace(Path(settings.workspace).absolute())
-    _check_files(settings)
+    _check_settings(settings)
     if dry:
         workspace.check_version()
     else:
@@ -96,14 +91,20 @@ def prepare(
         say(line)
     for warning in said_later:
         log.warning("warning: %s", warning)
-    if len(context.block.images) == 1:
-        raise InputError(f"only one image can be used ({context.block.images[0].name}): one image makes no pair")
-    if not pairs:
+    _check_pairs(context)
+    return context, oriented, report
+
+
+def _check_pairs(context: Context) -> None:
+    """Raise InputError where there is nothing to match."""
+    images = context.block.images
+    if len(images) == 1:
+        raise InputError(f"only one image can be used ({images[0].name}): one image makes no pair")
+    if not context.pairs:
         raise InputError(
-            f"no pairs: {len(context.block.images)} images, none of which overlap; check poses, cameras and ground "
+            f"no pairs: {len(images)} images, none of which overlap; check poses, cameras and ground "
             "(the warnings above), or use --set pairs=exhaustive"
         )
-    return context, oriented, report
 
 
 def _with_ground(context: Context, found: BlockRead) -> Context:
@@ -140,8 +141,15 @@ def _context(
     )
 
 
-def _check_files(settings: Settings) -> None:
-    """Files that strategies need (weights, pair lists) are found wanting now and not after hours of extraction."""
+def _check_settings(settings: Settings) -> None:
+    """Raise ConfigError for strategies that do not go together, and for files that they need (weights, pair lists):
+    now, and not after hours of extraction.
+    """
+    if isinstance(settings.pairs, Similar) and not isinstance(settings.orient, FirstPass):
+        raise ConfigError(
+            "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "
+            "orient, or pairs=exhaustive"
+        )
     for strategy in _chosen(settings):
         strategy.check_files(settings.extract.descriptor_length)
 
