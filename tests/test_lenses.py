@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.orientation.adjusting import drop_far_images, images_by_camera, reset_lenses
+from aeromatch_cli.orientation.mapper import _far_from_priors
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
 
@@ -58,6 +59,21 @@ def test_images_behind_a_lens_that_cannot_be_leave_the_model(model: Any, focal_p
     reset_lenses(model, known)
     assert images_by_camera(model) == {1: MANY}
     np.testing.assert_allclose(model.cameras[2].params, known["2"]["params"])
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "sigma", "far"),
+    [(820.0, 0.005, False), (900.0, 0.02, True), (900.0, 0.05, False), (1600.0, 0.2, True)],
+)
+def test_a_focal_length_far_from_its_prior_has_to_be_better(
+    model: Any, focal_px: float, sigma: float, far: bool
+) -> None:
+    """Beyond a tenth, and beyond four standard deviations."""
+    known = {number: {**prior, "sigma": sigma} for number, prior in priors(model).items()}
+    assert not _far_from_priors([model], known)
+    model.cameras[2].params = [focal_px, 512.0, 384.0, 0.0]
+    assert _far_from_priors([model], known) is far
+    assert not _far_from_priors([], known)
 
 
 def test_an_image_at_any_distance_leaves_the_model(model: Any) -> None:

@@ -30,6 +30,9 @@ from aeromatch_cli.orientation.results import arrays, figures
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
 _FOCAL_CHANGE = 0.1
 _MAX_STARTS = 3
+# A focal length that is so many of its prior's standard deviations away has to be better than the prior: by more points
+# or smaller errors than these shares leave.
+_FAR_SIGMAS, _AS_MANY, _AS_EXACT = 4.0, 0.8, 1.2
 _MIN_IMAGES = 3
 # Positions are found from the longest tracks, so many in every image that has them, in large blocks fewer: 300 images
 # take 13 s with 100, 36 s with 300. Small blocks need them: lewis 0.5 degrees with 100, 0.1 with 300. Points after that
@@ -45,6 +48,8 @@ def solve(folder: Path) -> None:
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     priors = np.load(folder / "priors.npz")
     models = _mapped(pycolmap, folder, task["mapper"])
+    if _far_from_priors(models, task["cameras"]):
+        models = _with_priors(pycolmap, folder, task, models)
     facts = []
     for number, model in enumerate(models):
         reset_lenses(model, task["cameras"])
@@ -76,11 +81,46 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
     for start in range(_MAX_STARTS):
         out = folder / f"start{start}"
         out.mkdir(exist_ok=True)
-        found = _global(pycolmap, database, out) if mapper == "global" else _incremental(pycolmap, database, out)
-        models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+        models = _once(pycolmap, database, out, mapper, free=True)
         if not models or not _update_focal_lengths(pycolmap, database, models):
             break
     return models
+
+
+def _once(pycolmap: ModuleType, database: Path, out: Path, mapper: str, *, free: bool) -> list[Any]:
+    """Models, the largest first. free: whether focal lengths and distortions are unknowns."""
+    run = _global if mapper == "global" else _incremental
+    found = run(pycolmap, database, out, free)
+    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _far_from_priors(models: list[Any], priors: dict[str, Any]) -> bool:
+    """Whether the largest model has found a focal length that its prior speaks against."""
+    for number, prior in priors.items():
+        if models and _sees(models[0], int(number)):
+            ratio = models[0].cameras[int(number)].mean_focal_length() / prior["focal_px"]
+            if abs(ratio - 1.0) > max(_FOCAL_CHANGE, _FAR_SIGMAS * prior["sigma"]):
+                return True
+    return False
+
+
+def _with_priors(pycolmap: ModuleType, folder: Path, task: dict[str, Any], free: list[Any]) -> list[Any]:
+    """Models mapped with the prior focal lengths held, where they are as good as the `free` ones, else these.
+
+    Straight views of flat ground go with any focal length and some flying height: what free mapping finds is chance.
+    """
+    database, out = folder / "database.db", folder / "held"
+    out.mkdir(exist_ok=True)
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            camera.params = task["cameras"][str(camera.camera_id)]["params"]
+            opened.update_camera(camera)
+    held = _once(pycolmap, database, out, task["mapper"], free=False)
+    if not held or held[0].num_reg_images() < free[0].num_reg_images():
+        return free
+    fewer = held[0].num_points3D() < _AS_MANY * free[0].num_points3D()
+    worse = held[0].compute_mean_reprojection_error() > _AS_EXACT * free[0].compute_mean_reprojection_error()
+    return free if fewer or worse else held
 
 
 def _update_focal_lengths(pycolmap: ModuleType, database: Path, models: list[Any]) -> bool:
@@ -101,7 +141,7 @@ def _sees(model: Any, camera_id: int) -> bool:
     return any(image.has_pose and image.camera_id == camera_id for image in model.images.values())
 
 
-def _global(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
+def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
     with pycolmap.Database.open(database) as opened:
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
@@ -112,16 +152,18 @@ def _global(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
     options.mapper.track_required_tracks_per_view = tracks
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
-    options.mapper.bundle_adjustment.refine_extra_params = most >= DISTORTION_IMAGES
+    options.mapper.bundle_adjustment.refine_focal_length = free
+    options.mapper.bundle_adjustment.refine_extra_params = free and most >= DISTORTION_IMAGES
     found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
     return found
 
 
-def _incremental(pycolmap: ModuleType, database: Path, out: Path) -> dict[int, Any]:
+def _incremental(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.num_threads = 0, 1
     options.min_model_size = _MIN_IMAGES
     options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = free
     found: dict[int, Any] = pycolmap.incremental_mapping(database, out, out, options=options)
     return found
 

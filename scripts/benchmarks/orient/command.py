@@ -33,6 +33,7 @@ command, of the stage orient, of the stage match.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -70,7 +71,8 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
         return row | {"seconds": run.seconds, "said": [run.said[-300:]]}
     stages = run.answer["stages"]
     facts = evaluated(work, reference, mapping=args.mapping)
-    row |= judged(work, reference, names, wrong)
+    found = judged(work, reference, names, wrong)
+    row |= {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in found.items()}
     if case == "level":  # heights count from the flight
         row["terrain_share"] = None
     row |= {"correct": facts["totals"]["correct"], "kept": facts["totals"]["kept"]}
