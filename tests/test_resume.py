@@ -61,7 +61,7 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     assert verified(halves) == expected
     rest = done_site("run", "--workspace", halves)
     assert rest.code == 0
-    assert set(rest.done()) == {"adjust", "export", "report"}
+    assert set(rest.done()) == {"adjust", "consistency", "export", "report"}
     assert contents(halves)["export/colmap/database.db"] == contents(done_site.work)["export/colmap/database.db"]
 
     swapped = Site(tmp_path / "swapped")
@@ -78,14 +78,31 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
 @pytest.mark.parametrize(
     ("change", "redone"),
     [
-        ("match.ratio=0.75", {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
-        ("filter.poselib.threshold_px=3", {"filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
+        (
+            "match.ratio=0.75",
+            {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+        ),
+        (
+            "filter.poselib.threshold_px=3",
+            {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+        ),
         (
             "extract.keypoints=300",
-            {"extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1},
+            {
+                "extract": IMAGES,
+                "match": PAIRS,
+                "filter": PAIRS,
+                "adjust": IMAGES,
+                "consistency": PAIRS,
+                "export": 1,
+                "report": 1,
+            },
         ),
-        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "export": 1, "report": 1}),
-        ("block.sigma_position_m=9", {"orient": IMAGES, "adjust": IMAGES, "export": 1, "report": 1}),
+        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1}),
+        (
+            "block.sigma_position_m=9",
+            {"orient": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+        ),
         ("export.colmap.pose_priors=false", {"export": 1, "report": 1}),
     ],
 )
@@ -230,7 +247,7 @@ def test_overwrite_redoes_everything(done_site):
     outcome = done_site("run", "--overwrite")
     assert outcome.done() == {
         "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES,
-        "export": 1, "report": 1
+        "consistency": PAIRS, "export": 1, "report": 1
     }  # fmt: skip
     assert contents(done_site.work) == before
 
