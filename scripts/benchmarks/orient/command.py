@@ -119,6 +119,11 @@ def _of_images(row: Row) -> str:
     return f"{row['images'] - len(row['unregistered'])} of {row['images']}{lost}"
 
 
+def _attitude(row: Row) -> str:
+    """Median and maximum of the errors, nothing where no image was oriented."""
+    return "" if row["attitude_deg"] is None else f"{row['attitude_deg']:.3f} ({row['attitude_max_deg']:.2f})"
+
+
 def _named(row: Row) -> str:
     extra = f" + {row['named_without_cause']}" if row["named_without_cause"] else ""
     return f"{row['named']} of {row['wrong']}{extra}" if row["wrong"] or extra else ""
@@ -131,7 +136,7 @@ def _seconds(row: Row) -> str:
 
 COLUMNS: Sequence[Column[Row]] = (
     ("images", _of_images),
-    ("attitude, degrees", lambda row: f"{row['attitude_deg']:.3f} ({row['attitude_max_deg']:.2f})"),
+    ("attitude, degrees", _attitude),
     ("adjusted", lambda row: "" if row.get("adjusted_deg") is None else f"{row['adjusted_deg']:.3f}"),
     ("turn", lambda row: "" if row["turn_deg"] is None else f"{row['turn_deg']:.1f}"),
     ("focal length", lambda row: f"{100 * row['focal_share']:+.1f} %"),
