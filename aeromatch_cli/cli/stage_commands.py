@@ -146,7 +146,9 @@ def _recipe(config: str | None, command: str, workspace: Path | None) -> str:
     """What a command follows that names no preset: the workspace's own settings for single stages, else `auto`."""
     if config is not None:
         return config
-    own = Path("aeromatch-work" if workspace is None else workspace) / "config.yaml"
+    from aeromatch_cli.config import Settings
+
+    own = Path(workspace or Settings.model_fields["workspace"].default) / "config.yaml"
     return str(own) if command not in _WHOLE and own.is_file() else AUTO
 
 

@@ -102,8 +102,8 @@ def _joined_groups(pycolmap: ModuleType, folder: Path, groups: Sequence[dict[str
         model = _triangulated(pycolmap, _posed(pycolmap, folder, set(group["images"])), folder, rough=True)
         parts.append(_part(group["kind"], model))
     with pycolmap.Database.open(folder / "database.db") as opened:
-        pairs = [pycolmap.pair_id_to_image_pair(k) for k in opened.read_two_view_geometries()[0]]
-        matches = {(a, b): opened.read_two_view_geometry(a, b).inlier_matches for a, b in pairs}
+        seen = zip(*opened.read_two_view_geometries(), strict=True)
+        matches = {tuple(pycolmap.pair_id_to_image_pair(k)): found.inlier_matches for k, found in seen}
     found = joined(parts, matches)
     if len(found) < len(parts):
         model = pycolmap.Reconstruction(folder / "sparse")

@@ -81,14 +81,13 @@ def _tied(
         return None
     rotation = view.rotation @ known.world_rotation
     limits_px = {i: _SLACK * thresholds_px[i] for i in ends}
-    lenses_by_id = {i: cameras[i] for i in ends}
     for direction in _directions(view.model, view.rotation, known.world_rotation):
         center_m = _along(known, given, direction)
         if center_m is None:
             continue
         pose = replace(given, center_m=center_m, world_rotation=rotation, sigma_angle_deg=_SIGMA_DEG)
         both = {ends[0]: known, ends[1]: pose}
-        if explained_share(pair, both, lenses_by_id, limits_px) >= EXPLAINED_SHARE:
+        if explained_share(pair, both, cameras, limits_px) >= EXPLAINED_SHARE:
             return pose
     return None
 

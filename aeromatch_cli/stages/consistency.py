@@ -6,12 +6,13 @@ for all who read final results.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, Verdict
+from aeromatch_cli.data import AdjustedBlock, Pair, Verdict
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
@@ -66,16 +67,18 @@ def run(context: Context) -> StageReport:
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    report.facts = {**_facts(context), "doubtful": doubtful, "ties": _ties(context, adjusted)}
+    report.facts = {**_facts(context, entries), "doubtful": doubtful, "ties": _ties(context, adjusted)}
     report.done = report.items
     return report.write(context.workspace)
 
 
-def _facts(context: Context) -> dict[str, Any]:
+def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:
+    """What is left of the verified entries."""
+    final = FinalEntries(context.workspace)
+    left = [final(pair.image_id0, entry) for pair, entry in entries]
     counts = [
         (len(before.matches.indices), len(after.matches.indices), after.verdict.state == "verified")
-        for (_, before), (_, after) in zip(verified_pairs(context), final_pairs(context), strict=True)
-        if before.verdict.state == "verified"
+        for (_, before), after in zip(entries, left, strict=True)
     ]
     return {
         "verified_matches": sum(after for _, after, verified in counts if verified),
