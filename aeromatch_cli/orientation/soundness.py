@@ -7,6 +7,7 @@ cameras; of two parts that do not belong together, hardly any across.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -24,7 +25,9 @@ from aeromatch_cli.orientation.judgement import (
 from aeromatch_cli.orientation.mapping import Model
 
 # Models are less exact than the errors of exact matches, by this factor: found from few tracks, without distortion.
-_SLACK = 3.0
+SLACK = 3.0
+# Of what an image in its place shares with the others at least this share is explained.
+_LEAST_EXPLAINED = 0.5
 # A position confirms a place up to so many standard deviations.
 _CONFIRMED_SIGMAS = 3.0
 # So many keypoints that two pairs of an image share tie their scales to each other.
@@ -50,12 +53,18 @@ def sound_part(
     matches in stored pixels. given: image_id -> pose whose position was given.
     """
     poses = {i: Pose(model.centers_m[i], rotation, 0.0, 0.0) for i, rotation in model.rotations.items()}
-    limits_px = {image_id: _SLACK * limit for image_id, limit in thresholds_px.items()}
+    limits_px = {image_id: SLACK * limit for image_id, limit in thresholds_px.items()}
     inside = [p for p in pairs if {p.image_id0, p.image_id1} <= poses.keys() and len(p.indices) >= MIN_MATCHES]
-    good = [p for p in inside if explained_share(p, poses, cameras, limits_px) >= EXPLAINED_SHARE]
+    shares = [explained_share(p, poses, cameras, limits_px) for p in inside]
+    wrong = _contradicted(inside, shares)
+    good = [
+        p
+        for p, share in zip(inside, shares, strict=True)
+        if share >= EXPLAINED_SHARE and not wrong & {p.image_id0, p.image_id1}
+    ]
     edges = [(p.image_id0, p.image_id1) for p in good]
     rigid = max(rigid_groups(good), key=lambda group: (len(group), min(group)), default=set())
-    sure = rigid | (_confirmed(model, given) if model.kind == "positions" else set())
+    sure = rigid | (_confirmed(model, given) - wrong if model.kind == "positions" else set())
     groups = connected_groups([edge for edge in edges if sure.issuperset(edge)])
     if not groups or len(groups[0]) < FEWEST_IMAGES:
         return None
@@ -71,6 +80,27 @@ def only(model: Model, image_ids: Collection[str]) -> Model:
         centers_m={i: model.centers_m[i] for i in left},
         figures=dict(model.figures) | {"images": len(left)},
     )
+
+
+def _contradicted(pairs: Sequence[PairPoints], shares: Sequence[float]) -> set[str]:
+    """Images in wrong places: most of what they share with the others is not explained. The worst counts first.
+
+    A misplaced image may explain a pair by chance, where its keypoints lie along one line say.
+    """
+    wrong: set[str] = set()
+    while True:
+        explained: defaultdict[str, float] = defaultdict(float)
+        total: defaultdict[str, float] = defaultdict(float)
+        for pair, share in zip(pairs, shares, strict=True):
+            ids = pair.image_id0, pair.image_id1
+            if not wrong.intersection(ids):
+                for image_id in ids:
+                    explained[image_id] += share * len(pair.indices)
+                    total[image_id] += len(pair.indices)
+        worst = min(sorted(total), key=lambda i: explained[i] / total[i], default=None)
+        if worst is None or explained[worst] >= _LEAST_EXPLAINED * total[worst]:
+            return wrong
+        wrong.add(worst)
 
 
 def _confirmed(model: Model, given: Mapping[str, Pose]) -> set[str]:

@@ -19,6 +19,7 @@ from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras,
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.focal import better_cameras
+from aeromatch_cli.orientation.growth import grown
 from aeromatch_cli.orientation.mapping import MAPPERS, Group, Mapper, Model, map_block
 from aeromatch_cli.orientation.solution import (
     Before,
@@ -53,7 +54,7 @@ from aeromatch_cli.workspace import (
 
 log = logging.getLogger("aeromatch")
 
-VERSION = 12
+VERSION = 13
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
@@ -197,7 +198,9 @@ def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence:
         left = left - {i for model in found for i in model.rotations}
         if not found or len(left) < FEWEST_IMAGES:
             break
-    return tuple(sorted(models, key=lambda model: -len(model.rotations)))
+    block = context.block
+    camera_ids = {image.image_id: image.camera_id for image in block.images}
+    return grown(models, evidence.pairs, camera_ids, block.cameras, evidence.thresholds_px, block.poses)
 
 
 def _one_round(
