@@ -37,7 +37,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 11
+VERSION = 12
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -194,7 +194,10 @@ def _control(context: Context, adjusted: AdjustedBlock) -> dict[str, Any] | None
     if not context.control:
         return None
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
-    return control_figures(adjusted, cameras, context.control)
+    # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
+    beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
+    placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
+    return control_figures(replace(adjusted, poses=placed), cameras, context.control)
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:

@@ -45,7 +45,10 @@ class BlockConsistency(Strategy):
         "of the point there, pixels; 0 = none needs to. Smaller, but for 0: fewer matches, fewer of them wrong.",
     )
     min_matches: int = Field(
-        15, ge=1, description="A pair that keeps fewer matches is rejected. Larger: fewer pairs, fewer of them wrong."
+        15,
+        ge=1,
+        description="A pair that has lost matches and keeps fewer than this is rejected. Larger: fewer pairs, fewer of "
+        "them wrong.",
     )
 
 
