@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site
 from scipy.spatial.transform import Rotation
-from test_export_colmap import ORIGIN_M, Truth, make_truth
+from test_export_colmap import CAMERA_A, CAMERA_B, ORIGIN_M, Truth, make_truth
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pose
 from aeromatch_cli.errors import InputError
@@ -30,6 +31,7 @@ zlib.compress(b"")  # pycolmap aborts the process when it is imported before zli
 
 NOISE_PX = 0.3
 IMAGE_IDS = tuple(f"img{number}" for number in range(6))
+CAMERAS = {i: (CAMERA_A, CAMERA_B)[int(i[-1]) % 2] for i in IMAGE_IDS}
 FOCAL_SIGMAS = {"a": 0.02, "b": 0.02}
 
 
@@ -207,6 +209,42 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     assert sorted(adjusted.poses) == list(IMAGE_IDS)
     seen = np.concatenate([track[:, 1] for track in adjusted.tracks.values()])
     assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
+
+
+def test_groups_share_their_cameras(truth: Truth) -> None:
+    """A second flight whose lens is another by 0.5 %: stated errors are those of the cameras that are handed over."""
+    contents = disturbed(truth, 0)
+    names = {i: f"far{i[-1]}" for i in IMAGE_IDS}
+    middles = {i: (CAMERAS[i].width_px / 2, CAMERAS[i].height_px / 2) for i in IMAGE_IDS}
+    keypoints = {i: contents.keypoints_px(i) for i in IMAGE_IDS}
+    keypoints |= {
+        far: (middles[i] + 1.005 * (keypoints[i] - middles[i])).astype(np.float32) for i, far in names.items()
+    }
+    away_m = np.array([1000.0, 0.0, 0.0])
+    block, given = contents.block, given_positions(truth, 1, 0.1)
+
+    def moved(poses: Mapping[str, Pose]) -> dict[str, Pose]:
+        return {**poses, **{far: replace(poses[i], center_m=poses[i].center_m + away_m) for i, far in names.items()}}
+
+    images = [replace(image, image_id=names[image.image_id], name=f"far/{image.name}") for image in block.images]
+    both = replace(block, images=(*block.images, *images), poses=moved(block.poses))
+    ends = [(names[p.pair.image_id0], names[p.pair.image_id1]) for p in truth.pairs]
+    more = [
+        replace(p, pair=replace(p.pair, image_id0=id0, image_id1=id1))
+        for p, (id0, id1) in zip(truth.pairs, ends, strict=True)
+    ]
+    doubled = ExportContents(both, keypoints.__getitem__, (*truth.pairs, *more))
+    groups = [Group("positions", IMAGE_IDS), Group("positions", tuple(names.values()))]
+    adjusted, figures = refine_block(doubled, Observed(moved(given), FOCAL_SIGMAS, {}), groups, fixed=False)
+    assert [one["images"] for one in figures] == [6, 6]
+    for group, figure in zip(groups, figures, strict=True):
+        off_px = []
+        for image_id in group.images:
+            track, pose = adjusted.tracks[image_id], adjusted.poses[image_id]
+            camera = adjusted.cameras["ab"[int(image_id[-1]) % 2]]
+            seen_px = project(camera, pose.rotation, pose.center_m, adjusted.points_m[track[:, 1]])
+            off_px.append(np.linalg.norm(seen_px - keypoints[image_id][track[:, 0]], axis=1))
+        assert float(np.concatenate(off_px).mean()) == pytest.approx(figure["reprojection_error_px"], rel=0.15)
 
 
 def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> None:

@@ -158,7 +158,7 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     control = outcome.facts["stages"]["adjust"]["facts"]["control"]
     assert control["control"] >= 6
     assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
-    assert "RMSE at leave one out" in outcome.stdout
+    assert "RMSE at each control point, fitted without it" in outcome.stdout
     assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()
 
 

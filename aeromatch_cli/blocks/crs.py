@@ -80,6 +80,15 @@ def grid_from_geographic(crs: str, latitudes_deg: FloatArray, longitudes_deg: Fl
     return xy_m
 
 
+def geographic_from_grid(crs: str, xy_m: FloatArray) -> FloatArray:
+    """Latitude and longitude (N, 2) in degrees, WGS84, of eastings and northings (N, 2) in a CRS."""
+    from pyproj import Transformer
+
+    transformer = Transformer.from_crs(_crs(crs), "EPSG:4326", always_xy=True)
+    longitudes, latitudes = transformer.transform(xy_m[:, 0], xy_m[:, 1])
+    return np.column_stack([latitudes, longitudes])
+
+
 def convergence_deg(crs: str, latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> FloatArray:
     """Meridian convergence (N,) in degrees: grid azimuth = true azimuth - convergence; 0 in a local frame."""
     from pyproj import Proj

@@ -154,8 +154,10 @@ def block_inputs(
     frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
-    stated = _stated_ground(camera_file, frame, Path(lists.cameras).name)
-    hint_z_m, hint_source = stated or _relative_ground(named_poses, facts)
+    # Heights that count from the flight say nothing of a ground that counts from elsewhere.
+    heights = not located.level or len(located.level) < len(located.poses)
+    stated = _stated_ground(camera_file, frame, Path(lists.cameras).name) if heights else None
+    hint_z_m, hint_source = stated or (_relative_ground(named_poses, facts) if heights else (None, ""))
     angles |= _angles_alone(lists, facts, angles)
     ids = image_ids(facts)
     return BlockInputs(

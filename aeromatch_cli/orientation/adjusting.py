@@ -42,6 +42,8 @@ _COMMON_DEG = 1.0
 _HOLDING = 3
 # A position that is so many standard deviations away is not that of the image.
 _WRONG_SIGMAS = 5.0
+# Positions beyond so many standard deviations are no observations of an adjustment in the making.
+_FAR_SIGMAS = 10.0
 # Position priors beyond this many standard deviations pull less and less (Cauchy).
 _PRIOR_LOSS_SIGMAS = 3.0
 
@@ -54,18 +56,23 @@ def adjusted(
     sigmas_m: FloatArray,
     ups: FloatArray,
     tolerance: float,
+    held: Collection[int] = (),
 ) -> Placement:
     """Place a model in the world, adjust it with the given positions as observations, and place it once more.
 
     The adjustment takes what the positions say of the model's shape; how it is levelled is for `place` to weigh. ups:
     one row per image number, unit vectors upwards in the camera's frame by its measured tilt, NaN where there is none.
-    tolerance: it ends when a step lowers the cost by a smaller share.
+    tolerance: it ends when a step lowers the cost by a smaller share. held: numbers of cameras that stay as they are.
     """
     ids = image_numbers(model)
     rows = np.array(ids) - 1
     placement = _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
-    used = [] if placement.kind == "level" else [i for i, agrees in zip(ids, placement.agreeing, strict=True) if agrees]
-    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
+    # A wrong focal length puts images far from positions that are right: those count that may be.
+    off_m = np.linalg.norm(centers_of(model, ids) - positions_m[rows], axis=1)
+    used = [] if placement.kind == "level" else [
+        i for i, off, sigma in zip(ids, off_m, sigmas_m[rows], strict=True) if off <= _FAR_SIGMAS * sigma
+    ]  # fmt: skip
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance, held)
     return _placed(pycolmap, model, ids, positions_m[rows], sigmas_m[rows], ups[rows])
 
 
@@ -103,18 +110,19 @@ def adjust_in_place(
     sigmas_m: FloatArray,
     attitudes: Attitudes,
     tolerance: float,
+    held: Collection[int] = (),
 ) -> list[int]:
     """Adjust a model whose poses are in the world frame already; it stays there. Images whose positions were used.
 
     The adjustment itself knows no attitudes: afterwards the whole model is turned to the most probable attitude of the
     block, by what its positions and its attitudes say of it. Positions far from where an image is are not used: they
-    have been found wrong before.
+    have been found wrong before. held: numbers of cameras that stay as they are.
     """
     ids = image_numbers(model)
     off_m = np.linalg.norm(centers_of(model, ids) - positions_m[np.array(ids, dtype=int) - 1], axis=1)
     used = [i for i, off in zip(ids, off_m, strict=True) if off <= _WRONG_SIGMAS * sigmas_m[i - 1]]
     used = used if len(used) >= _HOLDING else []
-    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance)
+    _adjust(pycolmap, model, cameras, used, positions_m, sigmas_m, tolerance, held)
     rows = np.array(used, dtype=int) - 1
     arms_m = positions_m[rows] - positions_m[rows].mean(axis=0) if used else np.zeros((0, 3))
     weights = 1.0 / sigmas_m[rows] ** 2
@@ -160,13 +168,17 @@ def _adjust(
     positions_m: FloatArray,
     sigmas_m: FloatArray,
     tolerance: float,
+    held: Collection[int],
 ) -> None:
-    """used: numbers of the images whose positions are observations; without any the frame is held by two images."""
+    """used: numbers of the images whose positions are observations; without any the frame is held by two images.
+
+    held: numbers of cameras that stay as they are.
+    """
 
     images = images_by_camera(model)
-    unknown = {number for number in model.cameras if images[number] < _FOCAL_IMAGES}
-    few = {number for number in model.cameras if images[number] < DISTORTION_IMAGES}
-    distorted = len(few) < len(images)
+    unknown = {number for number in model.cameras if images[number] < _FOCAL_IMAGES or number in held}
+    few = {number for number in model.cameras if images[number] < DISTORTION_IMAGES or number in held}
+    distorted = not few >= images.keys()
 
     def adjuster(which: Any, fixed_cameras: bool) -> Any:
         fixed = set(model.cameras) if fixed_cameras else few if distorted else unknown
@@ -175,7 +187,8 @@ def _adjust(
     if distorted and few > unknown:  # their focal lengths first, without anybody's distortion
         _adjuster(pycolmap, model, used, positions_m, sigmas_m, unknown, False, tolerance).solve()
     cost = adjuster(model, False).solve().ceres_summary.final_cost
-    _prefer_prior_focal_lengths(model, cameras, cost, adjuster)
+    own = {number: prior for number, prior in cameras.items() if int(number) not in held}
+    _prefer_prior_focal_lengths(model, own, cost, adjuster)
 
 
 def _prefer_prior_focal_lengths(

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # More images than this would need too much memory: each is taken by itself then, its neighbours as known.
 _MAX_TOGETHER = 1500
+# Two centres are the whole frame where nothing else holds it: they have no errors in it.
+_LEAST_IMAGES = 3
 # An angle with a larger standard deviation, degrees, is not determined: about the line of a single strip, say.
 _UNDETERMINED_DEG = 45.0
 
@@ -81,6 +83,8 @@ def pose_sigmas(
     angles = np.einsum("nij,njk,nlk->nil", turns, blocks[:, :3, :3], turns)
     sigmas_m = np.sqrt(np.maximum(np.diagonal(blocks[:, 3:, 3:], axis1=1, axis2=2), 0.0))
     sigmas_deg = np.sqrt(np.maximum(np.diagonal(angles, axis1=1, axis2=2), 0.0))
+    if images < _LEAST_IMAGES and not weights.any():
+        sigmas_m[:] = np.nan
     unseen = np.bincount(seen.image, minlength=images) == 0
     sigmas_m[unseen], sigmas_deg[unseen] = np.nan, np.nan
     sigmas_deg[sigmas_deg > _UNDETERMINED_DEG] = np.nan

@@ -10,6 +10,7 @@ import json
 import sys
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,6 +26,7 @@ from aeromatch_cli.orientation.adjusting import (
     believed_tilts,
     connected_parts,
     drop_weak_images,
+    images_by_camera,
     keep_images,
 )
 from aeromatch_cli.orientation.joining import Part, joined
@@ -64,11 +66,13 @@ def refine(folder: Path) -> None:
     if len(waiting) > 1 and not task["fixed"]:
         waiting = deque(_joined_groups(pycolmap, folder, task["groups"]))
     grouped = {number for group in task["groups"] for number in group["images"]}
+    lenses: dict[int, FloatArray] = {}
     while waiting:
         group = waiting.popleft()
         free = not task["fixed"]
         observed = priors if group["kind"] != "level" else _without_positions(priors)
         model = _posed(pycolmap, folder, set(group["images"]))
+        _take(model, lenses)
         model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
@@ -81,12 +85,14 @@ def refine(folder: Path) -> None:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
                 grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
-            model, observed = _refined(pycolmap, model, folder, group["kind"], task["cameras"], observed, attitudes)
+            work = _Work(pycolmap, folder, task["cameras"], frozenset(lenses))
+            model, observed = _refined(work, model, group["kind"], observed, attitudes)
         model.update_point_3d_errors()
         _drop_weak_points(model)
         drop_weak_images(model)
         if not image_numbers(model):
             continue
+        lenses |= {n: np.array(model.cameras[n].params) for n in images_by_camera(model) if n not in lenses}
         name = f"model{len(facts)}.npz"
         angles_deg = dict(zip(attitudes.images, attitudes.sigmas_deg.tolist(), strict=True))
         deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], angles_deg, float(observed["level_deg"]))
@@ -137,16 +143,28 @@ def _without_positions(priors: Mapping[str, FloatArray]) -> dict[str, FloatArray
     return {**priors, **unknown}
 
 
+@dataclass(frozen=True)
+class _Work:
+    """What the adjustments of a group share. cameras: priors by number. held: those that a larger group has found."""
+
+    pycolmap: ModuleType
+    folder: Path
+    cameras: dict[str, Any]
+    held: frozenset[int]
+
+
+def _take(model: Any, lenses: Mapping[int, FloatArray]) -> None:
+    """Give a model the cameras that a larger group has found: each is one and the same for all groups."""
+    for number, params in lenses.items():
+        if number in model.cameras:
+            model.cameras[number].params = params
+
+
 def _refined(
-    pycolmap: ModuleType,
-    model: Any,
-    folder: Path,
-    kind: str,
-    cameras: dict[str, Any],
-    observed: dict[str, FloatArray],
-    attitudes: Attitudes,
+    work: _Work, model: Any, kind: str, observed: dict[str, FloatArray], attitudes: Attitudes
 ) -> tuple[Any, dict[str, FloatArray]]:
     """The model adjusted and triangulated in turn, while that makes it better; and the observations that it used."""
+    pycolmap, cameras = work.pycolmap, work.cameras
     positions_m, sigmas_m = observed["positions_m"], observed["sigmas_m"]
     if kind == "positions":
         tilts = believed_tilts(pycolmap, model, positions_m, sigmas_m, observed["ups"], observed["rotations"])
@@ -156,17 +174,18 @@ def _refined(
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
         before = model.compute_mean_reprojection_error()
+        given = positions_m, sigmas_m
         if kind == "positions":
-            placement = adjusted(pycolmap, model, cameras, positions_m, sigmas_m, observed["ups"], _COST_TOLERANCE)
+            placement = adjusted(pycolmap, model, cameras, *given, observed["ups"], _COST_TOLERANCE, work.held)
             level_deg = placement.level_sigma_deg
             used = [i for i, agrees in zip(image_numbers(model), placement.agreeing, strict=True) if agrees]
         else:
-            used = adjust_in_place(pycolmap, model, cameras, positions_m, sigmas_m, attitudes, _COST_TOLERANCE)
+            used = adjust_in_place(pycolmap, model, cameras, *given, attitudes, _COST_TOLERANCE, work.held)
         model.update_point_3d_errors()
         made_roughly = number == 0 and _found(kind)
         if not made_roughly and model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
             break
-        model = _triangulated(pycolmap, model, folder, rough=False)
+        model = _triangulated(pycolmap, model, work.folder, rough=False)
     unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
     sigmas_m = sigmas_m.copy()
     sigmas_m[unused] = np.nan

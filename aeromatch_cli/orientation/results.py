@@ -15,6 +15,8 @@ from aeromatch_cli.orientation.precision import Observations, pose_sigmas
 
 # No coordinate of a keypoint is measured more exactly, in pixels.
 _LEAST_ERROR_PX = 0.03
+# Errors of points behind a camera are as large as a number can be.
+_BEHIND_PX = 1e6
 
 
 def image_numbers(model: Any) -> list[int]:
@@ -101,9 +103,12 @@ def _error_px(model: Any) -> float:
 
 
 def figures(model: Any) -> dict[str, Any]:
+    """Counts and errors of a model, JSON-ready. Points behind a camera, whose errors are not finite, do not count."""
+    errors_px = np.array([point.error for point in model.points3D.values()])
+    errors_px = errors_px[errors_px < _BEHIND_PX]
     return {
         "images": model.num_reg_images(),
         "points": model.num_points3D(),
         "track_length": model.compute_mean_track_length(),
-        "reprojection_error_px": model.compute_mean_reprojection_error(),
+        "reprojection_error_px": float(errors_px.mean()) if len(errors_px) else None,
     }

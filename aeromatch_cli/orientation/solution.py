@@ -157,11 +157,17 @@ class Before:
     cameras: Mapping[str, Camera]
 
 
-def from_models(evidence: Evidence, models: Sequence[Model], before: Before, angles: Mapping[str, Angles]) -> Solution:
+def from_models(
+    evidence: Evidence,
+    models: Sequence[Model],
+    before: Before,
+    angles: Mapping[str, Angles],
+    exchanged: str = "",
+) -> Solution:
     """Given poses and cameras, replaced by those of the mapper's models, the largest first.
 
     before: models are moved onto these poses, and where they agree the images keep them and their cameras. angles:
-    image_id -> attitude as it was given.
+    image_id -> attitude as it was given. exchanged: columns with whose exchange the given positions fit the pictures.
     """
     block = evidence.block
     poses, cameras = dict(block.poses), dict(block.cameras)
@@ -211,7 +217,7 @@ def from_models(evidence: Evidence, models: Sequence[Model], before: Before, ang
         **wrong,
         "focal_lengths": _focal_lengths(evidence.stated_cameras, cameras),
         "outside": _outside(block, found),
-        "remarks": [*_position_remarks(models), *_convention_remarks(convention)],
+        "remarks": [*_position_remarks(models, exchanged), *_convention_remarks(convention)],
     }
     return Solution(cameras, poses, terrains, facts)
 
@@ -258,15 +264,16 @@ def _convention_remarks(convention: Recognised | None) -> list[str]:
     return [f"the given angles do not fit the pictures: {convention.words}"]
 
 
-def _position_remarks(models: Sequence[Model]) -> list[str]:
+def _position_remarks(models: Sequence[Model], exchanged: str) -> list[str]:
     contradiction = models[0].figures.get("contradiction") if models else ""
+    said = "the given positions do not fit the pictures"
+    if not contradiction:
+        return []
+    if exchanged:
+        return [f"{said}, but with {exchanged} exchanged they do: exchange these columns of the pose list"]
     if contradiction == "mirrored":
-        return [
-            "the given positions fit the pictures only mirrored: are x and y, or latitude and longitude, exchanged?"
-        ]
-    if contradiction:
-        return ["the given positions do not fit the pictures: are they those of other images, or of another flight?"]
-    return []
+        return [f"{said}, only mirrored: is the sign of x or y, or of latitude or longitude, another?"]
+    return [f"{said}: are they those of other images, or of another flight?"]
 
 
 def _judged(

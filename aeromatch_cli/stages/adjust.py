@@ -37,11 +37,12 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 12
+VERSION = 13
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
 _FAR_CONTROL_M, _FAR_CONTROL_SIGMAS = 10.0, 5.0
+_NOTHING = "not done: no image is oriented, so that export/colmap/sparse holds none"
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 
@@ -52,7 +53,7 @@ def run(context: Context) -> StageReport:
     recipe = context.settings.orient
     groups = orient.groups(context) if isinstance(recipe, FirstPass) else []
     if not groups:
-        report.items, report.facts = 0, {"images": 0}
+        report.items, report.facts = 0, {"images": 0, "remarks": [_NOTHING] if isinstance(recipe, FirstPass) else []}
         _remove(context)
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
@@ -207,9 +208,12 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
         return {}
     pairs = Counter(i for p in context.pairs for i in (p.image_id0, p.image_id1))
     verified: Counter[str] = Counter()
+    tied: Counter[str] = Counter()
     for pair, entry in verified_pairs(context):
         if entry.verdict.state == "verified":
-            verified.update((pair.image_id0, pair.image_id1))
+            ends = pair.image_id0, pair.image_id1
+            verified.update(ends)
+            tied.update(i for i in ends if any(other in adjusted.poses for other in ends if other != i))
     keypoints = {
         image.image_id: len(read_keypoints(path)[0]) if (path := context.workspace.features(image.image_id)).exists()
         else 0 for image in context.block.images
@@ -224,6 +228,8 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
             reasons[image_id] = "in no pair: it overlaps no other image"
         elif not verified[image_id]:
             reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
+        elif not tied[image_id]:
+            reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
         else:
-            reasons[image_id] = f"too few points in common with oriented images ({verified[image_id]} verified pairs)"
+            reasons[image_id] = f"too few points in common with oriented images ({tied[image_id]} verified pairs)"
     return reasons

@@ -9,6 +9,9 @@ from aeromatch_cli.data import Block
 from aeromatch_cli.stages import enhance, filter  # noqa: A004
 from aeromatch_cli.stages.stage_report import StageReport
 
+# What a control figure is of, in words.
+_CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
+
 
 def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
     """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
@@ -150,6 +153,8 @@ def _control_words(control: Mapping[str, Any] | None) -> list[str]:
     if control is None:
         return []
     counts = f"control: {control['control']} control points, {control['check']} check points"
+    if control["points"] and len(control["not_measured_in_two_images"]) == control["points"]:
+        return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     if control["control_rmse_m"] is None:
         return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare"]
 
@@ -158,7 +163,7 @@ def _control_words(control: Mapping[str, Any] | None) -> list[str]:
 
     words = [f"{counts}; RMSE of the fit {shown(control['control_rmse_m'])} m"]
     if control["check_rmse_m"] is not None:
-        words.append(f"RMSE at {control['check_kind']}: {shown(control['check_rmse_m'])} m")
+        words.append(f"RMSE at {_CHECKED[control['check_kind']]}: {shown(control['check_rmse_m'])} m")
     return words
 
 

@@ -35,6 +35,7 @@ from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.exchanged import exchanged_columns
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.lines import frame_remarks
 from aeromatch_cli.stages.stage_report import StageReport
@@ -54,7 +55,7 @@ from aeromatch_cli.workspace import (
 
 log = logging.getLogger("aeromatch")
 
-VERSION = 13
+VERSION = 14
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
@@ -144,7 +145,9 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
             solution.facts["remarks"].append(unoriented_remark(evidence))
     else:
         models, first, evidence = _mapped(context, recipe, first, evidence)
-        solution = from_models(evidence, models, _before(context, kept), context.angles)
+        contradicted = bool(models) and bool(models[0].figures["contradiction"])
+        exchanged = exchanged_columns(block, models[0]) if contradicted else ""
+        solution = from_models(evidence, models, _before(context, kept), context.angles, exchanged)
         if not models:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
