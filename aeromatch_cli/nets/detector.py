@@ -2,9 +2,9 @@
 
 It is applied to every level of `strategies.extractors.pyramid.levels_of`, so it needs no scales of its own. Seven
 convolutions at the level's full resolution, because places count: 5 x 5 from the gray to CHANNELS, five of 3 x 3 (two
-of them with gaps of one pixel) and 3 x 3 to the heat; 12,161 parameters. What a pixel answers depends on the
-2 REACH_PX + 1 pixels squared around it, and through local brightness and contrast on FIELD_PX to every side.
-scripts/train detector documents the training, trained/detector.md the weights.
+of them with gaps of one pixel) and 3 x 3 to the heat; 6,153 parameters, each used twice, the second time turned by
+half. What a pixel answers depends on the 2 REACH_PX + 1 pixels squared around it, and through local brightness and
+contrast on FIELD_PX to every side. scripts/train detector documents the training, trained/detector.md the weights.
 
 Source: heat maps, trained on shapes and then by homographies, after DeTone, Malisiewicz and Rabinovich, SuperPoint,
 CVPR workshops 2018; their maxima over scale after the paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837).
@@ -36,18 +36,51 @@ PIECE_PX = 384
 _FLAT = 1.0 / 255.0
 
 
+class TurnedConvolution(nn.Module):
+    """A convolution whose answers to a picture turned by half are those to the picture, turned by half.
+
+    Channels come in twos, the second half of them what the first would say of the turned picture: kernels are turned
+    by half and read the halves of their input exchanged. Only the kernels of the first half are parameters. `inside` or
+    `outside` of 1 is the picture or the heat, which is its own half turn's.
+
+    Source: group convolution, Cohen and Welling, Group equivariant convolutional networks, ICML 2016, with the group of
+    half turns.
+    """
+
+    def __init__(self, inside: int, outside: int, side: int, gap: int = 1) -> None:
+        super().__init__()
+        self.inside, self.outside, self.gap, self.padding = inside, outside, gap, gap * (side // 2)
+        own = nn.Conv2d(inside, max(1, outside // 2), side)
+        self.weight, self.bias = own.weight, own.bias
+
+    def kernels(self) -> tuple[Tensor, Tensor]:
+        """Weights (outside, inside, side, side) and biases (outside,) of an ordinary convolution that does the same."""
+        turned = self.weight.flip(2, 3).roll(self.inside // 2, 1)
+        if self.outside == 1:
+            return (self.weight + turned) / 2.0, self.bias
+        return torch.cat([self.weight, turned]), torch.cat([self.bias, self.bias])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inside, H, W) -> (N, outside, H, W) of the weights' type."""
+        weights, biases = self.kernels()
+        # As the pictures between the layers lie in memory: another order costs several times the seconds.
+        if self.inside > 1:
+            weights = weights.contiguous(memory_format=torch.channels_last)
+        return F.conv2d(x, weights, biases, padding=self.padding, dilation=self.gap)
+
+
 class Detector(nn.Module):
     """Heat of gray pictures; layers may run in bfloat16, but the entrance and the last layer's sums are float32 always.
 
-    The heat is the mean of what the layers say of the picture and of the picture turned by half: alone, they put it
-    beside its place, to one and the same side.
+    The heat of a picture turned by half is the heat, turned by half: layers that are free to differ put keypoints
+    beside their places, to one and the same side.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.first = nn.Conv2d(1, CHANNELS, 5, padding=2)
-        self.layers = nn.ModuleList(nn.Conv2d(CHANNELS, CHANNELS, 3, padding=gap, dilation=gap) for gap in _GAPS)
-        self.last = nn.Conv2d(CHANNELS, 1, 3, padding=1)
+        self.first = TurnedConvolution(1, CHANNELS, 5)
+        self.layers = nn.ModuleList(TurnedConvolution(CHANNELS, CHANNELS, 3, gap) for gap in _GAPS)
+        self.last = TurnedConvolution(CHANNELS, 1, 3)
 
     def forward(self, gray: Tensor) -> Tensor:
         """Logits (N, 1, H, W) float32 of the heat (confidence 0-1 by a sigmoid) for gray (N, 1, H, W), 0-1.
@@ -58,21 +91,13 @@ class Detector(nn.Module):
         if gray.ndim != 4 or gray.shape[1] != 1:
             raise ValueError(f"gray has shape {tuple(gray.shape)} instead of (N, 1, H, W)")
         x = evened(gray.float())
-        if x.device.type != "cpu":
-            return self._both_ways(x)
+        if x.device.type != "cpu" or self.training:
+            return self._layered(x)
         out = torch.empty_like(x)
         for own_y, needed_y, kept_y in _pieces(x.shape[2]):
             for own_x, needed_x, kept_x in _pieces(x.shape[3]):
-                out[..., own_y, own_x] = self._both_ways(x[..., needed_y, needed_x])[..., kept_y, kept_x]
+                out[..., own_y, own_x] = self._layered(x[..., needed_y, needed_x])[..., kept_y, kept_x]
         return out
-
-    def one_way(self, gray: Tensor) -> Tensor:
-        """What the layers say of the picture as it is, (N, 1, H, W) as `forward`, in half the time: for training."""
-        return self._layered(evened(gray.float()))
-
-    def _both_ways(self, x: Tensor) -> Tensor:
-        """Mean logits (N, 1, H, W) float32 of an evened picture (N, 1, H, W) and of it turned by half."""
-        return (self._layered(x) + self._layered(x.flip(2, 3)).flip(2, 3)) / 2.0
 
     def _layered(self, x: Tensor) -> Tensor:
         """Logits (N, 1, H, W) float32 of an evened picture (N, 1, H, W)."""
@@ -82,8 +107,8 @@ class Detector(nn.Module):
         for layer in self.layers:
             x = F.relu_(layer(x))
         with torch.autocast(x.device.type, enabled=False):
-            bias = self.last.bias
-            return F.conv2d(x.float(), self.last.weight.float(), None if bias is None else bias.float(), padding=1)
+            weights, biases = self.last.kernels()
+            return F.conv2d(x.float(), weights.float(), biases.float(), padding=self.last.padding)
 
 
 def _pieces(length_px: int) -> list[tuple[slice, slice, slice]]:
@@ -131,10 +156,4 @@ def load_detector(path: Path | None = None, precision: Precision = "auto", devic
 
     Raises ConfigError where the file is missing or holds another.
     """
-    network = load_network(Detector, path or shipped_path("detector"), precision, device)
-    # As the pictures between the layers lie in memory: another order costs several times the seconds. Unlike
-    # `.to(memory_format=...)`, this leaves the one-channel weights as they are: float32 sums differ in the last digit.
-    for parameter in network.parameters():
-        if parameter.ndim == 4:
-            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
-    return network
+    return load_network(Detector, path or shipped_path("detector"), precision, device)

@@ -72,7 +72,7 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     explains = f"given poses explain the matches of {explained} of {matched} images"
     if facts["method"] == "given":
         unjudged = "no matches to judge the given poses by" if attitudes else "no matches to find it by"
-        words = [explains if matched else unjudged]
+        words = [(explains if attitudes else "no attitudes were given") if matched else unjudged]
     else:
         sizes = [str(model["images"]) for model in facts["models"]] or ["none"]
         found = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
@@ -81,6 +81,8 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
         words = [f"from the pictures: {found} of {len(block.images)} images{also}", *([explains] if attitudes else [])]
         if facts["frame"] == "own" and given.crs != block.crs:
             words.append(f"in a local frame, not in {given.crs}")
+        elif facts["frame"] == "own" and given.poses:
+            words.append("in a frame of its own, not that of the given positions")
     for camera_id, (before, found) in facts["focal_lengths"].items():
         kept = ", but the given one is kept" if facts["stays"] else ""
         words.append(f"focal length of {camera_id}: {found:.0f} px instead of {before:.0f} px{kept}")

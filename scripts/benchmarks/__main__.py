@@ -9,6 +9,7 @@ from benchmarks.launcher import Table, launch
 
 TABLE: Table = {
     "methods": ("benchmarks.methods.command", "presets beside peers on the same pairs, by truth"),
+    "presets": ("benchmarks.presets", "presets on whole rendered blocks with inexact poses, beside peers, by truth"),
     "blocks": ("benchmarks.blocks.command", "whole real blocks beside pycolmap: matches, mapping, time"),
     "fusion": ("benchmarks.fusion", "every table of preset fusion: a list of runs of the others"),
     "oblique": ("benchmarks.oblique", "every table of oblique pairs: a list of runs of the others"),

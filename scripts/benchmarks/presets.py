@@ -1,0 +1,183 @@
+"""Presets on whole rendered blocks with inexact poses, beside peers on the same pairs, all judged by exact truth.
+
+A preset is one `aeromatch run PRESET` with the block's noisy poses (5 % of the flying height, 3 degrees) and cameras:
+orientation, pairs, features, matches, verification and consistency. Peers get every pair of the block that overlaps by
+20 % or more, those that read poses the noisy ones. All pairs with so much overlap count, whether a preset tries them or
+not. Correct: within 3 px of the exact place. Best: the preset, or peer, with most correct matches in that line. Median
+error: of the medians of pairs. Seconds: of the whole command; peers have none here (see `scripts/bench methods`).
+
+Writes OUT/results.json row by row and OUT/presets.md. What OUT has is not made again: a killed run goes on there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from aeromatch_cli.config import preset_names
+from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
+from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.workspace import read_json, write_json
+from benchmarks import options, stamps
+from benchmarks.methods.worker import measure
+from benchmarks.peers.base import Options
+from benchmarks.peers.table import PEERS, check_method, reads_poses
+from benchmarks.processes import limit_threads
+from benchmarks.scenes import NOISY_POSES, Judged, rendered_scenes, with_noisy_poses
+from benchmarks.tables import Row, code, grouped, markdown, median, number, percent, plain, ratio, total, write_rows
+from benchmarks.whole import evaluated, whole_run
+
+_JUDGED = "auto"
+_ALL_PAIRS = 1_000_000
+_FIGURES = ("possible", "kept", "correct", "median_error_px", "coverage")
+
+
+def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
+    """One row for each pair of a preset's run."""
+    scene = judged.scene
+    given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
+    work = folder / "work"
+    settings = [f"extract.keypoints={args.keypoints}"]
+    run = whole_run("run", preset, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
+    if not run.answer:
+        raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
+    evaluated(work, scene.images.parent, mapping=False)
+    with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
+        found = list(csv.DictReader(stream))
+    shutil.rmtree(work)
+    own = {"seconds": run.seconds / max(1, len(found))}
+    return [
+        {"angle": row["view_angle_class"], **{key: plain(float(row[key] or "nan")) for key in _FIGURES}, **own}
+        for row in found
+    ]
+
+
+def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
+    """One row for each pair that a peer has answered."""
+    limits = Options(args.keypoints, "image", 2, args.seed, args.reference_weights)
+    noisy = with_noisy_poses(judged) if reads_poses(peer) else None
+    rows = []
+    answers = measure(peer, noisy or judged, limits, args.out / "found")
+    for pair, (_, measured) in zip(judged.pairs, answers, strict=True):
+        found = measured.found
+        answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
+        score = judged.truth.judge(*pair.images, *answer).row()
+        rows.append({"angle": pair.conditions.view_angle_class, **{key: plain(score[key]) for key in _FIGURES}})
+    return rows
+
+
+def rows_of(args: argparse.Namespace) -> Iterator[Row]:
+    """Of every method on every block, pair by pair."""
+    first = args.seed
+    for seed in (first + k for k in range(args.seeds)):
+        args.seed = seed
+        for flight, judged in rendered_scenes(args, "all"):
+            for method in (*args.presets, *args.peers):
+                folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}"
+                path = folder / "rows.json"
+                if not path.is_file():
+                    made = preset_rows if method in args.presets else peer_rows
+                    found = made(args, judged, method, *([folder] if method in args.presets else []))
+                    folder.mkdir(parents=True, exist_ok=True)
+                    write_json(path, {"rows": found})
+                for row in read_json(path)["rows"]:
+                    yield {"seed": seed, "flight": flight, "scene": judged.scene.name, "method": method, **row}
+    args.seed = first
+
+
+def _compared(args: argparse.Namespace, rows: Sequence[Row], label: str) -> list[object]:
+    """A line: the judged preset beside the best other preset and the best peer."""
+    of = {method[0]: own for method, own in grouped(rows, "method")}
+    correct = {method: total(own, "correct") for method, own in of.items()}
+    ours = of[_JUDGED]
+    line: list[object] = [
+        label, number(correct[_JUDGED]), percent(ratio(correct[_JUDGED], total(ours, "kept")), 1),
+        f"{median(ours, 'median_error_px'):.2f}",
+    ]  # fmt: skip
+    for names in (args.presets, args.peers):
+        others = [name for name in names if name != _JUDGED and name in of]
+        if not others:
+            line += ["-", "-", "-"]
+            continue
+        best = max(others, key=lambda name: correct[name])
+        right = percent(ratio(correct[best], total(of[best], "kept")), 1)
+        line += [f"{code(best)} {number(correct[best])}", right, f"{ratio(correct[_JUDGED], correct[best]):.2f}"]
+    return line
+
+
+def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
+    """Blocks, classes of view angle, and methods."""
+    heads = ["correct", "of kept", "error px", "best preset", "of kept", "auto / it", "best peer", "of kept",
+             "auto / it"]  # fmt: skip
+    blocks = [
+        _compared(args, own, f"{scene}:{flight}, seed {seed}")
+        for (scene, flight, seed), own in grouped(rows, "scene", "flight", "seed")
+    ]
+    classes = [name for name, _ in VIEW_ANGLE_CLASSES]
+    angles = [
+        _compared(args, own, f"{name} degrees")
+        for name in classes
+        if (own := [row for row in rows if row["angle"] == name])
+    ]
+    methods = []
+    for (method,), own in grouped(rows, "method"):
+        seconds = f"{total(own, 'seconds'):.0f}" if "seconds" in own[0] else "-"
+        right = percent(ratio(total(own, "correct"), total(own, "kept")), 1)
+        found = percent(ratio(total(own, "correct"), total(own, "possible")), 1)
+        tied = sum((row["correct"] or 0) >= 30 for row in own)
+        methods.append(
+            [code(method), number(total(own, "correct")), right, f"{median(own, 'median_error_px'):.2f}", found,
+             f"{tied} of {len(own)}", seconds]
+        )  # fmt: skip
+    return "\n\n".join(
+        [
+            "#### By block\n\n" + markdown(["block", *heads], blocks),
+            "#### By view angle\n\n" + markdown(["view angle", *heads], angles),
+            "#### By method\n\n"
+            + markdown(
+                ["method", "correct", "of kept", "error px", "of possible", "pairs with 30 correct", "seconds"], methods
+            ),
+        ]
+    )
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = options.make_parser("presets", __doc__)
+    add = parser.add_argument
+    add("--presets", type=options.names, default="auto,baseline,fusion,oblique", help="comma-separated, auto first")
+    add("--peers", type=options.names, default="pycolmap-guided", help=f"comma-separated of {', '.join(PEERS)}")
+    options.add_rendered(parser, scenes=",".join(PRESETS), size="800x600", images=12, flights="nadir,mixed,oblique")
+    add("--seeds", type=options.positive, default=1, help="so many, from --seed on")
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image")
+    add("--jobs", type=options.positive, default=2)
+    add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks")
+    options.add_output(parser)
+    args = options.parse(parser, arguments, {"scenes": "suburb", "flights": "nadir", "size": "480x360"})
+    args.pairs = _ALL_PAIRS
+    if _JUDGED not in args.presets:
+        parser.error(f"--presets must hold {_JUDGED}, which the others are compared with")
+    if unknown := [name for name in args.presets if name not in preset_names()]:
+        parser.error(f"--presets: {', '.join(unknown)} are none of {', '.join(preset_names())}")
+    for peer in args.peers:
+        check_method(peer)
+    limit_threads(2)
+    rows = []
+    for row in rows_of(args):
+        rows.append(row)
+        if len(rows) == 1 or any(rows[-2][key] != row[key] for key in ("seed", "flight", "scene", "method")):
+            print(json.dumps({key: row[key] for key in ("scene", "flight", "seed", "method")}), file=sys.stderr)
+            write_rows(args.out / "results.json", rows)
+    write_rows(args.out / "results.json", rows)
+    del args.pairs
+    versions: dict[str, stamps.Version] = {}
+    for preset in args.presets:
+        versions |= stamps.of_chain(preset)
+    options.publish(
+        args, table_of(args, rows) + "\n", args.out / "presets.md", table="bench_presets",
+        command=options.command_line(parser, args), versions=versions,
+    )  # fmt: skip
