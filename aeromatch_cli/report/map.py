@@ -148,10 +148,16 @@ def _show(axes: Any, middle: FloatArray, half: FloatArray) -> None:
 
 
 def _scale_equally(axes: Any) -> None:
-    """Settle where the axes stand, then let what is left of their width or height show more ground."""
+    """Settle where the axes stand, then let what is left of their width or height show more ground.
+
+    Twice: more ground may have longer numbers, which need more room.
+    """
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    for _ in range(2):
+        axes.figure.draw_without_rendering()
+        _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
     axes.figure.draw_without_rendering()
     axes.figure.set_layout_engine("none")
-    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
     _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
 
 

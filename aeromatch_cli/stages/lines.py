@@ -101,6 +101,12 @@ def frame_remarks(record: Mapping[str, Any]) -> list[str]:
     beside = sum(len(group["images"]) for group in record["groups"] if group["kind"] == "level")
     if not beside:
         return []
+    several = len(record["groups"])
+    if record["facts"]["frame"] == "own" and several > 1:
+        return [
+            f"without usable positions each of {several} groups of images is in a frame of its own: scale, north and "
+            "place are arbitrary, and so is the distance between the groups"
+        ]
     if record["facts"]["frame"] == "own":
         return ["without usable positions the result is in a frame of its own: scale, north and place are arbitrary"]
     return [

@@ -46,6 +46,7 @@ PAGES: Mapping[str, str] = {
     "bench_orient": "orient.md",
     "bench_orient_thinned": "orient.md",
     "bench_orient_rendered": "orient.md",
+    "bench_orient_oblique": "orient.md",
     "bench_orient_noisy": "orient.md",
     "bench_orient_many": "orient.md",
     "bench_growth": "orient.md",

@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from aeromatch_cli.config import preset_names
+from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import read_json, write_json
@@ -42,7 +42,8 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
     scene = judged.scene
     given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
-    settings = [f"extract.keypoints={args.keypoints}"]
+    settings = [f"extract.keypoints={args.keypoints}", *args.set]
+    settings += [f"cascade.{step.name}.keypoints={args.keypoints}" for step in load(preset).cascade]
     run = whole_run("run", preset, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
@@ -153,7 +154,8 @@ def main(arguments: Sequence[str]) -> None:
     add("--peers", type=options.names, default="pycolmap-guided", help=f"comma-separated of {', '.join(PEERS)}")
     options.add_rendered(parser, scenes=",".join(PRESETS), size="800x600", images=12, flights="nadir,mixed,oblique")
     add("--seeds", type=options.positive, default=1, help="so many, from --seed on")
-    add("--keypoints", type=options.positive, default=2048, help="descriptors per image")
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image, of every step of a cascade")
+    add("--set", type=options.names, default="", metavar="KEY=VALUE", help="settings of every preset, comma-separated")
     add("--jobs", type=options.positive, default=2)
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks")
     options.add_output(parser)
