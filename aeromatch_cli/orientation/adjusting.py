@@ -25,7 +25,7 @@ from aeromatch_cli.orientation.results import centers_of, image_numbers, points_
 # standard deviation, and grows with the distance: what a lens model lacks also lowers the cost.
 _SAME_COST, _CHANCE = 0.05, 6.0
 # Fewer images do not determine a camera's focal length, or its distortion: it stays as it was given.
-_FOCAL_IMAGES, DISTORTION_IMAGES = 3, 10
+_FOCAL_IMAGES, DISTORTION_IMAGES = 3, 4
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
 _LENS_RATIO = 3.0
 # Images are connected by so many points that both see.
