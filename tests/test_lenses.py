@@ -48,8 +48,16 @@ def test_a_sound_model_keeps_its_images_and_focal_lengths(model: Any) -> None:
     drop_far_images(model)
     assert images_by_camera(model) == {1: MANY, 2: FEW}
     np.testing.assert_allclose(model.cameras[1].params, [790.0, 512.0, 384.0, 0.02])
-    # Four images do not determine a distortion.
+    # Four images do not determine another distortion than the one that was given.
     np.testing.assert_allclose(model.cameras[2].params, [830.0, 512.0, 384.0, 0.01])
+
+
+def test_four_images_determine_a_distortion_that_nobody_gave(model: Any) -> None:
+    known = priors(model)
+    known["2"]["params"][3] = 0.0
+    model.cameras[2].params = [830.0, 512.0, 384.0, -0.04]
+    reset_lenses(model, known)
+    np.testing.assert_allclose(model.cameras[2].params, [830.0, 512.0, 384.0, -0.04])
 
 
 @pytest.mark.parametrize("focal_px", [-7.4e6, 200.0, 2500.0])

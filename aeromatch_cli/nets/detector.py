@@ -51,7 +51,7 @@ class TurnedConvolution(nn.Module):
         super().__init__()
         self.inside, self.outside, self.gap, self.padding = inside, outside, gap, gap * (side // 2)
         own = nn.Conv2d(inside, max(1, outside // 2), side)
-        self.weight, self.bias = own.weight, own.bias
+        self.weight, self.bias = own.weight, own.get_parameter("bias")
 
     def kernels(self) -> tuple[Tensor, Tensor]:
         """Weights (outside, inside, side, side) and biases (outside,) of an ordinary convolution that does the same."""

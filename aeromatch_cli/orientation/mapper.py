@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.orientation.adjusting import (
-    DISTORTION_IMAGES,
+    GIVEN_DISTORTION_IMAGES,
     adjusted,
     believed_tilts,
     drop_far_images,
@@ -153,7 +153,7 @@ def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
     options.mapper.bundle_adjustment.refine_focal_length = free
-    options.mapper.bundle_adjustment.refine_extra_params = free and most >= DISTORTION_IMAGES
+    options.mapper.bundle_adjustment.refine_extra_params = free and most >= GIVEN_DISTORTION_IMAGES
     found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
     return found
 
