@@ -12,7 +12,7 @@ from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z, tilt_deg
 from aeromatch_cli.orientation.dem import terrain_of, terrains_of
-from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share
+from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share, grouped_images
 from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT, place, similarity
 from aeromatch_cli.orientation.resection import resected
 
@@ -105,6 +105,14 @@ def test_a_block_flown_backwards_is_not_explained() -> None:
     assert explained_images(exact, turned, cameras, thresholds) == set()
     back = {i: replace(p, world_rotation=p.world_rotation @ np.diag([-1.0, -1.0, 1.0])) for i, p in truth.items()}
     assert explained_images(pairs, back, cameras, thresholds) == set()
+
+
+@pytest.mark.parametrize(("across", "held"), [(40, True), (200, False)])
+def test_few_matches_contradict_no_group(across: int, held: bool) -> None:
+    """Three images whose poses hold among themselves, and a pair with the others that does not."""
+    good = {("a", "b"): True, ("b", "c"): True, ("c", "d"): True, ("x", "y"): True, ("y", "z"): True, ("d", "x"): False}
+    matches = dict.fromkeys(good, 130) | {("d", "x"): across}
+    assert grouped_images(good, matches) == set("abcd") | (set("xyz") if held else set())
 
 
 def test_an_image_without_enough_points_is_not_resected() -> None:

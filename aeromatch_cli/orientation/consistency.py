@@ -35,7 +35,8 @@ def consistent_images(
     known = {i for i, pose in poses.items() if pose.world_rotation is not None}
     ties = [p for p in pairs if len(p.indices) >= MIN_MATCHES and {p.image_id0, p.image_id1} <= known]
     judged = {i for p in ties for i in (p.image_id0, p.image_id1)}
-    good = grouped_images({(p.image_id0, p.image_id1): _agrees(p, poses, cameras, thresholds_px) for p in ties})
+    agree = {(p.image_id0, p.image_id1): _agrees(p, poses, cameras, thresholds_px) for p in ties}
+    good = grouped_images(agree, {(p.image_id0, p.image_id1): len(p.indices) for p in ties})
     return good | (known - judged) if len(good) >= _MOST * len(judged) else good
 
 

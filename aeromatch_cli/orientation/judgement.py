@@ -19,6 +19,8 @@ N = TypeVar("N", str, tuple[str, str])
 EXPLAINED_SHARE = 0.75
 # A pair of fewer matches says nothing of two poses.
 MIN_MATCHES = 15
+# Matches that contradict a group count from this share of those that hold it together.
+_BY_CHANCE = 0.25
 # Matches at a flatter angle of intersection may seem to lie behind a camera, and give no height.
 _MIN_RAY_ANGLE_DEG = 2.0
 
@@ -70,18 +72,20 @@ def explained_images(
     good = {
         (p.image_id0, p.image_id1): explained_share(p, poses, cameras, thresholds_px) >= EXPLAINED_SHARE for p in ties
     }
-    return grouped_images(good)
+    return grouped_images(good, {(p.image_id0, p.image_id1): len(p.indices) for p in ties})
 
 
-def grouped_images(good: Mapping[tuple[str, str], bool]) -> set[str]:
+def grouped_images(good: Mapping[tuple[str, str], bool], matches: Mapping[tuple[str, str], int]) -> set[str]:
     """Images grouped by pairs that hold: the largest group, and each further one that contradicts none before it.
 
-    good: whether a pair of images holds.
+    good: whether a pair of images holds. matches: how many it has. Few of them across, beside many within a group, are
+    of places that look alike.
     """
     taken: set[str] = set()
     for group in connected_groups([ids for ids, holds in good.items() if holds]):
+        within = sum(matches[ids] for ids, holds in good.items() if holds and group.issuperset(ids))
         across = [ids for ids in good if len(taken.intersection(ids)) == 1 and len(group.intersection(ids)) == 1]
-        if not across:
+        if sum(matches[ids] for ids in across) <= _BY_CHANCE * within:
             taken |= group
     return taken
 

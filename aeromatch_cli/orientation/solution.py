@@ -20,12 +20,13 @@ from aeromatch_cli.orientation.judgement import (
     attitude_errors_deg,
     connected_groups,
     explained_images,
+    explained_share,
     position_errors_m,
     triangulated,
 )
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.resection import resected
-from aeromatch_cli.orientation.soundness import FEWEST_IMAGES
+from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, SLACK
 from aeromatch_cli.orientation.strips import predicted
 from aeromatch_cli.orientation.tying import tied_by_pairs
 
@@ -44,6 +45,8 @@ _UNKNOWN_NORTH_DEG = 180.0
 _OPEN_SIGMAS = 3.0
 # A focal length that differs by more than this share is said.
 _FOCAL_SHARE = 0.02
+# A pair shows ground where its poses explain this share of its matches.
+_SHOWN = 0.5
 # Pictures of one place differ by less, in pixels of the stored images.
 _STANDING_PX = 2.0
 
@@ -322,10 +325,15 @@ def _flying_height_m(evidence: Evidence, poses: Mapping[str, Pose]) -> float:
 def _terrains(
     evidence: Evidence, poses: Mapping[str, Pose], groups: Sequence[set[str]], cameras: Mapping[str, Camera]
 ) -> tuple[tuple[Terrain, ...], int]:
-    """Terrains of groups of posed images, and how many points they come from. cameras: by image_id."""
+    """Terrains of groups of posed images, and how many points they come from. cameras: by image_id.
+
+    Pairs whose matches the poses contradict show no ground.
+    """
+    limits_px = {i: SLACK * limit for i, limit in evidence.thresholds_px.items()}
     parts = []
     for group in groups:
-        own = [pair for pair in evidence.pairs if {pair.image_id0, pair.image_id1} <= group]
+        inside = [pair for pair in evidence.pairs if {pair.image_id0, pair.image_id1} <= group]
+        own = [pair for pair in inside if explained_share(pair, poses, cameras, limits_px) >= _SHOWN]
         centers_m = np.array([poses[i].center_m for i in sorted(group)])
         parts.append((_finite(triangulated(own, poses, cameras)), centers_m))
     return terrains_of(parts), sum(len(points) for points, _ in parts)
