@@ -154,10 +154,8 @@ def block_inputs(
     frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
-    # Heights that count from the flight say nothing of a ground that counts from elsewhere.
-    heights = not located.level or len(located.level) < len(located.poses)
-    stated = _stated_ground(camera_file, frame, Path(lists.cameras).name) if heights else None
-    hint_z_m, hint_source = stated or (_relative_ground(named_poses, facts) if heights else (None, ""))
+    stated = None if _all_level(located) else _stated_ground(camera_file, frame, Path(lists.cameras).name)
+    hint_z_m, hint_source = stated or _relative_ground({} if _all_level(located) else named_poses, facts)
     angles |= _angles_alone(lists, facts, angles)
     ids = image_ids(facts)
     return BlockInputs(
@@ -329,12 +327,20 @@ def _with_exif_heights(
     return observations, [remark] if heights_m else []
 
 
+def _all_level(located: Located) -> bool:
+    """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
+    return bool(located.level) and len(located.level) == len(located.poses)
+
+
 def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]:
     """What is said of images without a height."""
     if not located.level:
         return []
-    all_level = len(located.level) == len(located.poses)
-    zero = "0 m, so that heights count from the flight" if all_level else f"{located.level_m:.1f} m, that of the others"
+    zero = (
+        "0 m, so that heights count from the flight"
+        if _all_level(located)
+        else f"{located.level_m:.1f} m, that of the others"
+    )
     return [f"{_count(located.level, facts)} have a position without height: a level flight at {zero}, is assumed"]
 
 

@@ -173,7 +173,7 @@ def from_models(
     image_id -> attitude as it was given. exchanged: columns with whose exchange the given positions fit the pictures.
     """
     block = evidence.block
-    poses, cameras = dict(block.poses), dict(block.cameras)
+    cameras = dict(block.cameras)
     found: dict[str, Pose] = {}
     for model, kept in reversed(arranged(models, before.poses)):  # the largest model's cameras count
         height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
@@ -193,17 +193,8 @@ def from_models(
     found |= {i: pose for i, (pose, _) in tied.items()}
     groups = _groups_with(models, {i: anchor for i, (_, anchor) in tied.items()})
     convention = None if own else _convention(models, angles, block.poses)
-    outside = block.poses.keys() - found.keys()
-    if own:
-        poses = {}  # given positions are in another frame
-    elif convention is not None:
-        poses |= {i: replace(poses[i], world_rotation=convention.rotation(angles[i])) for i in outside & angles.keys()}
-    else:
-        # An attitude that nothing confirms in a block where others were wrong is not relied on.
-        by_strip = predicted(block, found)
-        for image_id in outside - evidence.consistent():
-            poses[image_id] = by_strip.get(image_id, replace(poses[image_id], world_rotation=None))
-    poses |= found
+    # Given positions are in another frame than one of the pictures' own.
+    poses = found if own else {**block.poses, **_loose_poses(evidence, found, convention, angles), **found}
     terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
     north_deg = {i: _north_sigma_deg(model, block.poses) for model in models for i in model.rotations}
     judged_poses = {i: pose for i, pose in found.items() if i not in beside}
@@ -223,6 +214,22 @@ def from_models(
         "remarks": [*_position_remarks(models, exchanged), *_convention_remarks(convention)],
     }
     return Solution(cameras, poses, terrains, facts)
+
+
+def _loose_poses(
+    evidence: Evidence, found: Mapping[str, Pose], convention: Recognised | None, angles: Mapping[str, Angles]
+) -> dict[str, Pose]:
+    """Poses of images that no model holds, as far as they are to be other than given.
+
+    Attitudes by the right reading of what was given, else by the strip: one that nothing confirms in a block where
+    others were wrong is not relied on.
+    """
+    given = evidence.block.poses
+    outside = given.keys() - found.keys()
+    if convention is not None:
+        return {i: replace(given[i], world_rotation=convention.rotation(angles[i])) for i in outside & angles.keys()}
+    by_strip = predicted(evidence.block, found)
+    return {i: by_strip.get(i, replace(given[i], world_rotation=None)) for i in sorted(outside - evidence.consistent())}
 
 
 def _groups_with(models: Sequence[Model], anchors: Mapping[str, str]) -> list[dict[str, Any]]:
