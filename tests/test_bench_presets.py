@@ -1,0 +1,42 @@
+"""The table of presets on whole blocks: sums, shares and ratios."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+
+import pytest
+from benchmarks.presets import main, table_of
+
+ARGS = Namespace(presets=["auto", "baseline"], peers=["aliked"])
+
+
+def rows(method: str, correct: list[int], kept: list[int], **more: float) -> list[dict[str, object]]:
+    block = {"seed": 1, "flight": "mixed", "scene": "city", "method": method}
+    pairs = zip(("0-20", "20-40"), correct, kept, strict=True)
+    return [
+        block | {"angle": angle, "correct": right, "kept": all_, "possible": 200, "median_error_px": 0.5, **more}
+        for angle, right, all_ in pairs
+    ]
+
+
+def test_the_best_of_each_kind_stands_beside_auto() -> None:
+    found = [
+        *rows("auto", [90, 60], [100, 60], seconds=5.0),
+        *rows("baseline", [60, 15], [60, 20], seconds=2.0),
+        *rows("aliked", [30, 20], [40, 20]),
+    ]
+    text = table_of(ARGS, found)
+    block = "| city:mixed, seed 1 | 150 | 93.8 % | 0.50 | `baseline` 75 | 93.8 % | 2.00 | `aliked` 50 | 83.3 % | 3.00 |"
+    assert block in text
+    steep = "| 20-40 degrees | 60 | 100.0 % | 0.50 | `baseline` 15 | 75.0 % | 4.00 | `aliked` 20 | 100.0 % | 3.00 |"
+    assert steep in text
+    assert "| `auto` | 150 | 93.8 % | 0.50 | 37.5 % | 2 of 2 | 10 |" in text
+    assert "| `aliked` | 50 | 83.3 % | 0.50 | 12.5 % | 1 of 2 | - |" in text
+
+
+def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, said in ((["--presets", "baseline"], "must hold auto"), (["--presets", "auto,none"], "none")):
+        with pytest.raises(SystemExit) as stopped:
+            main([*words, "--out", "nowhere"])
+        assert stopped.value.code == 2
+        assert said in capsys.readouterr().err
