@@ -40,6 +40,9 @@ def grown(
         free = [pair for pair in pairs if not taken.intersection((pair.image_id0, pair.image_id1))]
         lenses = {i: model.cameras.get(k, cameras[k]) for i, k in camera_ids.items()}
         found = _resected(model, free, lenses, thresholds_px)
+        if not found:
+            done.append(model)
+            continue
         parts = [one for one in left if len(found.keys() & one.rotations.keys()) >= _MOST * len(one.rotations)]
         left = [one for one in left if one not in parts]
         elsewhere = {i for one in left for i in one.rotations}

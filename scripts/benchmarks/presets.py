@@ -34,7 +34,7 @@ from benchmarks.whole import evaluated, whole_run
 
 _JUDGED = "auto"
 _ALL_PAIRS = 1_000_000
-_FIGURES = ("possible", "kept", "correct", "median_error_px", "coverage")
+_FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
 def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
@@ -82,8 +82,8 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
                 folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}"
                 path = folder / "rows.json"
                 if not path.is_file():
-                    made = preset_rows if method in args.presets else peer_rows
-                    found = made(args, judged, method, *([folder] if method in args.presets else []))
+                    ours = method in args.presets
+                    found = preset_rows(args, judged, method, folder) if ours else peer_rows(args, judged, method)
                     folder.mkdir(parents=True, exist_ok=True)
                     write_json(path, {"rows": found})
                 for row in read_json(path)["rows"]:
