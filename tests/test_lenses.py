@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import zlib
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from aeromatch_cli.orientation.adjusting import drop_far_images, images_by_camera, reset_lenses
+from aeromatch_cli.orientation.adjusting import (
+    _prefer_prior_focal_lengths,
+    drop_far_images,
+    images_by_camera,
+    reset_lenses,
+)
 from aeromatch_cli.orientation.mapper import _far_from_priors
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
@@ -93,3 +99,18 @@ def test_an_image_at_any_distance_leaves_the_model(model: Any) -> None:
     drop_far_images(model)
     assert sum(images_by_camera(model).values()) == MANY + FEW - 1
     assert not model.images[lost.image_id].has_pose
+
+
+@pytest.mark.parametrize(("rise", "share"), [(0.0, 1.0), (0.0125, 0.5), (1.0, 0.0123)])
+def test_a_focal_length_near_its_prior_is_weighed_with_it(model: Any, rise: float, share: float) -> None:
+    """One standard deviation away: where the cost with the prior is larger by 0.0125, both count the same."""
+
+    def adjuster(which: Any, fixed_cameras: bool) -> Any:
+        assert fixed_cameras
+        cost = 100.0 * (1.0 + rise * (which.cameras[1].params[0] == 800.0))
+        return SimpleNamespace(solve=lambda: SimpleNamespace(ceres_summary=SimpleNamespace(final_cost=cost)))
+
+    model.cameras[1].params = [840.0, 512.0, 384.0, 0.02]
+    _prefer_prior_focal_lengths(model, {"1": priors(model)["1"]}, 100.0, adjuster)
+    assert model.cameras[1].params[0] == pytest.approx(840.0 - 40.0 * share, abs=0.01)
+    assert model.cameras[1].params[3] == pytest.approx(0.02 - 0.01 * share, abs=1e-5)

@@ -186,7 +186,7 @@ def test_page_shows_headline_tables_and_reasons(full):
     words = Structure.of(page).words()
     for text in (
         "4 images",
-        "4 with position, 4 with attitude",
+        "4 with position, 4 with attitude, given or found",
         "5 pairs compared",
         "2 verified pairs",
         "80 verified matches",

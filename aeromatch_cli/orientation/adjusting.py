@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.placing import Placement, place
 from aeromatch_cli.orientation.results import centers_of, image_numbers, points_of
 
@@ -24,6 +25,8 @@ from aeromatch_cli.orientation.results import centers_of, image_numbers, points_
 # many times the mean of a residual: chance lowers it by one for every unknown. The share holds for twice the prior's
 # standard deviation, and grows with the distance: what a lens model lacks also lowers the cost.
 _SAME_COST, _CHANCE = 0.05, 6.0
+# Closer to its prior than this share of twice the standard deviation, a focal length stays as it was found.
+_NEAR = 0.1
 # Fewer images do not determine a camera's focal length, or its distortion: it stays as it was given. A distortion that
 # nobody has given is worse than what few images tell: without it, focal lengths of seven images are off by 4 instead of
 # 2 %, their attitudes by 2 instead of 1 degree (seneca).
@@ -196,11 +199,12 @@ def _adjust(
 def _prefer_prior_focal_lengths(
     model: Any, priors: dict[str, Any], cost: float, adjuster: Callable[[Any, bool], Any]
 ) -> None:
-    """Give up focal lengths far from their priors, where the pictures say nothing against the priors.
+    """Take focal lengths back towards their priors, as far as the pictures say little against the priors.
 
     Where all images look straight down on flat ground, any focal length goes with some flying height, and what an
-    adjustment finds is chance. A prior is taken where the cost of an adjustment with it is nearly the same. cost: of
-    the model as it is.
+    adjustment finds is chance. A prior far away is taken where the cost of an adjustment with it is nearly the same.
+    Nearer ones are weighed: the cost grows with the square of the distance, and the prior's with it. cost: of the model
+    as it is.
     """
     lenses = {number: model.cameras[int(number)] for number in priors if int(number) in model.cameras}
     away = {
@@ -208,17 +212,22 @@ def _prefer_prior_focal_lengths(
         for number, camera in lenses.items()
     }
     far = {number: priors[number] for number, sigmas in away.items() if sigmas > 1.0}
-    if not far:
+    moved = far or {number: priors[number] for number, sigmas in away.items() if sigmas > _NEAR}
+    if not moved:
         return
     trial = copy.deepcopy(model)
-    for number, prior in far.items():
+    for number, prior in moved.items():
         trial.cameras[int(number)].params = prior["params"]
     spare = 2 * model.compute_num_observations() - 3 * model.num_points3D() - 6 * model.num_reg_images()
-    same = max(_SAME_COST * max(away.values()), _CHANCE / max(spare, 1))
-    if adjuster(trial, True).solve().ceres_summary.final_cost > (1.0 + same) * cost:
+    most = max(away.values())
+    same = max(_SAME_COST * (most if far else most**2), _CHANCE / max(spare, 1))
+    rise = max(adjuster(trial, True).solve().ceres_summary.final_cost / cost - 1.0, 0.0)
+    if far and rise > same:
         return
-    for number, prior in far.items():
-        model.cameras[int(number)].params = prior["params"]
+    share = 1.0 if far else same / (same + rise)
+    for number, prior in moved.items():
+        found = model.cameras[int(number)]
+        found.params = found.params + share * (np.array(prior["params"]) - found.params)
     adjuster(model, True).solve()
 
 
@@ -307,19 +316,11 @@ def drop_far_images(model: Any) -> None:
 
 def connected_parts(model: Any) -> list[list[int]]:
     """Numbers of images that shared points connect with each other, the largest part first."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    ids = image_numbers(model)
     shared: Counter[tuple[int, int]] = Counter()
     for point in model.points3D.values():
         shared.update(combinations(sorted({int(element.image_id) for element in point.track.elements}), 2))
-    edges = np.array([pair for pair, count in shared.items() if count >= _SHARED_POINTS]).reshape(-1, 2)
-    rows = np.searchsorted(ids, edges)
-    graph = sparse.coo_matrix((np.ones(len(rows)), (rows[:, 0], rows[:, 1])), shape=(len(ids), len(ids)))
-    _, labels = connected_components(graph, directed=False)
-    parts = [[i for i, label in zip(ids, labels, strict=True) if label == k] for k in range(labels.max(initial=-1) + 1)]
-    return sorted(parts, key=lambda part: (-len(part), part))
+    connected = connected_groups([pair for pair, count in shared.items() if count >= _SHARED_POINTS])
+    return [sorted(part) for part in connected]
 
 
 def keep_images(model: Any, numbers: Collection[int]) -> None:

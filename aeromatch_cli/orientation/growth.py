@@ -38,7 +38,9 @@ def grown(
         model, *left = left
         taken = {i for one in done for i in one.rotations}
         free = [pair for pair in pairs if not taken.intersection((pair.image_id0, pair.image_id1))]
-        lenses = {i: model.cameras.get(k, cameras[k]) for i, k in camera_ids.items()}
+        # As the largest model has it that has found it: images are resected with the camera that they keep.
+        known = {k: camera for one in reversed([model, *left]) for k, camera in one.cameras.items()}
+        lenses = {i: known.get(k, cameras[k]) for i, k in camera_ids.items()}
         found = _resected(model, free, lenses, thresholds_px)
         if not found:
             done.append(model)
@@ -46,7 +48,9 @@ def grown(
         parts = [one for one in left if len(found.keys() & one.rotations.keys()) >= _MOST * len(one.rotations)]
         left = [one for one in left if one not in parts]
         elsewhere = {i for one in left for i in one.rotations}
-        larger = _with(model, parts, {i: pose for i, pose in found.items() if i not in elsewhere})
+        taken_in = {i: pose for i, pose in found.items() if i not in elsewhere}
+        own = {camera_ids[i] for i in taken_in} & known.keys()
+        larger = _with(model, taken_in, {k: known[k] for k in sorted(own)})
         sound = sound_part(larger, free, lenses, thresholds_px, given)
         if sound is not None and sound.rotations.keys() > model.rotations.keys():
             done.append(sound)
@@ -64,12 +68,13 @@ def _resected(
     return resected(pairs, known, lenses, limits_px, (0.0, 0.0))
 
 
-def _with(model: Model, parts: Sequence[Model], found: Mapping[str, Pose]) -> Model:
-    """The model with the poses found; cameras of the parts that it lacks."""
+def _with(model: Model, found: Mapping[str, Pose], cameras: Mapping[str, Camera]) -> Model:
+    """The model with the poses found. cameras: of their images, where a model has found them."""
     rotations, centers_m = dict(model.rotations), dict(model.centers_m)
     for image_id, pose in found.items():
         assert pose.world_rotation is not None
         rotations[image_id], centers_m[image_id] = pose.world_rotation, pose.center_m
-    cameras = {k: camera for part in parts for k, camera in part.cameras.items()} | dict(model.cameras)
     figures = {**model.figures, "images": len(rotations)}
-    return replace(model, rotations=rotations, centers_m=centers_m, cameras=cameras, figures=figures)
+    return replace(
+        model, rotations=rotations, centers_m=centers_m, cameras={**model.cameras, **cameras}, figures=figures
+    )

@@ -13,8 +13,8 @@ from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
 
-# An image, or a pair of them.
-N = TypeVar("N", str, tuple[str, str])
+# An image by its id or number, or a pair of images.
+N = TypeVar("N", str, tuple[str, str], int)
 # Two poses explain the matches of a pair when this share of them lies near its epipolar line and in front of both.
 EXPLAINED_SHARE = 0.75
 # A pair of fewer matches says nothing of two poses.
@@ -94,9 +94,11 @@ def connected_groups(edges: Sequence[tuple[N, N]]) -> list[set[N]]:
     """Connected groups of nodes, the largest first; among equal ones the first in order."""
     group: dict[N, set[N]] = {}
     for one, other in edges:
-        both = group.get(one, {one}) | group.get(other, {other})
-        for node in both:
-            group[node] = both
+        first, second = group.setdefault(one, {one}), group.setdefault(other, {other})
+        if first is not second:
+            larger, smaller = (first, second) if len(first) >= len(second) else (second, first)
+            larger |= smaller
+            group.update(dict.fromkeys(smaller, larger))
     unique = {id(members): members for members in group.values()}
     return sorted(unique.values(), key=lambda members: (-len(members), min(members)))
 

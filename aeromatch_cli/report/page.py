@@ -133,7 +133,7 @@ def _headline(
     matches, parts, weak = facts["verified_matches"], len(facts["components"]), len(facts["weakly_tied"])
     tiles = [
         (_counted(len(images), "image", "images"), False),
-        (f"{posed:,} with position, {full:,} with attitude", False),
+        (f"{posed:,} with position, {full:,} with attitude, given or found", False),
         (_counted(len(pairs), "pair compared", "pairs compared"), False),
         (_counted(verified, "verified pair", "verified pairs"), not verified),
         (_counted(matches, "verified match", "verified matches"), not matches),
