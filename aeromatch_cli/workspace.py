@@ -29,9 +29,13 @@ _PROBE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Workspace:
-    """Every path and file name below one root folder. Holds no state."""
+    """Every path and file name below one root folder. Holds no state.
+
+    features_of: the workspace whose features this one uses, None for its own.
+    """
 
     root: Path
+    features_of: Workspace | None = None
 
     @property
     def config(self) -> Path:
@@ -79,9 +83,10 @@ class Workspace:
         """The first pass is a small workspace of its own."""
         return Workspace(self.orientation / "first_pass")
 
-    def step(self, name: str) -> Workspace:
-        """A step of a cascade is a workspace of its own."""
-        return Workspace(self.root / "steps" / name)
+    def step(self, name: str, features_of: str) -> Workspace:
+        """A step of a cascade is a workspace of its own. features_of: the step whose features it uses."""
+        root = self.root / "steps"
+        return Workspace(root / name, None if features_of == name else Workspace(root / features_of))
 
     @property
     def steps(self) -> Path:
@@ -109,7 +114,7 @@ class Workspace:
         return self.root / "simulated" / image_id / f"{view_name}.png"
 
     def features(self, image_id: str) -> Path:
-        return self.root / "features" / f"{image_id}.npz"
+        return (self.features_of or self).root / "features" / f"{image_id}.npz"
 
     def matches(self, image_id0: str) -> Path:
         return self.root / "matches" / f"{image_id0}.npz"

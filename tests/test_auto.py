@@ -12,7 +12,11 @@ from conftest import Site, invoke
 from aeromatch_cli.config import load
 
 # Small pictures have few matches: with so many a pair is an easy one.
-EASY = ("--set", "cascade.learned.below_matches=60", "--set", "cascade.learned.below_coverage=0")
+EASY = tuple(
+    word
+    for step in ("guided", "learned")
+    for word in ("--set", f"cascade.{step}.below_matches=60", "--set", f"cascade.{step}.below_coverage=0")
+)
 
 
 def test_commands_take_auto_where_no_preset_is_named(tmp_path) -> None:
@@ -20,8 +24,7 @@ def test_commands_take_auto_where_no_preset_is_named(tmp_path) -> None:
     assert outcome.code == 3
     assert "no image" in outcome.stderr
     settings = load("auto")
-    assert [step.name for step in settings.cascade] == ["learned"]
-    assert settings.match.guided
+    assert [step.name for step in settings.cascade] == ["guided", "learned"]
 
 
 @pytest.mark.slow
@@ -56,7 +59,7 @@ def test_an_easy_block_never_loads_torch(site: Site) -> None:
     arguments = [str(argument) for argument in ("run", *site.options("--executor", "serial", *EASY))]
     done = subprocess.run([sys.executable, "-c", _RUN, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "pairs settled: 100 % by first, 0 % by learned" in done.stdout
+    assert "pairs settled: 100 % by first, 0 % by guided, 0 % by learned" in done.stdout
     assert done.stdout.splitlines()[-1] == "False"
 
 
@@ -64,7 +67,7 @@ def test_an_easy_block_never_loads_torch(site: Site) -> None:
 def test_check_says_what_further_steps_may_take(site: Site) -> None:
     outcome = invoke("check", *site.options("--json"))
     assert outcome.facts["estimate"]["seconds_of_further_steps"] > 0.0
-    assert "further   learned: up to" in outcome.stdout
+    assert "further   guided and learned: up to" in outcome.stdout
 
 
 @pytest.mark.slow
@@ -73,9 +76,9 @@ def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
     assert outcome.code == 0
     with (site.work / "steps.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    taken = [row for row in rows if row["steps"] == "first+learned"]
+    taken = [row for row in rows if row["steps"] == "first+guided+learned"]
     assert taken
-    assert all(row["reasons"].startswith("learned: ") for row in taken)
+    assert all(row["reasons"].startswith("guided: ") and "; learned: " in row["reasons"] for row in taken)
     page = (site.work / "report" / "index.html").read_text()
-    assert page.count(">first+learned</td>") == len(taken)
+    assert page.count(">first+guided+learned</td>") == len(taken)
     assert outcome.facts["stages"]["match"]["facts"]["settled_by"]["learned"] == len(taken)

@@ -61,7 +61,7 @@ def test_without_attitudes_no_overlap_is_known() -> None:
         (Evidence(299, 0.5, 0.9), "299 verified matches of 300 that the overlap promises"),
         (Evidence(60, 0.2, 0.1), ""),
         (Evidence(59, 0.2, 0.1), "59 verified matches of 60 that the overlap promises"),
-        (Evidence(29, 0.01, 1.0), "29 verified matches of 30 that the overlap promises"),
+        (Evidence(19, 0.01, 1.0), "19 verified matches of 20 that the overlap promises"),
         (Evidence(900, 0.5, 0.55), "verified matches in 55 % of the overlap"),
         (Evidence(600, float("nan"), float("nan")), ""),
         (Evidence(599, float("nan"), float("nan")), "599 verified matches of 600 that the overlap promises"),
@@ -162,6 +162,24 @@ def _matches(site: Site, step: str) -> int:
 
 def _rows(folder) -> list[VerifiedEntry]:
     return [e for path in sorted(folder.glob("*.npz")) for e in read_verified_row(path).values()]
+
+
+@pytest.mark.slow
+def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(site: Site) -> None:
+    settings = ("--set", "cascade=guided", "--set", "cascade.guided.below_matches=100000")
+    outcome = site("run", *settings)
+    assert outcome.code == 0, outcome.stderr
+    assert "pairs settled: 0 % by first, 100 % by guided" in outcome.stdout
+    assert not (site.work / "steps" / "guided" / "features").exists()
+    first, guided = (_rows(site.work / "steps" / step / "verified") for step in ("first", "guided"))
+    whole = _rows(site.work / "verified")
+    assert len(whole) == len(guided) == len(first)
+    assert sum(len(e.matches.indices) for e in guided) > sum(len(e.matches.indices) for e in first)
+    for joined, own in zip(whole, guided, strict=True):
+        np.testing.assert_array_equal(joined.matches.indices, own.matches.indices)
+    before = {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()}
+    assert site("run", *settings).code == 0
+    assert {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.slow

@@ -156,7 +156,7 @@ that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each key
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones). Features, matches and verdicts of a step lie in its folder, laid out like this workspace; those of
-the workspace itself join them.
+the workspace itself join them. `guided` has no features: it uses those of the first step.
 
 ### matches/<id0>.npz
 

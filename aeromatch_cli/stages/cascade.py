@@ -9,9 +9,10 @@ have found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
@@ -27,9 +28,10 @@ from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
+from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
-from aeromatch_cli.strategies.steps import LearnedFeatures, LiftedShadows, Step
+from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows, Step
 
 # The first step of every cascade.
 FIRST = "first"
@@ -38,16 +40,21 @@ _TYING_OVERLAP = 0.4
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
-_LEAST_MATCHES = 30
+_LEAST_MATCHES = 20
 
 Key = tuple[str, str]
-_RECIPES: Mapping[type[Step], Callable[[Step], dict[str, Strategy]]] = {
-    LearnedFeatures: lambda step: {
+# What a step changes of the settings.
+_RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
+    GuidedSearch: lambda _, settings: {
+        # The step has decided: guided search, however many matches there are.
+        "match": settings.match.model_copy(update={"guided": True, "guide_below_matches": EVERY_PAIR}),
+    },
+    LearnedFeatures: lambda step, _: {
         "simulate": NeighbourViews(),
         "extract": Learned(keypoints=step.keypoints),
         "match": Bidirectional(ratio=0.9, guided=True),
     },
-    LiftedShadows: lambda step: {
+    LiftedShadows: lambda step, _: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
         "extract": Sift(keypoints=step.keypoints),
@@ -78,13 +85,18 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class StepContext:
-    """A step with its context. reasons: why each pair takes it, "" in the first. reports: of extract, match and filter,
-    where this command has run them."""
+    """A step with its context. features_of: the step whose features it uses. reasons: why each pair takes it, "" in the
+    first. reports: of extract, match and filter, where this command has run them."""
 
     name: str
+    features_of: str
     context: Context
     reasons: Mapping[Key, str]
     reports: tuple[StageReport, ...] = ()
+
+    @property
+    def own_features(self) -> bool:
+        return self.features_of == self.name
 
     @cached_property
     def images(self) -> frozenset[str]:
@@ -116,56 +128,64 @@ def _steps(context: Context) -> Iterator[StepContext]:
     """Each step, with the pairs that the results on file of those before it leave to it."""
     settings = context.settings
     chosen = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
-    steps = [_step(context, FIRST, settings.model_copy(update={"cascade": ()}), chosen)]
+    steps = [_step(context, FIRST, FIRST, settings.model_copy(update={"cascade": ()}), chosen)]
     yield steps[0]
     for recipe in settings.cascade:
-        found = evidence_of([step.context for step in steps], steps[-1].reasons)
+        found = evidence_of(steps)
         reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
         left = {key: reason for key, reason in reasons.items() if reason}
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
             left = {key: reason or _BOTH_KNOWN for key, reason in reasons.items() if reason or set(key) <= looked_at}
-        steps.append(_step(context, recipe.name, _own(context, recipe), left))
+        steps.append(_further_step(context, recipe, left))
         yield steps[-1]
 
 
-def further(context: Context) -> list[Context]:
+def further(context: Context) -> list[StepContext]:
     """The steps after the first, each with all pairs."""
     reasons = {(pair.image_id0, pair.image_id1): "" for pair in context.pairs}
-    return [_step(context, recipe.name, _own(context, recipe), reasons).context for recipe in context.settings.cascade]
+    return [_further_step(context, recipe, reasons) for recipe in context.settings.cascade]
 
 
-def _own(context: Context, recipe: Step) -> Settings:
-    """The settings of a further step."""
-    return context.settings.model_copy(update={"cascade": (), **_RECIPES[type(recipe)](recipe)})
+def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) -> StepContext:
+    changed = {"cascade": (), **_RECIPES[type(recipe)](recipe, context.settings)}
+    features_of = recipe.name if recipe.own_features else FIRST
+    return _step(context, recipe.name, features_of, context.settings.model_copy(update=changed), reasons)
 
 
-def _step(context: Context, name: str, settings: Settings, reasons: Mapping[Key, str]) -> StepContext:
+def _step(context: Context, name: str, features_of: str, settings: Settings, reasons: Mapping[Key, str]) -> StepContext:
     own = replace(
         context,
         settings=settings,
-        workspace=context.workspace.step(name),
+        workspace=context.workspace.step(name, features_of),
         chosen=frozenset(reasons),
         part=f"{name}: ",
     )
-    return StepContext(name, own, reasons)
+    return StepContext(name, features_of, own, reasons)
 
 
-def evidence_of(steps: Sequence[Context], keys: Collection[Key]) -> dict[Key, Evidence]:
-    """What the steps have found together of those of the pairs that the last one has judged."""
-    places: dict[Key, list[tuple[FloatArray, FloatArray]]] = {}
-    last: set[Key] = set()
-    for context in steps:
-        read = cache(lambda image_id, context=context: read_keypoints(context.workspace.features(image_id))[0])
-        last = set()
-        for pair, entry in filter.verified_pairs(context):
+def evidence_of(steps: Sequence[StepContext]) -> dict[Key, Evidence]:
+    """What the steps have found together of those of the pairs that the last of their steps has judged."""
+    # By pair and the step that has made the features: of several steps with the same ones the last counts.
+    places: dict[Key, dict[str, tuple[FloatArray, FloatArray]]] = {}
+    judged: set[Key] = set()
+    for step in steps:
+        workspace = step.context.workspace
+        read = cache(lambda image_id, workspace=workspace: read_keypoints(workspace.features(image_id))[0])
+        judged -= step.reasons.keys()
+        for pair, entry in filter.verified_pairs(step.context):
             key = pair.image_id0, pair.image_id1
-            if key in keys and (context.chosen is None or key in context.chosen):
-                last.add(key)
+            if key in step.reasons:
+                judged.add(key)
                 found = entry.matches.indices if entry.verdict.state == "verified" else entry.matches.indices[:0]
-                places.setdefault(key, []).append((read(key[0])[found[:, 0]], read(key[1])[found[:, 1]]))
-    pairs = ((pair.image_id0, pair.image_id1, pair) for pair in steps[0].pairs)
-    return {(id0, id1): _evidence(steps[0], pair, places[id0, id1]) for id0, id1, pair in pairs if (id0, id1) in last}
+                both = read(key[0])[found[:, 0]], read(key[1])[found[:, 1]]
+                places.setdefault(key, {})[step.features_of] = both
+    pairs = ((pair.image_id0, pair.image_id1, pair) for pair in steps[0].context.pairs)
+    return {
+        (id0, id1): _evidence(steps[0].context, pair, [*places[id0, id1].values()])
+        for id0, id1, pair in pairs
+        if (id0, id1) in judged
+    }
 
 
 def _evidence(context: Context, pair: Pair, found: Sequence[tuple[FloatArray, FloatArray]]) -> Evidence:

@@ -158,10 +158,10 @@ def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
     """Seconds that the further steps of a cascade take where every pair needs them; None where that is unknown."""
     every_s = 0.0
     for step in cascade.further(context):
-        costs = _costs(step, sampled[0]) if sampled else None
+        costs = _costs(step.context, sampled[0]) if sampled else None
         if costs is None:
             return None
-        every_s += len(context.block.images) * costs[0] + len(context.pairs) * costs[1]
+        every_s += step.own_features * len(context.block.images) * costs[0] + len(context.pairs) * costs[1]
     return round(every_s / context.executor.jobs, 1)
 
 

@@ -54,7 +54,8 @@ class KeypointsTask:
 
 @dataclass(frozen=True, eq=False)
 class RowTask:
-    """All pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, names and workspaces."""
+    """All pairs of one image. pairs: image_id1 -> fingerprint; steps: by image_id1, the name of the step whose features
+    the matches use, and the workspace that has them."""
 
     image_id0: str
     pairs: Mapping[str, str]
@@ -67,7 +68,7 @@ def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
     features: dict[str, str] = {}
     for image in context.block.images:
         image_id = image.image_id
-        looking = [step for step in steps if image_id in step.images]
+        looking = [step for step in steps if step.own_features and image_id in step.images]
         kinds = [(step.name, extract.task_of(step.context, image_id).fingerprint) for step in looking]
         features[image_id] = fingerprint(VERSION, kinds)
     matches = {}
@@ -90,17 +91,17 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
     tasks = []
-    usable = [extract.current(step.context, step.images) for step in steps]
+    usable = [(step, extract.current(step.context, step.images)) for step in steps if step.own_features]
     for image in context.block.images:
         image_id = image.image_id
-        own = [step for step, ready in zip(steps, usable, strict=True) if image_id in ready]
+        own = [step for step, ready in usable if image_id in ready]
         wanted = context.union.features[image_id]
         if own and (context.overwrite or features_fingerprint(context.workspace.features(image_id)) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
     report.skipped = report.items - report.done - len(report.failures)
-    report.facts = {"images_by_step": {step.name: len(step.images) for step in steps}}
+    report.facts = {"images_by_step": {step.name: len(step.images) for step in steps if step.own_features}}
     report.fingerprint = fingerprint(sorted(context.union.features.values()))
     return report.write(context.workspace)
 
@@ -169,13 +170,14 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
         wanted, own = {}, {}
         for pair in pairs:
             key = pair.image_id0, pair.image_id1
-            known = [
-                (step.name, step.context.workspace)
+            # Of several steps with the same features the last one's matches count.
+            known = {
+                step.features_of: step.context.workspace
                 for step, found in zip(steps, on_file, strict=True)
                 if key in step.reasons and found[image_id0].get(key[1]) == match.pair_fingerprint(step.context, pair)
-            ]
+            }
             if known and set(key) <= ready:
-                wanted[key[1]], own[key[1]] = context.union.matches[key], tuple(known)
+                wanted[key[1]], own[key[1]] = context.union.matches[key], tuple(known.items())
         tasks.append(RowTask(image_id0, wanted, own, context.workspace))
     tasks = [task for task in tasks if task.pairs]
     report.items = sum(len(task.pairs) for task in tasks)

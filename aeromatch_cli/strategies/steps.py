@@ -13,14 +13,21 @@ from pydantic import Field
 
 from aeromatch_cli.strategies import Strategy
 
+_KEYPOINTS: int = Field(
+    4000, ge=1, description="Largest number of descriptors per image of this step. Larger: more time and memory."
+)
+
 
 class Step(Strategy):
     """What all steps have in common: which pairs take them.
 
-    cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
+    own_features: it finds keypoints of its own, else it uses those of the first step, and what it finds replaces that
+    step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
     """
 
+    own_features: ClassVar[bool] = True
     cheap_to_match: ClassVar[bool] = False
+    name: str
     # With 400 as many correct matches as with 600 in four rendered blocks of one and two suns, with 250 a quarter fewer
     # under two; on easy farmland (seneca) nine pairs of 210 asked with 600, all but at their goal.
     below_matches: int = Field(
@@ -36,9 +43,14 @@ class Step(Strategy):
         description="And by pairs with an overlap of 40 % or more whose verified matches lie in less than this share "
         "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
     )
-    keypoints: int = Field(
-        4000, ge=1, description="Largest number of descriptors per image of this step. Larger: more time and memory."
-    )
+
+
+class GuidedSearch(Step):
+    """The first step's keypoints matched once more, within the windows that the poses predict and around the places
+    that verified matches predict."""
+
+    own_features: ClassVar[bool] = False
+    name: Literal["guided"] = "guided"
 
 
 class LearnedFeatures(Step):
@@ -46,12 +58,14 @@ class LearnedFeatures(Step):
 
     cheap_to_match: ClassVar[bool] = True
     name: Literal["learned"] = "learned"
+    keypoints: int = _KEYPOINTS
 
 
 class LiftedShadows(Step):
     """SIFT with shadows lifted, views from the neighbours' directions, LightGlue."""
 
     name: Literal["shadow"] = "shadow"
+    keypoints: int = _KEYPOINTS
 
 
-STEPS: Mapping[str, type[Strategy]] = {"learned": LearnedFeatures, "shadow": LiftedShadows}
+STEPS: Mapping[str, type[Strategy]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}

@@ -43,7 +43,9 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
     given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
     settings = [f"extract.keypoints={args.keypoints}", *args.set]
-    settings += [f"cascade.{step.name}.keypoints={args.keypoints}" for step in load(preset).cascade]
+    settings += [
+        f"cascade.{step.name}.keypoints={args.keypoints}" for step in load(preset).cascade if step.own_features
+    ]
     run = whole_run("run", preset, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison,
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
 from aeromatch_cli.strategies.matchers.descriptors.views import appearances, comparable_views
 
+# Of guide_below_matches: all pairs are searched again, without counting first.
+EVERY_PAIR = sys.maxsize
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
 
@@ -111,10 +114,10 @@ class Search(Strategy):
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
         comparison = Comparison(features0, features1, geometry, source)
-        found = self.scan(comparison)
+        found = None if self.guide_below_matches == EVERY_PAIR else self.scan(comparison)
         comparison = replace(comparison, where=where)
-        found = comparison.within(found)
-        if len(found.rows) < self.guide_below_matches:
+        found = None if found is None else comparison.within(found)
+        if found is None or len(found.rows) < self.guide_below_matches:
             comparison, found = yield from self._search_again(comparison, found, enhanced)
         return _matches(comparison, found)
 
@@ -126,13 +129,14 @@ class Search(Strategy):
         """
 
     def _search_again(
-        self, comparison: Comparison, found: Found, enhanced: list[BoolArray]
+        self, comparison: Comparison, found: Found | None, enhanced: list[BoolArray]
     ) -> Steps[tuple[Comparison, Found]]:
         """The comparison with most matches (source or enhanced pictures) and its matches after the guided search.
 
-        enhanced: comparable view pairs (V0, V1) of the enhanced pictures, if there are any.
+        found: what a scan without windows has left within them, if there was one. enhanced: comparable view pairs
+        (V0, V1) of the enhanced pictures, if there are any.
         """
-        first = found if comparison.where is None else self.scan(comparison)
+        first = found if found is not None and comparison.where is None else self.scan(comparison)
         others = [replace(comparison, comparable=comparable) for comparable in enhanced]
         scans = [(comparison, first), *((other, self.scan(other)) for other in others)]
         # Under the same sun the borders of shadows are texture, else they mislead: the number of matches decides.
