@@ -67,8 +67,8 @@ def test_tables_count_what_was_accepted_wrongly_and_compare_times():
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables(rows).splitlines() if "|" in line]
     mine = next(line for line in lines if line[:2] == ["grass", "polar"])
     assert mine[2:5] == ["3", "2", "1"]
-    times = next(line for line in lines if line[:2] == ["known", "10x10"])
-    assert times[2:8] == ["3", "8.00", "1.00", "2.00", "12.5%", "25.0%"]
+    times = next(line for line in lines if line[:3] == ["known", "polar", "10x10"])
+    assert times[3:9] == ["3", "8.00", "1.00", "2.00", "12.5%", "25.0%"]
     assert next(line for line in lines if line[0] == "saturated")[1:3] == ["3", "1"]
 
 

@@ -11,7 +11,7 @@ from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.grid import Grid
-from aeromatch_cli.strategies.matchers.polar import Polar
+from aeromatch_cli.strategies.matchers.polar import Measured, Polar
 from aeromatch_cli.strategies.matchers.polar.relief import agreed
 from aeromatch_cli.strategies.simulators.none import source_view
 
@@ -41,6 +41,27 @@ def test_points_are_measured_to_a_few_hundredths_of_a_pixel_both_ways():
         off = np.linalg.norm(there[rows] - apply_homography(way, own[rows]), axis=1)
         assert np.median(off) < 0.06
         assert np.percentile(off, 95) < 0.2
+
+
+@pytest.mark.parametrize(("turn_deg", "scale"), [(12.0, 1.05), (200.0, 0.85)])
+def test_the_similarity_of_the_tie_points_is_right_to_a_hundredth_of_a_pixel(turn_deg: float, scale: float):
+    first, second, truth = pair(turn_deg, scale, (50.0, 20.0), seed=18)
+    polar = Polar()
+    found = polar.registered(first, second, GEOMETRY)
+    points = polar.measured(found, *(grid(shot, 150).keypoints_px for shot in (first, second)))
+    matrix = points.similarity()
+    shared = points.points0_px.mean(axis=0, keepdims=True)
+    off_px = np.linalg.norm(apply_homography(matrix, shared) - apply_homography(truth, shared))
+    assert off_px < 0.01
+    assert abs(np.rad2deg(np.angle((matrix[0, 0] + 1j * matrix[1, 0]) / (truth[0, 0] + 1j * truth[1, 0])))) < 0.002
+    gross = replace(
+        points, points1_px=points.points1_px + np.where(np.arange(len(points.indices)) % 10 == 0, 5.0, 0.0)[:, None]
+    )
+    again = gross.similarity()
+    assert np.linalg.norm(apply_homography(again, shared) - apply_homography(truth, shared)) < 0.01
+    with pytest.raises(ValueError, match="two tie points, there are 1"):
+        Measured(points.indices[:1], *(getattr(points, name)[:1] for name in (
+            "points0_px", "points1_px", "correlations", "sigmas_px"))).similarity()  # fmt: skip
 
 
 def test_the_order_of_the_images_makes_no_difference_to_where_points_lie():

@@ -48,13 +48,15 @@ def homography_jacobians(homography: FloatArray, points_px: FloatArray, there_px
     return np.asarray((homography[:2, :2] - there_px[:, :, None] * homography[2, :2]) / depth[:, None, None])
 
 
-def closest_similarity(points0: FloatArray, points1: FloatArray) -> FloatArray:
+def closest_similarity(points0: FloatArray, points1: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """(3, 3) similarity that takes points (N, 2), two different ones at least, to others by least squares.
 
-    Source: Umeyama, IEEE TPAMI 13(4), 1991, in the plane without mirroring.
+    weights: (N,), by default equal. Source: Umeyama, IEEE TPAMI 13(4), 1991, in the plane without mirroring.
     """
-    first, second = ((points - points.mean(axis=0)) @ np.array([1.0, 1j]) for points in (points0, points1))
-    factor = complex(np.vdot(first, second) / np.vdot(first, first))
+    middles = [np.average(points, axis=0, weights=weights) for points in (points0, points1)]
+    first, second = ((points - m) @ np.array([1.0, 1j]) for points, m in zip((points0, points1), middles, strict=True))
+    own = first if weights is None else first * weights
+    factor = complex(np.vdot(own, second) / np.vdot(own, first))
     linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
-    shift = points1.mean(axis=0) - linear @ points0.mean(axis=0)
+    shift = middles[1] - linear @ middles[0]
     return np.vstack([np.column_stack([linear, shift]), [0.0, 0.0, 1.0]])

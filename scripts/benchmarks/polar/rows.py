@@ -17,6 +17,8 @@ from benchmarks.polar.sides import RATIO, PolarResult, SiftPair, SiftResult, reg
 from benchmarks.tables import Row
 
 TIE_POINTS = 1000
+# The similarity by least squares over fewer tie points.
+FEW_TIE_POINTS, ADJUSTED = 250, "polar, adjusted"
 RATIOS = (0.6, 0.7, 0.8, 0.9)
 NEGATIVES = ("apart", "other ground", "apart", "saturated", "featureless")
 RIGHT_PX = 3.0
@@ -56,6 +58,8 @@ def known_rows(task: Task, pairs: int, with_sift: int) -> Iterator[Row]:
                     "overlap": pair.overlap, "valid": True}  # fmt: skip
             found = registered(pair.first, pair.second, TIE_POINTS)
             yield head | {"method": "polar"} | _of_polar(found) | _against_truth(found.matrix, found, pair)
+            few = registered(pair.first, pair.second, FEW_TIE_POINTS)
+            yield head | {"method": ADJUSTED} | _of_polar(few) | _against_truth(few.adjusted(), few, pair)
             scales = ((1.0,) if number * count + index < with_sift else ()) + (_REDUCED,)
             for scale in scales:
                 other = SiftPair(pair.first, pair.second, scale).matched()

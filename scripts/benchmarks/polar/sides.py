@@ -16,7 +16,7 @@ from aeromatch_cli.geometry.frames import apply_homography, closest_similarity, 
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.grid import Grid
-from aeromatch_cli.strategies.matchers.polar import Polar, Registered
+from aeromatch_cli.strategies.matchers.polar import Measured, Polar, Registered
 from aeromatch_cli.strategies.matchers.polar.registration import Registration
 from aeromatch_cli.strategies.simulators.none import source_view
 
@@ -55,20 +55,31 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class PolarResult:
-    """matrix: (3, 3) px1 from px0 of stored pixels. found: what it is of. points0, points1: (M, 2) tie points. seconds:
-    of the registration; seconds_tie_points: of everything. Everything but decoding, as for SIFT: the grid too.
+    """matrix: (3, 3) px1 from px0 of stored pixels. found: what it is of. measured: tie points. seconds: of the
+    registration; seconds_tie_points: of everything. Everything but decoding, as for SIFT: the grid too.
     """
 
     matrix: FloatArray
     found: Registered
-    points0: FloatArray
-    points1: FloatArray
+    measured: Measured
     seconds: float
     seconds_tie_points: float
 
     @property
     def registration(self) -> Registration:
         return self.found.registration
+
+    @property
+    def points0(self) -> FloatArray:
+        return self.measured.points0_px
+
+    @property
+    def points1(self) -> FloatArray:
+        return self.measured.points1_px
+
+    def adjusted(self) -> FloatArray:
+        """(3, 3) px1 from px0 by the tie points, else as registered."""
+        return self.measured.similarity() if len(self.points0) >= _FEWEST else self.matrix
 
     def places1(self, places0: FloatArray) -> FloatArray:
         """Where stored pixels (N, 2) of picture 0 lie in picture 1: the homography, and what the nearest tie points
@@ -113,7 +124,7 @@ def registered(
     straight = found.registration.matrix if found.side0.camera is None else np.eye(3)
     if found.side0.camera is not None and len(shared0) >= 2:
         straight = closest_similarity(shared0, shared1)
-    return PolarResult(straight, found, points.points0_px, points.points1_px, seconds, total)
+    return PolarResult(straight, found, points, seconds, total)
 
 
 def _shared(found: Registered) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.polar.rows import RIGHT_PX
+from benchmarks.polar.rows import ADJUSTED, RIGHT_PX
 from benchmarks.tables import Column, Row, grouped, table, total, values
 
 _Rows = Sequence[Row]
@@ -133,18 +133,22 @@ def known_table(rows: _Rows) -> str:
 def time_table(rows: _Rows) -> str:
     """Of pairs that SIFT took at full size: polar's seconds over its."""
 
-    def lines() -> Iterator[tuple[tuple[str, str], np.ndarray]]:
-        for section, method in (("known", "sift"), ("unknown", "sift 0.8")):
+    def lines() -> Iterator[tuple[tuple[str, str, str], np.ndarray]]:
+        for section, sift, method in (
+            ("known", "sift", "polar"),
+            ("known", "sift", ADJUSTED),
+            ("unknown", "sift 0.8", "polar"),
+        ):
             for (size,), own in grouped([row for row in rows if row["section"] == section], "size"):
-                pairs: dict[str, dict[Any, Row]] = {method: {}, "polar": {}}
+                pairs: dict[str, dict[Any, Row]] = {sift: {}, method: {}}
                 for row in own:
                     pairs.setdefault(row["method"], {})[row["kind"], row["pair"]] = row
-                sift, mine = pairs[method], pairs["polar"]
-                if both := sorted(sift.keys() & mine.keys()):
-                    times = [[sift[at]["seconds"], mine[at]["seconds"], mine[at]["seconds_tie_points"]] for at in both]
-                    yield (section, size), np.array(times).T
+                other, mine = pairs[sift], pairs[method]
+                if both := sorted(other.keys() & mine.keys()):
+                    times = [[other[at]["seconds"], mine[at]["seconds"], mine[at]["seconds_tie_points"]] for at in both]
+                    yield (section, method, size), np.array(times).T
 
-    return _unless_empty(("parameters", "size"), list(lines()), _TIMES)
+    return _unless_empty(("parameters", "method", "size"), list(lines()), _TIMES)
 
 
 def unknown_table(rows: _Rows) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from aeromatch_cli.data import Features, FloatArray, IntArray, Matches, PairGeometry, Raster
+from aeromatch_cli.geometry.frames import apply_homography, closest_similarity
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.polar.points import Limits, TiePoints, tie_points
 from aeromatch_cli.strategies.matchers.polar.pyramid import Pyramid
@@ -25,6 +26,8 @@ from aeromatch_cli.strategies.matchers.polar.sides import Side, grounded
 
 # What poses must promise for a pair to be compared without them, where nothing was found with them.
 _LEAST_UNPOSED_OVERLAP = 0.3
+# Of a similarity from tie points: standard deviations are no smaller, and weights are settled in so many rounds.
+_LEAST_SIGMA_PX, _ROUNDS = 0.02, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,23 @@ class Measured:
     points1_px: FloatArray
     correlations: FloatArray
     sigmas_px: FloatArray
+
+    def similarity(self) -> FloatArray:
+        """(3, 3) similarity of stored pixels, image 1 from image 0, by least squares over the tie points.
+
+        That of the registration is measured on reduced pictures; this one is as exact as stored pixels allow, where the
+        ground is flat. Weights by the points' standard deviations, and less and less for those that lie off (Cauchy).
+        Raises ValueError with fewer than two tie points.
+        """
+        if len(self.points0_px) < 2:
+            raise ValueError(f"a similarity needs two tie points, there are {len(self.points0_px)}")
+        own = 1.0 / np.maximum(self.sigmas_px, _LEAST_SIGMA_PX) ** 2
+        matrix = closest_similarity(self.points0_px, self.points1_px, own)
+        for _ in range(_ROUNDS):
+            off = np.linalg.norm(apply_homography(matrix, self.points0_px) - self.points1_px, axis=1)
+            usual = max(float(np.median(off)), _LEAST_SIGMA_PX)
+            matrix = closest_similarity(self.points0_px, self.points1_px, own / (1.0 + (off / (2.0 * usual)) ** 2))
+        return matrix
 
 
 class Polar(Strategy):
