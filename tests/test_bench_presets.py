@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from pathlib import Path
 
 import pytest
 from benchmarks.presets import main, table_of
+from benchmarks.quality import draw_quality, quality
 
 ARGS = Namespace(presets=["auto", "baseline"], peers=["aliked"])
 
@@ -21,17 +23,27 @@ def rows(method: str, correct: list[int], kept: list[int], **more: float) -> lis
 
 def test_the_best_of_each_kind_stands_beside_auto() -> None:
     found = [
-        *rows("auto", [90, 60], [100, 60], seconds=5.0),
-        *rows("baseline", [60, 15], [60, 20], seconds=2.0),
-        *rows("aliked", [30, 20], [40, 20]),
+        *rows("auto", [90, 60], [100, 60], seconds=5.0, run_seconds=9.0),
+        *rows("baseline", [60, 15], [60, 20], seconds=2.0, run_seconds=4.0),
+        *rows("aliked", [30, 20], [40, 20], seconds=3.0),
     ]
     text = table_of(ARGS, found)
     block = "| city:mixed, seed 1 | 150 | 93.8 % | 0.50 | `baseline` 75 | 93.8 % | 2.00 | `aliked` 50 | 83.3 % | 3.00 |"
     assert block in text
     steep = "| 20-40 degrees | 60 | 100.0 % | 0.50 | `baseline` 15 | 75.0 % | 4.00 | `aliked` 20 | 100.0 % | 3.00 |"
     assert steep in text
-    assert "| `auto` | 150 | 93.8 % | 0.50 | 37.5 % | 2 of 2 | 10 |" in text
-    assert "| `aliked` | 50 | 83.3 % | 0.50 | 12.5 % | 1 of 2 | - |" in text
+    assert "| `auto` | 150 | 93.8 % | 0.50 | 37.5 % | 2 of 2 | 10 | 18 |" in text
+    assert "| `aliked` | 50 | 83.3 % | 0.50 | 12.5 % | 1 of 2 | 6 | - |" in text
+
+
+def test_quality_and_seconds_are_per_pair(tmp_path: Path) -> None:
+    found = rows("auto", [90, 60], [100, 60], seconds=5.0, run_seconds=9.0)
+    found += rows("aliked", [30, 20], [40, 20], seconds=3.0)
+    assert quality(found) == [("auto", 5.0, 75.0, 0.9375), ("aliked", 3.0, 25.0, 50 / 60)]
+    draw_quality(tmp_path / "quality.svg", found)
+    again = tmp_path / "again.svg"
+    draw_quality(again, found)
+    assert again.read_bytes() == (tmp_path / "quality.svg").read_bytes()
 
 
 def test_what_cannot_be_measured_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

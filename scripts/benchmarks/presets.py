@@ -4,9 +4,11 @@ A preset is one `aeromatch run PRESET` with the block's noisy poses (5 % of the 
 orientation, pairs, features, matches, verification and consistency. Peers get every pair of the block that overlaps by
 20 % or more, those that read poses the noisy ones. All pairs with so much overlap count, whether a preset tries them or
 not. Correct: within 3 px of the exact place. Best: the preset, or peer, with most correct matches in that line. Median
-error: of the medians of pairs. Seconds: of the whole command; peers have none here (see `scripts/bench methods`).
+error: of the medians of pairs. Seconds: of features, each image's once, matching and verification, on --jobs cores;
+orientation, start-up and export, which peers do without, are in the seconds of the whole command alone.
 
-Writes OUT/results.json row by row and OUT/presets.md. What OUT has is not made again: a killed run goes on there.
+Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has is
+not made again: a killed run goes on there. A preset may be PRESET[key=value,key=value].
 """
 
 from __future__ import annotations
@@ -19,21 +21,25 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from aeromatch_cli.config import load, preset_names
+from aeromatch_cli.config import load, parse_method, preset_names
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import read_json, write_json
 from benchmarks import options, stamps
 from benchmarks.methods.worker import measure
+from benchmarks.pages import FOLDER
 from benchmarks.peers.base import Options
-from benchmarks.peers.table import PEERS, check_method, reads_poses
+from benchmarks.peers.table import PEERS, check_method, reads_poses, split_methods
 from benchmarks.processes import limit_threads
+from benchmarks.quality import draw_quality
 from benchmarks.scenes import NOISY_POSES, Judged, rendered_scenes, with_noisy_poses
 from benchmarks.tables import Row, code, grouped, markdown, median, number, percent, plain, ratio, total, write_rows
 from benchmarks.whole import evaluated, whole_run
 
 _JUDGED = "auto"
 _ALL_PAIRS = 1_000_000
+# Whose seconds are those of features, matching and verification.
+_STAGES = ("extract", "match", "filter")
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
@@ -42,18 +48,19 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
     scene = judged.scene
     given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
-    settings = [f"extract.keypoints={args.keypoints}", *args.set]
-    settings += [
-        f"cascade.{step.name}.keypoints={args.keypoints}" for step in load(preset).cascade if step.own_features
-    ]
-    run = whole_run("run", preset, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
+    name, own_settings = parse_method(preset)
+    settings = [*own_settings, f"extract.keypoints={args.keypoints}", *args.set]
+    steps = load(name, own_settings).cascade
+    settings += [f"cascade.{step.name}.keypoints={args.keypoints}" for step in steps if step.own_features]
+    run = whole_run("run", name, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
     evaluated(work, scene.images.parent, mapping=False)
     with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
         found = list(csv.DictReader(stream))
     shutil.rmtree(work)
-    own = {"seconds": run.seconds / max(1, len(found))}
+    seconds = sum(run.answer["stages"][stage]["seconds"] for stage in _STAGES)
+    own = {"seconds": seconds / max(1, len(found)), "run_seconds": run.seconds / max(1, len(found))}
     return [
         {"angle": row["view_angle_class"], **{key: plain(float(row[key] or "nan")) for key in _FIGURES}, **own}
         for row in found
@@ -62,15 +69,20 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
 
 def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
     """One row for each pair that a peer has answered."""
-    limits = Options(args.keypoints, "image", 2, args.seed, args.reference_weights)
+    limits = Options(args.keypoints, "image", args.jobs, args.seed, args.reference_weights)
     noisy = with_noisy_poses(judged) if reads_poses(peer) else None
-    rows = []
+    rows: list[Row] = []
+    known: set[str] = set()
     answers = measure(peer, noisy or judged, limits, args.out / "found")
     for pair, (_, measured) in zip(judged.pairs, answers, strict=True):
         found = measured.found
         answer = found.keypoints0_px, found.keypoints1_px, found.points0_px, found.points1_px, found.scores
         score = judged.truth.judge(*pair.images, *answer).row()
-        rows.append({"angle": pair.conditions.view_angle_class, **{key: plain(score[key]) for key in _FIGURES}})
+        again = [s for image, s in zip(pair.images, measured.features_seconds, strict=True) if image in known]
+        known.update(pair.images)
+        figures = {key: plain(score[key]) for key in _FIGURES}
+        own = {"seconds": measured.seconds - sum(again)}
+        rows.append({"angle": pair.conditions.view_angle_class, **figures, **own})
     return rows
 
 
@@ -129,13 +141,13 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
     ]
     methods = []
     for (method,), own in grouped(rows, "method"):
-        seconds = f"{total(own, 'seconds'):.0f}" if "seconds" in own[0] else "-"
+        seconds, whole = (f"{total(own, key):.0f}" if key in own[0] else "-" for key in ("seconds", "run_seconds"))
         right = percent(ratio(total(own, "correct"), total(own, "kept")), 1)
         found = percent(ratio(total(own, "correct"), total(own, "possible")), 1)
         tied = sum((row["correct"] or 0) >= 30 for row in own)
         methods.append(
             [code(method), number(total(own, "correct")), right, f"{median(own, 'median_error_px'):.2f}", found,
-             f"{tied} of {len(own)}", seconds]
+             f"{tied} of {len(own)}", seconds, whole]
         )  # fmt: skip
     return "\n\n".join(
         [
@@ -143,7 +155,17 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
             "#### By view angle\n\n" + markdown(["view angle", *heads], angles),
             "#### By method\n\n"
             + markdown(
-                ["method", "correct", "of kept", "error px", "of possible", "pairs with 30 correct", "seconds"], methods
+                [
+                    "method",
+                    "correct",
+                    "of kept",
+                    "error px",
+                    "of possible",
+                    "pairs with 30 correct",
+                    "s",
+                    "whole run, s",
+                ],
+                methods,
             ),
         ]
     )
@@ -152,7 +174,7 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("presets", __doc__)
     add = parser.add_argument
-    add("--presets", type=options.names, default="auto,baseline,fusion,oblique", help="comma-separated, auto first")
+    add("--presets", type=split_methods, default="auto,baseline,fusion,oblique", help="comma-separated, auto first")
     add("--peers", type=options.names, default="pycolmap-guided", help=f"comma-separated of {', '.join(PEERS)}")
     options.add_rendered(parser, scenes=",".join(PRESETS), size="800x600", images=12, flights="nadir,mixed,oblique")
     add("--seeds", type=options.positive, default=1, help="so many, from --seed on")
@@ -165,7 +187,7 @@ def main(arguments: Sequence[str]) -> None:
     args.pairs = _ALL_PAIRS
     if _JUDGED not in args.presets:
         parser.error(f"--presets must hold {_JUDGED}, which the others are compared with")
-    if unknown := [name for name in args.presets if name not in preset_names()]:
+    if unknown := [name for name in args.presets if parse_method(name)[0] not in preset_names()]:
         parser.error(f"--presets: {', '.join(unknown)} are none of {', '.join(preset_names())}")
     for peer in args.peers:
         check_method(peer)
@@ -178,9 +200,12 @@ def main(arguments: Sequence[str]) -> None:
             write_rows(args.out / "results.json", rows)
     write_rows(args.out / "results.json", rows)
     del args.pairs
+    draw_quality(args.out / "quality.svg", rows)
+    if args.docs is not None:
+        draw_quality(FOLDER / "auto.svg", rows)
     versions: dict[str, stamps.Version] = {}
     for preset in args.presets:
-        versions |= stamps.of_chain(preset)
+        versions |= stamps.of_chain(*parse_method(preset))
     options.publish(
         args, table_of(args, rows) + "\n", args.out / "presets.md", table="bench_presets",
         command=options.command_line(parser, args), versions=versions,

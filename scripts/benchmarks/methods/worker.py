@@ -26,11 +26,13 @@ _ARRAYS = ("points0_px", "points1_px", "scores", "keypoints0_px", "keypoints1_px
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One pair: seconds of both images' features, matching and verification; peak resident memory over these."""
+    """One pair: seconds of both images' features, matching and verification, and of each image's features in them; peak
+    resident memory over these."""
 
     found: Found
     seconds: float
     peak_mb: float
+    features_seconds: tuple[float, float]
 
 
 def measure(spec: str, judged: Judged, options: Options, store: Path) -> Iterator[tuple[str, Measured]]:
@@ -59,16 +61,16 @@ def write_measured(path: Path, measured: Measured) -> None:
     """One pair of one method, whole or not at all."""
     found = measured.found
     buffer = io.BytesIO()
-    numbers = np.array([found.descriptors, measured.seconds, measured.peak_mb])
+    numbers = np.array([found.descriptors, measured.seconds, measured.peak_mb, *measured.features_seconds])
     np.savez_compressed(buffer, numbers=numbers, **{name: getattr(found, name) for name in _ARRAYS})
     write_atomically(path, lambda stream: stream.write(buffer.getvalue()))
 
 
 def read_measured(path: Path) -> Measured:
     with np.load(path, allow_pickle=False) as arrays:
-        descriptors, seconds, peak_mb = arrays["numbers"].tolist()
+        descriptors, seconds, peak_mb, *features_seconds = arrays["numbers"].tolist()
         found = Found(**{name: arrays[name] for name in _ARRAYS}, descriptors=descriptors)
-    return Measured(found, seconds, peak_mb)
+    return Measured(found, seconds, peak_mb, (features_seconds[0], features_seconds[1]))
 
 
 class Worker:
@@ -89,7 +91,7 @@ class Worker:
         sides = [self._features(image) for image in pair]
         found, seconds, peak_mb = watched(lambda: self.method.match(*pair, sides[0][0], sides[1][0]))
         total = seconds + sum(side[1] for side in sides)
-        return Measured(found, total, max(peak_mb, *(side[2] for side in sides)))
+        return Measured(found, total, max(peak_mb, *(side[2] for side in sides)), (sides[0][1], sides[1][1]))
 
     def _features(self, image: str) -> tuple[Any, float, float]:
         if image not in self.known:
