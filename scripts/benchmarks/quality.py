@@ -46,9 +46,10 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
         axis.scatter(seconds, correct, color=colour, s=36, zorder=3)
         # Of two neighbours the upper one's label stands above it.
         nearest = places[np.argsort(np.linalg.norm(places - place, axis=1))[:2]][-1]
+        beside = 6, 5 if place[1] >= nearest[1] else -11
         axis.annotate(
-            f"{method}, {100 * right:.1f} % right", (seconds, correct), xytext=(6, 5 if place[1] >= nearest[1] else -11),
-            textcoords="offset points", fontsize=8, color=colour, zorder=4,
+            f"{method}, {100 * right:.1f} % right", (seconds, correct), xytext=beside, textcoords="offset points",
+            fontsize=8, color=colour, zorder=4,
         )  # fmt: skip
     # Room for the labels, which stand to the right.
     low, high = 0.8 * min(point[1] for point in points), 4.0 * max(point[1] for point in points)
