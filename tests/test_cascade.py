@@ -61,7 +61,7 @@ def test_without_attitudes_no_overlap_is_known() -> None:
         (Evidence(299, 0.5, 0.9), "299 verified matches of 300 that the overlap promises"),
         (Evidence(60, 0.2, 0.1), ""),
         (Evidence(59, 0.2, 0.1), "59 verified matches of 60 that the overlap promises"),
-        (Evidence(19, 0.01, 1.0), "19 verified matches of 20 that the overlap promises"),
+        (Evidence(29, 0.01, 1.0), "29 verified matches of 30 that the overlap promises"),
         (Evidence(900, 0.5, 0.55), "verified matches in 55 % of the overlap"),
         (Evidence(600, float("nan"), float("nan")), ""),
         (Evidence(599, float("nan"), float("nan")), "599 verified matches of 600 that the overlap promises"),

@@ -40,7 +40,7 @@ _TYING_OVERLAP = 0.4
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
-_LEAST_MATCHES = 20
+_LEAST_MATCHES = 30
 
 Key = tuple[str, str]
 # What a step changes of the settings.
