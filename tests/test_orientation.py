@@ -13,7 +13,7 @@ from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z, tilt_deg
 from aeromatch_cli.orientation.dem import terrain_of, terrains_of
 from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share, grouped_images
-from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT, place, similarity
+from aeromatch_cli.orientation.placing import _COMMON, LOCAL_FLYING_HEIGHT, _common, place, similarity
 from aeromatch_cli.orientation.resection import resected
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, -0.03))
@@ -188,6 +188,27 @@ def tilts_off(truth: dict[str, Pose], rotations: FloatArray) -> float:
     """Largest angle between up in the block and true up, degrees: turns about the vertical do not count."""
     pairs = zip(truth.values(), rotations, strict=True)
     return max(np.rad2deg(np.arccos(np.clip(r[:, 2] @ p.world_rotation[:, 2], -1, 1))) for p, r in pairs)
+
+
+@pytest.mark.parametrize(("noise_m", "limit_deg"), [(0.05, 0.9), (1.0, 1.5), (7.0, 6.0)])
+def test_positions_say_how_good_they_are_and_level_a_block_over_a_slope(noise_m: float, limit_deg: float) -> None:
+    """Stated are 5 m. The median of ten blocks; level ground would be 10 degrees off."""
+    truth, centers, rotations, points, _ = tilted_block(0.0)
+    exact = np.array([pose.center_m for pose in truth.values()])
+    off = []
+    for seed in range(10):
+        positions = exact + np.random.default_rng(seed).normal(0.0, noise_m, exact.shape)
+        found = place(centers, points, positions, np.full(len(centers), 5.0))
+        assert found.kind == "positions"
+        off.append(tilts_off(truth, found.rotations(rotations)))
+    assert np.median(off) < limit_deg
+
+
+def test_errors_that_neighbours_share_are_told_from_those_of_chance() -> None:
+    places = np.array([pose.center_m for pose in flight().values()])
+    delay = np.column_stack([np.repeat([8.0, -8.0, 8.0], COLUMNS), np.zeros((len(places), 2))])
+    assert _common(delay, places) > 0.9
+    assert max(_common(np.random.default_rng(k).normal(size=places.shape), places) for k in range(20)) < _COMMON
 
 
 def test_measured_tilts_level_a_block_over_a_slope() -> None:

@@ -21,12 +21,18 @@ _AGREE_SIGMAS = 3.0
 _AGREE_EXTENT = 0.01
 # The error that is allowed doubles until this share of the positions agrees.
 _LEAST_AGREEING = 0.6
-# Positions that do not agree to this share of the extent either are not those of the images.
-_BELIEVED_EXTENT = 0.1
-# Where fewer than this share agree within their standard deviations, errors have a common cause (a delay between GPS
-# and shutter, say), which no average takes away: the block is levelled as if they were larger by this factor.
+# Positions that do not agree to this share of the extent either are not those of the images; nor to this share of their
+# median distance from the middle, where there are so many: chance has places that near.
+_BELIEVED_EXTENT, _BELIEVED_SPREAD, _BELIEVED_MANY = 0.1, 0.4, 8
+# Where fewer than this share agree within their standard deviations, and what neighbours are off by agrees to this
+# correlation, errors have a common cause (a delay between GPS and shutter, say), which no average takes away: the block
+# is levelled as if they were larger by this factor.
 _TRUSTED = 0.85
+_COMMON = 0.5
 _DOUBTFUL = 5.0
+# A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
+_STATED_RESIDUALS = 3.0
+_UNKNOWNS = 7  # of a similarity
 # How far from level the plane of best fit of a terrain usually is.
 _LEVEL_SIGMA_DEG = 3.0
 # The mean of measured tilts is no better than this, whatever their number; they count where they agree to so many
@@ -49,7 +55,8 @@ class Placement:
     by the terrain, scale and origin arbitrary). agreeing: (N,) which positions were used; False where there is none.
     trusted: whether nearly all positions agree with the pictures as well as their standard deviations say.
     contradiction: why given positions were not used: "mirrored" (they fit only with the ground above the cameras),
-    "scattered" (they do not fit), else "". level_sigma_deg: how exactly tilts or terrain say where up is.
+    "scattered" (they do not fit), else "". level_sigma_deg: how exactly tilts or terrain say where up is. sigma_factor:
+    standard deviations of the positions, as the pictures show them, over those stated.
     """
 
     scale: float
@@ -60,6 +67,7 @@ class Placement:
     trusted: bool
     contradiction: str = ""
     level_sigma_deg: float = np.inf
+    sigma_factor: float = 1.0
 
     def points(self, points: FloatArray) -> FloatArray:
         """World points (N, 3) of model points (N, 3)."""
@@ -98,7 +106,10 @@ def place(
     agreeing[np.flatnonzero(known)[found.agreeing]] = True
     found = replace(found, agreeing=agreeing)
     used_m = positions_m[agreeing]
-    information = _information(found, centers, used_m, float(np.median(sigmas_m[agreeing])))
+    stated_m = float(np.median(sigmas_m[agreeing]))
+    sigma_m = _sigma_m(found, found.points(centers[agreeing]) - used_m, used_m, stated_m)
+    found = replace(found, sigma_factor=sigma_m / max(stated_m, 1e-9))
+    information = _information(used_m, sigma_m)
     if _off_level(found, information, used_m, by_terrain, vertical):
         vertical = by_terrain
     return _levelled(found, information, used_m, vertical)
@@ -192,8 +203,11 @@ def _upside_down(
 
 def _loose_m(positions_m: FloatArray, sigmas_m: FloatArray) -> FloatArray:
     """(N,) errors beyond which positions are not those of the images."""
-    extent_m = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
-    return np.asarray(np.maximum(_AGREE_SIGMAS * sigmas_m, _BELIEVED_EXTENT * extent_m))
+    share_m = _BELIEVED_EXTENT * float(np.linalg.norm(np.ptp(positions_m, axis=0)))
+    if len(positions_m) >= _BELIEVED_MANY:
+        apart_m = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
+        share_m = max(share_m, _BELIEVED_SPREAD * float(np.median(apart_m)))
+    return np.asarray(np.maximum(_AGREE_SIGMAS * sigmas_m, share_m))
 
 
 def _errors(fit: tuple[float, FloatArray, FloatArray], centers: FloatArray, positions_m: FloatArray) -> FloatArray:
@@ -214,19 +228,32 @@ def _level(centers: FloatArray, points: FloatArray, known: BoolArray, vertical: 
     return Placement(scale, rotation, -scale * middle, "level", np.zeros_like(known), trusted=False)
 
 
-def _information(found: Placement, centers: FloatArray, used_m: FloatArray, sigma_m: float) -> FloatArray:
+def _sigma_m(found: Placement, errors_m: FloatArray, used_m: FloatArray, stated_m: float) -> float:
+    """Standard deviation of the positions used (N, 3), as stated and by what they are off the model (N, 3)."""
+    spare = max(errors_m.size - _UNKNOWNS, 0)  # so many errors are seen, the others are in the fit
+    squares = _STATED_RESIDUALS * stated_m**2 + float((errors_m**2).sum())
+    sigma_m = float(np.sqrt(squares / (_STATED_RESIDUALS + spare)))
+    shared = not found.trusted and _common(errors_m, used_m) > _COMMON
+    return sigma_m * (_DOUBTFUL if shared else 1.0)
+
+
+def _information(used_m: FloatArray, sigma_m: float) -> FloatArray:
     """What the positions used (N, 3) say of a small turn of the block: (3, 3), per square radian.
 
     Positions with standard deviation s that lie at r_i from their middle determine a small turn w with the information
     sum [r_i]x^T [r_i]x / s^2, along a line none about it.
     """
-    errors_m = found.points(centers[found.agreeing]) - used_m
-    sigma_m = max(sigma_m, float(np.sqrt((errors_m**2).mean())))
-    if not found.trusted:
-        sigma_m *= _DOUBTFUL
     arms = used_m - used_m.mean(axis=0)
     spread = np.eye(3) * (arms**2).sum() - arms.T @ arms
     return np.asarray(spread / max(sigma_m, 1e-9) ** 2)
+
+
+def _common(errors_m: FloatArray, places_m: FloatArray) -> float:
+    """Correlation of errors (N, 3) with those of the nearest place (N, 3)."""
+    apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
+    np.fill_diagonal(apart_m, np.inf)
+    nearest = errors_m[np.argmin(apart_m, axis=1)]
+    return float((errors_m * nearest).sum() / max((errors_m**2).sum(), 1e-12))
 
 
 def _off_level(

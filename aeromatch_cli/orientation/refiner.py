@@ -169,7 +169,7 @@ def _refined(
     if kind == "positions":
         tilts = believed_tilts(pycolmap, model, positions_m, sigmas_m, observed["ups"], observed["rotations"])
         observed = {**observed, "ups": tilts}
-    used, level_deg = image_numbers(model), np.inf
+    used, level_deg, factor = image_numbers(model), np.inf, 1.0
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
@@ -177,7 +177,7 @@ def _refined(
         given = positions_m, sigmas_m
         if kind == "positions":
             placement = adjusted(pycolmap, model, cameras, *given, observed["ups"], _COST_TOLERANCE, work.held)
-            level_deg = placement.level_sigma_deg
+            level_deg, factor = placement.level_sigma_deg, placement.sigma_factor
             used = [i for i, agrees in zip(image_numbers(model), placement.agreeing, strict=True) if agrees]
         else:
             used = adjust_in_place(pycolmap, model, cameras, *given, attitudes, _COST_TOLERANCE, work.held)
@@ -187,7 +187,8 @@ def _refined(
             break
         model = _triangulated(pycolmap, model, work.folder, rough=False)
     unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
-    sigmas_m = sigmas_m.copy()
+    # Precision rests on these. An adjustment bends a weak block to its positions: that they fit shows nothing better.
+    sigmas_m = max(factor, 1.0) * sigmas_m
     sigmas_m[unused] = np.nan
     return model, {**observed, "sigmas_m": sigmas_m, "level_deg": np.array(level_deg)}
 

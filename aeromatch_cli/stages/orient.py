@@ -55,7 +55,7 @@ from aeromatch_cli.workspace import (
 
 log = logging.getLogger("aeromatch")
 
-VERSION = 15
+VERSION = 16
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
