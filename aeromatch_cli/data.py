@@ -68,7 +68,8 @@ class AdjustedBlock:
 
     cameras: camera_id -> Camera. poses: image_id -> AdjustedPose; images that could not be tied are absent. points_m:
     (P, 3). errors_px: (P,) mean reprojection errors. tracks: image_id -> (n, 2) int32, keypoint of the image and row
-    of points_m.
+    of points_m. frames: image_id -> number of the frame of its own that its group lies in, from 1; absent where
+    positions have placed it in the world.
     """
 
     cameras: Mapping[str, Camera]
@@ -76,6 +77,7 @@ class AdjustedBlock:
     points_m: FloatArray
     errors_px: FloatArray
     tracks: Mapping[str, IntArray]
+    frames: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

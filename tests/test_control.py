@@ -90,6 +90,17 @@ def test_a_block_in_another_frame_is_transformed(truth: Truth) -> None:
     assert max(figures["check_rmse_m"]) < 1e-6
 
 
+def test_a_point_that_the_others_contradict_is_named(truth: Truth) -> None:
+    rows = list(range(0, 400, 50))
+    offsets_m = np.random.default_rng(0).normal(0.0, 0.01, (8, 3))
+    offsets_m[5] += [5.0, 0.0, 0.0]
+    figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, rows, offsets_m, set()))
+    assert figures["doubtful"] == ["p250"]
+    offsets_m[5] = 0.0
+    figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, rows, offsets_m, set()))
+    assert figures["doubtful"] == []
+
+
 def test_two_points_determine_nothing(truth: Truth) -> None:
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, [0, 40], np.zeros((2, 3)), set()))
     assert (figures["control"], figures["transformation"], figures["check_rmse_m"]) == (2, None, None)
@@ -158,7 +169,9 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     control = outcome.facts["stages"]["adjust"]["facts"]["control"]
     assert control["control"] >= 6
     assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
-    assert "RMSE at each control point, fitted without it" in outcome.stdout
+    assert "at each control point, fitted without it" in outcome.stdout
+    assert "to fit them the exported block is to be moved by x " in outcome.stdout
+    assert control["doubtful"] == []
     assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()
 
 

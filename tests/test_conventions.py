@@ -128,6 +128,16 @@ def test_a_third_at_random_does_not_hide_the_convention() -> None:
     assert "off by 180 degrees" in found.words
 
 
+@pytest.mark.parametrize(("turned", "all_are"), [(14, False), (22, True)])
+def test_what_holds_for_some_images_is_no_convention(turned: int, all_are: bool) -> None:
+    """Headings of a part of the images are off by 180 degrees, those of the others are right."""
+    true = flown("yaw_pitch_roll")
+    ids = sorted(true)
+    wrong = written({i: true[i] for i in ids[:turned]}, lambda yaw, pitch, roll: (yaw + 180.0, pitch, roll))
+    found = recognised({**true, **wrong}, attitudes(true))
+    assert (found is not None) == all_are
+
+
 def test_the_meridian_convergence_is_named() -> None:
     true = flown("yaw_pitch_roll")  # yaw counts from grid north
     wrong = {i: replace(one, convergence_deg=2.1) for i, one in true.items()}

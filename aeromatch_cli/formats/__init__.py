@@ -77,10 +77,12 @@ apart have one each: `terrain-2.tif` and so on.
 
 ### orientation/orientation.csv
 
-Written by `adjust`: the bundle adjustment of the verified matches. One line per oriented image, in the block's CRS:
-`image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
+Written by `adjust`: the bundle adjustment of the verified matches. One line per image of known place, in the block's
+CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
 (photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
-are not known; `camera`: camera_id.
+are not known; `camera`: camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north
+and scale are arbitrary, standard deviations hold within the group), or `predicted` of an image that is not oriented:
+the position given, the attitude given or that of its strip, empty where nothing is known.
 
 ### orientation/adjusted.json
 
@@ -94,8 +96,8 @@ are not known; `camera`: camera_id.
 
 N images, P points, O observations, C cameras.
 
-- `images` (N,) str: image_id. `rotations` (N, 3, 3), `centers_m` (N, 3), `sigmas_m` (N, 3), `sigmas_deg` (N, 3: omega,
-  phi, kappa): float64.
+- `images` (N,) str: image_id. `frames` (N,) int32: number of its group's own frame, 0 in the world. `rotations`
+  (N, 3, 3), `centers_m` (N, 3), `sigmas_m` (N, 3), `sigmas_deg` (N, 3: omega, phi, kappa): float64.
 - `points_m` (P, 3), `errors_px` (P,) float64: triangulated points and their mean reprojection errors.
 - `track_images`, `track_keypoints`, `track_points` (O,) int32: row of `images`, keypoint of that image, row of
   `points_m`.

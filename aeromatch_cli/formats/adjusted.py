@@ -13,7 +13,17 @@ from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 
 _POSES = ("rotations", "centers_m", "sigmas_m", "sigmas_deg")
-_REST = ("images", "points_m", "errors_px", "track_images", "track_keypoints", "track_points", "cameras", "params")
+_REST = (
+    "images",
+    "frames",
+    "points_m",
+    "errors_px",
+    "track_images",
+    "track_keypoints",
+    "track_points",
+    "cameras",
+    "params",
+)
 
 
 def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
@@ -31,6 +41,7 @@ def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
         centers_m=_rows([p.center_m for p in poses]),
         sigmas_m=_rows([p.sigmas_m for p in poses]),
         sigmas_deg=_rows([p.sigmas_deg for p in poses]),
+        frames=np.array([adjusted.frames.get(i, 0) for i in ids], dtype=np.int32),
         points_m=adjusted.points_m,
         errors_px=adjusted.errors_px,
         track_images=np.repeat(np.arange(len(ids), dtype=np.int32), [len(one) for one in seen]),
@@ -56,25 +67,38 @@ def read_adjusted(path: Path) -> AdjustedBlock:
     }
     both = np.column_stack([arrays["track_keypoints"], arrays["track_points"]]).astype(np.int32)
     tracks = {name: both[arrays["track_images"] == row] for row, name in enumerate(ids)}
-    return AdjustedBlock(cameras, poses, arrays["points_m"], arrays["errors_px"], tracks)
+    frames = {name: int(number) for name, number in zip(ids, arrays["frames"], strict=True) if number}
+    return AdjustedBlock(cameras, poses, arrays["points_m"], arrays["errors_px"], tracks, frames)
 
 
 def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
-    """orientation.csv: one line per oriented image, in the block's CRS.
+    """orientation.csv: one line per image of known place, in the block's CRS.
 
     x, y, z: projection centre, metres. omega, phi, kappa: degrees, photogrammetric, against the grid of the CRS.
-    sigma_*: their standard deviations.
+    sigma_*: their standard deviations. frame: "world"; "own N" of images in a frame of their own, whose place, north
+    and scale are arbitrary; "predicted" of images that are not oriented, by the pose that is known of them.
     """
-    names = {image.image_id: image for image in block.images}
     header = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
     rows = []
-    for image_id, pose in sorted(adjusted.poses.items(), key=lambda item: names[item[0]].name):
-        center_m = [round(float(v), 4) for v in pose.center_m + np.array(block.origin_m)]
-        angles = [round(float(v), 6) for v in to_omega_phi_kappa(pose.rotation)]
-        sigmas = [float(f"{v:.3g}") for v in (*pose.sigmas_m, *pose.sigmas_deg)]
-        image = names[image_id]
-        rows.append((image.name, *center_m, *angles, *sigmas, image.camera_id))
-    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera"), rows)
+    for image in sorted(block.images, key=lambda image: image.name):
+        pose, known = adjusted.poses.get(image.image_id), block.poses.get(image.image_id)
+        rotation: FloatArray | None
+        if pose is not None:
+            number = adjusted.frames.get(image.image_id)
+            frame, sigmas = f"own {number}" if number else "world", [*pose.sigmas_m, *pose.sigmas_deg]
+            center_m, rotation = pose.center_m, pose.rotation
+        elif known is not None:
+            frame, sigmas = "predicted", [known.sigma_position_m] * 3 + [known.sigma_angle_deg] * 3
+            center_m, rotation = known.center_m, known.world_rotation
+        else:
+            continue
+        place = [round(float(v), 4) for v in center_m + np.array(block.origin_m)]
+        angles = ["", "", ""] if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
+        deviations = [float(f"{v:.3g}") for v in sigmas[:3]] + [
+            "" if rotation is None else float(f"{v:.3g}") for v in sigmas[3:]
+        ]
+        rows.append((image.name, *place, *angles, *deviations, image.camera_id, frame))
+    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame"), rows)
 
 
 def _rows(values: list[FloatArray]) -> FloatArray:

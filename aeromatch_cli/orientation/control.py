@@ -13,6 +13,8 @@ from aeromatch_cli.orientation.placing import similarity
 
 # A similarity has seven unknowns: three points determine it, a fourth tells how well.
 _LEAST_POINTS = 3
+# A point is doubtful without which, of so many, the errors of the others are smaller by this factor.
+_TELLING_POINTS, _DOUBTFUL = 5, 5.0
 
 
 def control_figures(
@@ -22,7 +24,8 @@ def control_figures(
 
     cameras: image_id -> adjusted camera. `check_rmse_m` (x, y, z) is of the check points; without any, of every control
     point under the transformation of the others (leave-one-out). `offset_m`: from the block as it is to the surveyed
-    positions, median over the control points. None where points are too few.
+    positions, median over the control points. `doubtful`: control points that the others contradict. None where points
+    are too few.
     """
     found = {point.name: _intersected(adjusted, cameras, point) for point in points}
     seen = [point for point in points if found[point.name] is not None]
@@ -36,7 +39,7 @@ def control_figures(
     }
     if len(control) < _LEAST_POINTS:
         unknown = ("offset_m", "transformation", "control_rmse_m", "check_rmse_m", "check_kind")
-        return figures | dict.fromkeys(unknown)
+        return figures | dict.fromkeys(unknown) | {"doubtful": []}
     in_block = {name: place for name, place in found.items() if place is not None}
     fit = _fit(control, in_block)
     own = _errors(fit, control, in_block)
@@ -57,12 +60,21 @@ def control_figures(
         "control_rmse_m": _rmse(own),
         "check_rmse_m": _rmse(independent),
         "check_kind": kind,
+        "doubtful": _doubtful(control, in_block),
         "residuals": {
             point.name: [round(float(v), 4) for v in error]
             for point, error in zip([*control, *checks], _errors(fit, [*control, *checks], in_block), strict=True)
         },
         "reprojection_error_px": _pixel_error(adjusted, cameras, seen, in_block),
     }
+
+
+def offset_words(figures: Mapping[str, Any]) -> str:
+    """How the block, as it is exported, lies to the control points."""
+    offset = ", ".join(f"{axis} {off:+.2f}" for axis, off in zip("xyz", figures["offset_m"], strict=True))
+    share = 100.0 * (figures["transformation"]["scale"] - 1.0)
+    size = f"{abs(share):.2f} % {'larger' if share >= 0.0 else 'smaller'}"
+    return f"to fit them the exported block is to be moved by {offset} m and made {size}"
 
 
 def _intersected(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: ControlPoint) -> FloatArray | None:
@@ -93,6 +105,22 @@ def _errors(
     scale, rotation, shift_m = fit
     moved = np.array([scale * rotation @ found[p.name] + shift_m for p in points]).reshape(-1, 3)
     return np.asarray(moved - np.array([p.position_m for p in points]).reshape(-1, 3))
+
+
+def _doubtful(control: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> list[str]:
+    """Names of points without which the others agree much better, the worst first."""
+    names: list[str] = []
+    left = list(control)
+    while len(left) >= _TELLING_POINTS:
+        whole_m = float(np.linalg.norm(_errors(_fit(left, found), left, found)))
+        rests = [[one for one in left if one is not point] for point in left]
+        rest_m = [float(np.linalg.norm(_errors(_fit(rest, found), rest, found))) for rest in rests]
+        worst = int(np.argmin(rest_m))
+        if _DOUBTFUL * rest_m[worst] >= whole_m:
+            break
+        names.append(left[worst].name)
+        left = rests[worst]
+    return names
 
 
 def _described(fit: tuple[float, FloatArray, FloatArray]) -> dict[str, Any]:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.rotations import rotation_z
+from aeromatch_cli.geometry.rotations import angle_between_deg, rotation_z
 
 Reading = Callable[[Angles], FloatArray]
 
@@ -35,6 +36,8 @@ _CONVERGENCE_DEG = 0.5
 _SMALL_TURN_DEG = 10.0
 # A turn this near to one of 90 or 180 degrees is that: the frame of the pictures is no more exact.
 _NEAR_QUARTER_DEG = 3.0
+# Where more images than this share are right as they were read, the others have faults of their own.
+_MOST_RIGHT = 0.2
 _MIN_IMAGES = 5
 # More images say no more of a convention.
 _MOST_IMAGES = 500
@@ -72,7 +75,12 @@ def recognised(
     if not fits:
         return None
     near_deg = _NEARLY * min(fit.error_deg for fit in fits) + _NEARLY_DEG
-    return next(fit for fit in fits if fit.error_deg <= near_deg)
+    fit = next(fit for fit in fits if fit.error_deg <= near_deg)
+    read, meant = (np.array([reading(one) for one in angles]) for reading in (_as_read, fit.rotation))
+    frame = _of_the_frame(_turns(meant, true), free_deg)
+    right = np.rad2deg((frame.inv() * _turns(read, true)).magnitude()) <= limit_deg
+    changed = np.array([angle_between_deg(*pair) for pair in zip(read, meant, strict=True)]) > 2.0 * limit_deg
+    return None if (right & changed).mean() > _MOST_RIGHT else fit
 
 
 def _fits(angles: list[Angles], true: FloatArray, free_deg: float) -> Iterator[Recognised]:
@@ -172,13 +180,23 @@ def _heading_deg(turns: FloatArray) -> float:
 
 
 def _median_deg(rotations: FloatArray, true: FloatArray, free_deg: float) -> float:
-    """Median angle between attitudes, degrees, but for what all have in common by the frame's own error: a small tilt,
-    and a turn about the vertical of up to free_deg.
-    """
+    """Median angle between attitudes, degrees, but for what all have in common by the frame's own error."""
+    turns = _turns(rotations, true)
+    return float(np.median(np.rad2deg((_of_the_frame(turns, free_deg).inv() * turns).magnitude())))
+
+
+def _turns(rotations: FloatArray, true: FloatArray) -> Any:
+    """Of the world, from each true attitude to the given one."""
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_matrix(true.transpose(0, 2, 1) @ rotations)
+    return Rotation.from_matrix(true.transpose(0, 2, 1) @ rotations)
+
+
+def _of_the_frame(turns: Any, free_deg: float) -> Any:
+    """What all turns have in common by the frame's own error: a small tilt, and a heading up to free_deg."""
+    from scipy.spatial.transform import Rotation
+
     common = np.median(turns.as_rotvec(degrees=True), axis=0)
     common[:2] *= np.linalg.norm(common[:2]) <= _FRAME_DEG
     common[2] *= abs(common[2]) <= free_deg
-    return float(np.median(np.rad2deg((Rotation.from_rotvec(-common, degrees=True) * turns).magnitude())))
+    return Rotation.from_rotvec(common, degrees=True)

@@ -99,22 +99,26 @@ def refine_block(
         archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
     for one in facts:
         one["registered"] = [_image_ids(block)[k - 1] for k in one["registered"]]
-    return _joined(archives, block), facts
+    return _joined(archives, [one["kind"] for one in facts], block), facts
 
 
-def _joined(archives: Sequence[Mapping[str, Any]], block: Block) -> AdjustedBlock:
-    """All groups as one block; a camera that several have is that of the largest."""
+def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: Block) -> AdjustedBlock:
+    """All groups as one block; a camera that several have is that of the largest. kinds: how each was placed."""
     image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
     cameras = dict(block.cameras)
     poses: dict[str, AdjustedPose] = {}
     tracks: dict[str, IntArray] = {}
+    frames: dict[str, int] = {}
     first = 0
     for arrays in reversed(archives):
         cameras |= {
             camera_ids[n - 1]: _camera(block.cameras[camera_ids[n - 1]], arrays[f"params{n}"])
             for n in arrays["cameras"]
         }
-    for arrays in archives:
+    for arrays, kind in zip(archives, kinds, strict=True):
+        if kind == "level":
+            frame = 1 + max(frames.values(), default=0)
+            frames |= {image_ids[number - 1]: frame for number in arrays["images"]}
         parts = (arrays[name] for name in ("images", "centers_m", "rotations", "sigmas_m", "sigmas_deg"))
         for number, *pose in zip(*parts, strict=True):
             own = arrays["track_images"] == number
@@ -124,7 +128,7 @@ def _joined(archives: Sequence[Mapping[str, Any]], block: Block) -> AdjustedBloc
         first += len(arrays["points_m"])
     points_m = np.concatenate([np.zeros((0, 3)), *(arrays["points_m"] for arrays in archives)])
     errors_px = np.concatenate([np.zeros(0), *(arrays["errors_px"] for arrays in archives)])
-    return AdjustedBlock(cameras, poses, points_m, errors_px, tracks)
+    return AdjustedBlock(cameras, poses, points_m, errors_px, tracks, frames)
 
 
 def _image_ids(block: Block) -> list[str]:

@@ -16,6 +16,7 @@ from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
@@ -273,10 +274,13 @@ def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         found.append(("Cameras after the adjustment", _camera_words(cameras)))
     control = facts["control"]
     if control and control["control_rmse_m"]:
-        found.append(("Control points", f"{control['control']}, RMSE {_metres(control['control_rmse_m'])}"))
+        found.append(("Control points", f"{control['control']}; {offset_words(control)}"))
+        found.append(("Control points after a similarity", f"RMSE {_metres(control['control_rmse_m'])}"))
         if control["check_rmse_m"]:
-            kind = "Check points" if control["check"] else "Control points, each left out once"
-            found.append((kind, f"{control['check'] or control['control']}, RMSE {_metres(control['check_rmse_m'])}"))
+            kind = f"{control['check']} check points" if control["check"] else "Control points, each left out once"
+            found.append((f"{kind}, after it", f"RMSE {_metres(control['check_rmse_m'])}"))
+        if control["doubtful"]:
+            found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
     return found
 
 

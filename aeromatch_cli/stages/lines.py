@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from aeromatch_cli.data import Block
+from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.stages import enhance, filter  # noqa: A004
 from aeromatch_cli.stages.stage_report import StageReport
 
@@ -169,9 +170,12 @@ def _control_words(control: Mapping[str, Any] | None) -> list[str]:
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
 
-    words = [f"{counts}; RMSE of the fit {shown(control['control_rmse_m'])} m"]
+    words = [counts, offset_words(control)]
+    words.append(f"after a similarity to the control points: RMSE of the fit {shown(control['control_rmse_m'])} m")
     if control["check_rmse_m"] is not None:
-        words.append(f"RMSE at {_CHECKED[control['check_kind']]}: {shown(control['check_rmse_m'])} m")
+        words[-1] += f", at {_CHECKED[control['check_kind']]} {shown(control['check_rmse_m'])} m"
+    if control["doubtful"]:
+        words.append(f"control points that the others contradict: {_listed(control['doubtful'])}")
     return words
 
 

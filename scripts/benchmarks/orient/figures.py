@@ -73,11 +73,15 @@ def turned_errors(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArra
 
 
 def attitudes_of(path: Path) -> dict[str, FloatArray]:
-    """Rotations cam_from_world of a table with omega, phi, kappa, by image name; none where there is no such file."""
+    """Rotations cam_from_world of a table with omega, phi, kappa, by image name; none where there is no such file.
+
+    Of orientation.csv those of oriented images.
+    """
     if not path.is_file():
         return {}
     with path.open(encoding="utf-8", newline="") as stream:
-        return {r["image"]: from_omega_phi_kappa(*(float(r[k]) for k in ANGLES)) for r in csv.DictReader(stream)}
+        rows = [row for row in csv.DictReader(stream) if row.get("frame") != "predicted"]
+    return {row["image"]: from_omega_phi_kappa(*(float(row[k]) for k in ANGLES)) for row in rows}
 
 
 def most_alike(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArray], limit_deg: float) -> int:
