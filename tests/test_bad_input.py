@@ -48,8 +48,10 @@ def test_one_bad_image_never_stops_the_rest(site, how):
     assert item in (bad.name, bad.name.replace(".", "_"))
     assert bad.name.partition(".")[0] in outcome.stderr
 
+    before = {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()}
     again = site("run")  # it still fails, so it is still reported
     assert again.code == 1
+    assert {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()} == before
     assert site.failures() == [("pairs" if item == bad.name else "extract", item)]
     for command in ("match", "filter", "export", "report"):
         assert site(command).code == 1

@@ -47,7 +47,7 @@ class StageReport:
     def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
         """Close the clock, write the report and gather failures.csv from all stages.
 
-        A stage that found everything up to date leaves the report of the run that made it, with its timing.
+        A stage that made nothing, and fails where it failed before, leaves the report of the run before, with its timing.
         """
         self.seconds = round(time.perf_counter() - self.started, 3)
         value = {
@@ -77,12 +77,14 @@ class StageReport:
         return self.write(workspace)
 
     def _says_nothing_new(self, path: Path) -> bool:
-        if self.done or self.failures or not path.is_file():
+        if self.done or not path.is_file():
             return False
         old = read_json(path)
         # Without facts of its own the stage only counts what it makes: those on file still hold.
         self.facts = self.facts or old.get("facts", {})
-        return not old.get("failures") and (old.get("fingerprint"), old.get("facts")) == (self.fingerprint, self.facts)
+        failures = [list(failure) for failure in self.failures]
+        known = [old.get(key) for key in ("failures", "fingerprint", "facts")]
+        return known == [failures, self.fingerprint, self.facts]
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
