@@ -11,7 +11,7 @@ import pytest
 from conftest import Site
 from test_export_colmap import ORIGIN_M, Truth, make_truth
 
-from aeromatch_cli.blocks.control import read_control
+from aeromatch_cli.blocks.control import far_control, read_control
 from aeromatch_cli.blocks.crs import grid_from_geographic
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, ControlPoint, FloatArray, Image
 from aeromatch_cli.errors import ConfigError
@@ -121,7 +121,16 @@ def test_a_list_is_read_into_the_block(tmp_path: Path, head: str) -> None:
     ]
     np.testing.assert_allclose(points[0].position_m, [10.5, 20.25, 12.5], atol=1e-6)
     np.testing.assert_array_equal(points[0].pixels["a_jpg"], [50.0, 40.0])
-    assert remarks == ["gcp_list.txt names 1 images that are not in the block: c.jpg"]
+    assert remarks == ["gcp_list.txt names 1 image that the block does not have: c.jpg"]
+
+
+def test_points_of_another_place_are_said_before_the_long_stages(truth: Truth) -> None:
+    near = surveyed(truth, [0, 40], np.zeros((2, 3)), set())
+    assert far_control(near, truth.block.poses, "dir/gcp_list.txt") == []
+    far = surveyed(truth, [0, 40], np.full((2, 3), 300_000.0), set())
+    (said,) = far_control(far, truth.block.poses, "dir/gcp_list.txt")
+    assert said.startswith("the control points of gcp_list.txt lie 424.")
+    assert far_control(far, {}, "gcp_list.txt") == []
 
 
 def test_geographic_points_are_brought_to_the_blocks_crs(tmp_path: Path) -> None:

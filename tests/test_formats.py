@@ -125,9 +125,18 @@ def test_poses_round_trip(tmp_path: Path) -> None:
     found = read_poses(written(tmp_path, poses_text(poses)))
     assert list(found) == ["a", "b"]
     np.testing.assert_array_equal(found["a"].center_m, poses["a"].center_m)
-    np.testing.assert_allclose(found["a"].world_rotation, rotation, atol=1e-15)
+    np.testing.assert_allclose(found["a"].world_rotation, rotation, atol=2e-14)
     assert found["b"].world_rotation is None
     assert (found["b"].sigma_position_m, found["b"].sigma_angle_deg) == (0.02, 180.0)
+
+
+def test_poses_written_again_are_the_same_to_the_last_digit(tmp_path: Path) -> None:
+    """A grown block keeps the poses of its old images, and what was made with them."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.random(500, random_state=0).as_matrix()
+    text = poses_text({f"i{n:03}": Pose(np.zeros(3), turn, 1.0, 1.0) for n, turn in enumerate(turns)})
+    assert poses_text(read_poses(written(tmp_path, text))) == text
 
 
 def test_pairs_round_trip_with_unknown_overlap(tmp_path: Path) -> None:

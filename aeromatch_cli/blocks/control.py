@@ -13,6 +13,7 @@ comments.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,10 +21,12 @@ import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.crs import LOCAL
-from aeromatch_cli.data import ControlPoint, FloatArray, Image
+from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 
+# Control points so many extents of the block, and so many metres more, from its middle are elsewhere.
+_FAR_EXTENTS, _FAR_M = 5.0, 2000.0
 _CHECK = ("check", "checkpoint", "check_point")
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check]"
 
@@ -57,9 +60,24 @@ def read_control(
     checks = {row.name for row in rows if row.check}
     points = tuple(ControlPoint(name, place_m, name in checks, pixels[name]) for name, place_m in places.items())
     absent = sorted({row.image for row in rows} - ids.keys())
-    return points, [
-        f"{path.name} names {len(absent)} images that are not in the block: {listed(absent)}"
-    ] if absent else []
+    count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
+    return points, [f"{path.name} names {count} that the block does not have: {listed(absent)}"] if absent else []
+
+
+def far_control(points: Sequence[ControlPoint], poses: Mapping[str, Pose], name: str) -> list[str]:
+    """One sentence where control points lie far outside the block: in another CRS, or with exchanged columns."""
+    if len(points) == 0 or len(poses) < 2:
+        return []
+    places_m = np.array([pose.center_m[:2] for pose in poses.values()])
+    middle_m = np.median(places_m, axis=0)
+    extent_m = float(np.linalg.norm(np.ptp(places_m, axis=0)))
+    apart_m = float(np.linalg.norm(np.median([point.position_m[:2] for point in points], axis=0) - middle_m))
+    if apart_m <= _FAR_EXTENTS * extent_m + _FAR_M:
+        return []
+    return [
+        f"the control points of {Path(name).name} lie {apart_m / 1000.0:,.1f} km from the images: is the CRS in its first "
+        "line right, or are x and y exchanged?"
+    ]
 
 
 @dataclass(frozen=True)

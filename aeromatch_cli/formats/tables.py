@@ -11,6 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import (
     Camera,
+    FloatArray,
     Image,
     Pair,
     Pose,
@@ -19,6 +20,7 @@ from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.geometry.rotations import from_quaternion, to_quaternion
 
 T = TypeVar("T")
+_QUATERNION_DIGITS = 14
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -64,9 +66,24 @@ def poses_text(poses: Mapping[str, Pose]) -> str:
     header = ("image_id", "x", "y", "z", "qw", "qx", "qy", "qz", "sigma_position_m", "sigma_angle_deg")
     rows = []
     for image_id, pose in sorted(poses.items()):
-        q: Sequence[float | None] = (None,) * 4 if pose.world_rotation is None else to_quaternion(pose.world_rotation)
+        q: Sequence[float | None] = (None,) * 4 if pose.world_rotation is None else _settled(pose.world_rotation)
         rows.append((image_id, *map(float, pose.center_m), *q, pose.sigma_position_m, pose.sigma_angle_deg))
     return csv_text(header, rows)
+
+
+def _settled(rotation: FloatArray) -> tuple[float, ...]:
+    """A quaternion that stays the same to the last digit when it is read and written again: results depend on poses."""
+    found = _rounded(rotation)
+    for _ in range(20):  # one or two in practice
+        again = _rounded(from_quaternion(*found))
+        if again == found:
+            break
+        found = again
+    return found
+
+
+def _rounded(rotation: FloatArray) -> tuple[float, ...]:
+    return tuple(round(value, _QUATERNION_DIGITS) for value in to_quaternion(rotation))
 
 
 def pairs_text(pairs: Iterable[Pair]) -> str:

@@ -148,8 +148,23 @@ def unoriented_remark(evidence: Evidence) -> str:
 def judged(given: Solution, pictures: Solution) -> Solution:
     """Given poses as they are, with what the pictures say against them."""
     against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "focal_lengths", "remarks")}
+    against["remarks"] = [*against["remarks"], *_kept_remarks(given, pictures)]
     better = pictures if pictures.facts["frame"] == "world" and pictures.terrains else given
     return replace(given, terrains=better.terrains, facts={**given.facts, **against, "points": better.facts["points"]})
+
+
+def _kept_remarks(given: Solution, pictures: Solution) -> list[str]:
+    """How far given poses, which stay, are from those of the pictures."""
+    oriented = {i for group in pictures.facts["groups"] for i in group["images"]}
+    found = {i: pictures.poses[i] for i in sorted(oriented & pictures.poses.keys())}
+    off_deg = list(attitude_errors_deg(given.poses, found).values())
+    if not off_deg or pictures.facts["frame"] != "world":
+        return []
+    off_m = list(position_errors_m(given.poses, found).values())
+    return [
+        "the given poses do not explain the matches, and stay (orient=given): beside those of the pictures they are "
+        f"off by {np.median(off_deg):.2f} degrees and {np.median(off_m):.2f} m (medians); orient=global corrects them"
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.control import read_control
+from aeromatch_cli.blocks.control import far_control, read_control
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -63,6 +63,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
     inputs, prints = _read_inputs(settings, workspace, executor, before)
     ground, source, remarks = given_ground(settings, inputs)
     control, absent = read_control(settings.block.gcp, inputs.images, inputs.crs, inputs.origin_m)
+    absent += far_control(control, inputs.poses, settings.block.gcp)
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,

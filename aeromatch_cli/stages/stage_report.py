@@ -47,7 +47,7 @@ class StageReport:
     def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
         """Close the clock, write the report and gather failures.csv from all stages.
 
-        A stage that made nothing, and fails where it failed before, leaves the report of the run before, with its timing.
+        A stage that made nothing, and fails where it failed before, leaves that report, with its timing.
         """
         self.seconds = round(time.perf_counter() - self.started, 3)
         value = {
