@@ -201,7 +201,7 @@ def contradicting_exif(
     odd = {k: px for k, px in found.items() if _contradicts(focal_px(assignment.cameras[k]), px)}
     remarks = [
         f"camera {camera_id}: focal length {focal_px(assignment.cameras[camera_id]):.0f} px in the camera file, "
-        f"{px:.0f} px by EXIF of its images: the pictures are asked which is right"
+        f"{px:.0f} px by EXIF of its images: the matches decide between them"
         for camera_id, px in odd.items()
     ]
     return {k: _of_other_size(focal_px(assignment.cameras[k]), px) for k, px in odd.items()}, remarks

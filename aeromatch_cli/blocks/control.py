@@ -75,8 +75,8 @@ def far_control(points: Sequence[ControlPoint], poses: Mapping[str, Pose], name:
     if apart_m <= _FAR_EXTENTS * extent_m + _FAR_M:
         return []
     return [
-        f"the control points of {Path(name).name} lie {apart_m / 1000.0:,.1f} km from the images: is the CRS in its first "
-        "line right, or are x and y exchanged?"
+        f"the control points of {Path(name).name} lie {apart_m / 1000.0:,.1f} km from the images: is the CRS in its "
+        "first line right, or are x and y exchanged?"
     ]
 
 
@@ -94,7 +94,9 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"control points {path} cannot be read ({error}): give ODM's gcp_list.txt") from error
+        raise ConfigError(
+            f"control points {path} cannot be read ({getattr(error, 'strerror', None) or error}): give ODM's gcp_list.txt"
+        ) from error
 
 
 def _row(path: Path, number: int, line: str) -> _Row:

@@ -135,6 +135,8 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
 def unoriented_remark(evidence: Evidence) -> str:
     """Why no image could be oriented from its matches."""
     said = "no image could be oriented from the pictures"
+    if len(evidence.block.images) < 2:
+        return f"{said}: one image has none to be compared with"
     if not evidence.pairs:
         return f"{said}: no two of them have enough matches"
     if len(evidence.matched) < FEWEST_IMAGES:

@@ -84,8 +84,13 @@ def class_of(count: int, limits: Sequence[int]) -> int:
     return round(max(index, 0) * (MAP_CLASSES - 1) / max(len(limits) - 1, 1))
 
 
-def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], links: Sequence[Link]) -> MapFigure:
-    """Footprints, pairs and cameras in world metres. footprints: polygons (N, 2). At least one station."""
+def block_map(
+    stations: Sequence[Station], footprints: Sequence[FloatArray], links: Sequence[Link], *, in_world: bool = True
+) -> MapFigure:
+    """Footprints, pairs and cameras in world metres. footprints: polygons (N, 2). At least one station.
+
+    in_world: else in a frame of the pictures' own, where neither north nor a metre is known.
+    """
     place = {s.image_id: (s.x_m, s.y_m) for s in stations}
     placed = [link for link in links if link.image_id0 in place and link.image_id1 in place]
     drawn = [placed[i] for i in evenly_chosen(len(placed), MAX_LINES)]
@@ -99,6 +104,7 @@ def block_map(stations: Sequence[Station], footprints: Sequence[FloatArray], lin
         words = "1 pair has an image" if missing == 1 else f"{missing:,} pairs have images"
         remarks.append(f"Not drawn: {words} without position.")
     axes = _frame(stations, footprints)
+    _name_axes(axes, in_world)
     _draw_footprints(axes, outlines)
     limits = match_classes(link.verified for link in placed if link.state == "verified")
     titles, handles = _draw_links(axes, place, drawn, limits)
@@ -134,13 +140,20 @@ def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any
     middle = (low + high) / 2
     height = float(np.clip((_WIDTH - _LEGEND_WIDTH) * half[1] / half[0], *_AXES_HEIGHTS))
     axes = new_axes(_WIDTH / 72, height / 72)
-    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
     _show(axes, middle, half)
     axes.ticklabel_format(useOffset=False, style="plain")
+    return axes
+
+
+def _name_axes(axes: Any, in_world: bool) -> None:
+    """Their names, and an arrow to the north where that is known."""
+    if not in_world:
+        axes.set(xlabel="x, arbitrary units", ylabel="y, arbitrary units")
+        return
+    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
     arrow = {"arrowstyle": "-|>", "color": COLOURS["ink"]}
     where = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "color": COLOURS["ink"]}
     axes.annotate("N", (0.975, 0.985), (0.0, -38.0), arrowprops=arrow, zorder=5, **where)
-    return axes
 
 
 def _show(axes: Any, middle: FloatArray, half: FloatArray) -> None:

@@ -184,7 +184,7 @@ def notices(
             text = f"The pictures contradict the given {what} by what is shown; {used}."
             found.append(Notice("bad", _counted(len(items), f"wrong {what}", f"wrong {what}s"), text, items))
     for camera_id, (before, now) in judged.get("focal_lengths", {}).items():
-        text = f"Camera {camera_id}: {now:.0f} px in the pictures, {before:.0f} px given; {used}."
+        text = f"Camera {camera_id}: {now:.0f} px in the pictures, {before:.0f} px before; {used}."
         found.append(Notice("warn", "Another focal length", text))
     if facts["weakly_tied"] and facts["verified_matches"]:
         ties = {row.image_id: row for row in images}
@@ -310,7 +310,8 @@ def _map(
     if not stations:
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
-    return block_map(stations, footprints, [_link(row) for row in pairs])
+    in_world = _facts(context, "orient").get("frame") != "own"
+    return block_map(stations, footprints, [_link(row) for row in pairs], in_world=in_world)
 
 
 def _link(row: PairRow) -> Link:

@@ -165,7 +165,9 @@ def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, An
     for camera_id in sorted(used):
         old_px, new_px = focal_px(before[camera_id]), focal_px(adjusted.cameras[camera_id])
         if abs(new_px / old_px - 1.0) > _FOCAL_SHARE:
-            remarks.append(f"focal length of {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before")
+            remarks.append(
+                f"focal length of camera {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before"
+            )
     return remarks + control_remarks(context, None if control is None else control["offset_m"])
 
 

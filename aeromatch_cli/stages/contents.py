@@ -26,7 +26,7 @@ def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
     pairs = [p for p in context.pairs if (p.image_id0, p.image_id1) not in absent]
     if not pairs:
         raise InputError(
-            "nothing to export: no pair is matched and filtered with the present settings and inputs; "
+            "no pair is matched and filtered with the present settings and inputs; "
             "run `aeromatch filter` first (`aeromatch run` does everything), and see failures.csv"
         )
     return replace(context, pairs=tuple(pairs)), outdated

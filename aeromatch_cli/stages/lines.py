@@ -86,7 +86,7 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
             words.append("in a frame of its own, not that of the given positions")
     for camera_id, (before, found) in facts["focal_lengths"].items():
         kept = ", but the given one is kept" if facts["stays"] else ""
-        words.append(f"focal length of {camera_id}: {found:.0f} px instead of {before:.0f} px{kept}")
+        words.append(f"focal length of camera {camera_id}: {found:.0f} px instead of {before:.0f} px{kept}")
     for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
         if facts[what]:
             named = _listed([f"{names[i]} ({value:.0f} {unit})" for i, value in facts[what].items()])
