@@ -94,9 +94,8 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"control points {path} cannot be read ({getattr(error, 'strerror', None) or error}): give ODM's gcp_list.txt"
-        ) from error
+        said = getattr(error, "strerror", None) or error
+        raise ConfigError(f"control points {path} cannot be read ({said}): give ODM's gcp_list.txt") from error
 
 
 def _row(path: Path, number: int, line: str) -> _Row:
