@@ -13,7 +13,7 @@ from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdic
 from aeromatch_cli.formats.features import read_joined, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
-from aeromatch_cli.stages.cascade import Evidence
+from aeromatch_cli.stages.cascade import Evidence, _untied
 from aeromatch_cli.stages.union import joined_keypoints, joined_matches
 from aeromatch_cli.strategies.steps import LearnedFeatures
 
@@ -69,6 +69,12 @@ def test_without_attitudes_no_overlap_is_known() -> None:
 )
 def test_a_pair_goes_on_where_it_falls_short_of_its_overlap(evidence: Evidence, reason: str) -> None:
     assert evidence.falls_short_of(LearnedFeatures(below_matches=600, below_coverage=0.7)) == reason
+
+
+def test_rare_pairs_go_without_features_where_a_third_image_ties_them() -> None:
+    reasons = {("a", "b"): "", ("b", "c"): "", ("a", "c"): "few", ("c", "d"): "few", ("d", "e"): ""}
+    left = {key: reason for key, reason in reasons.items() if reason}
+    assert _untied(left, reasons) == {("c", "d"): "few"}
 
 
 def test_a_keypoint_of_a_later_step_that_lies_on_an_earlier_one_is_that_one() -> None:

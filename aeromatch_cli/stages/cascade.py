@@ -37,6 +37,8 @@ from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, Lifted
 FIRST = "first"
 # Pairs that overlap by less tie images that others tie better: fewer matches are enough, wherever they lie.
 _TYING_OVERLAP = 0.4
+# Of features that so small a share of the pairs asks for, the pairs go without whose images a third one ties.
+_RARE = 0.05
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
@@ -134,11 +136,24 @@ def _steps(context: Context) -> Iterator[StepContext]:
         found = evidence_of(steps)
         reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
         left = {key: reason for key, reason in reasons.items() if reason}
+        if recipe.own_features and len(left) <= _RARE * len(reasons):
+            left = _untied(left, reasons)
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
-            left = {key: reason or _BOTH_KNOWN for key, reason in reasons.items() if reason or set(key) <= looked_at}
+            known = [key for key in reasons if key not in left and set(key) <= looked_at]
+            left |= {key: reasons[key] or _BOTH_KNOWN for key in known}
         steps.append(_further_step(context, recipe, left))
         yield steps[-1]
+
+
+def _untied(left: Mapping[Key, str], reasons: Mapping[Key, str]) -> dict[Key, str]:
+    """Those of the pairs left whose images no third image ties: none has a pair with both that needs nothing more."""
+    settled: dict[str, set[str]] = {}
+    for (id0, id1), reason in reasons.items():
+        if not reason:
+            settled.setdefault(id0, set()).add(id1)
+            settled.setdefault(id1, set()).add(id0)
+    return {key: reason for key, reason in left.items() if not settled.get(key[0], set()) & settled.get(key[1], set())}
 
 
 def further(context: Context) -> list[StepContext]:
