@@ -38,7 +38,7 @@ FIRST = "first"
 # Pairs that overlap by less tie images that others tie better: fewer matches are enough, wherever they lie.
 _TYING_OVERLAP = 0.4
 # Of features that so small a share of the pairs asks for, the pairs go without whose images a third one ties.
-_RARE = 0.05
+_RARE = 0.02
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
 # A pair with fewer verified matches is never settled, however small its overlap.
