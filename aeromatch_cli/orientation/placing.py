@@ -250,9 +250,11 @@ def _information(used_m: FloatArray, sigma_m: float) -> FloatArray:
 
 def _common(errors_m: FloatArray, places_m: FloatArray) -> float:
     """Correlation of errors (N, 3) with those of the nearest place (N, 3)."""
-    apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
-    np.fill_diagonal(apart_m, np.inf)
-    nearest = errors_m[np.argmin(apart_m, axis=1)]
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(places_m).query(places_m, k=2)[1]
+    others = np.where(near[:, 0] == np.arange(len(near)), near[:, 1], near[:, 0])  # two may lie in one place
+    nearest = errors_m[others]
     return float((errors_m * nearest).sum() / max((errors_m**2).sum(), 1e-12))
 
 
