@@ -99,5 +99,5 @@ def test_images_without_any_pose(site):
     assert outcome.code == 0
     assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100
     views = read_json(Workspace(site.work).views(site.names()[0].replace(".", "_")))["views"]
-    assert outcome.facts["stages"]["orient"]["facts"]["method"] == "pictures"
+    assert outcome.facts["stages"]["orient"]["facts"]["poses_from"] == "pictures"
     assert [view["is_source"] for view in views] == [False]  # a ground view: the pictures gave the attitude

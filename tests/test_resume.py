@@ -204,7 +204,7 @@ def test_a_wrong_attitude_is_corrected_once_and_the_second_run_does_nothing(done
     outcome = done_site("run")
     assert outcome.code == 0
     facts = outcome.facts["stages"]["orient"]["facts"]
-    assert facts["method"] == "given"
+    assert facts["poses_from"] == "given poses"
     assert facts["corrected"] == [image_id]
     assert facts["wrong_attitudes"] == {image_id: pytest.approx(180, abs=2)}
     # The others keep their poses to the last bit: nothing of theirs is made again.

@@ -118,7 +118,7 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     groups = connected_groups([(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= seen.keys()])
     terrains, points = _terrains(evidence, seen, groups, cameras)
     facts = {
-        "method": "given",
+        "poses_from": "given poses",
         "frame": "world",
         "corrected": sorted(found) if correct else [],
         "stays": not correct,
@@ -217,7 +217,7 @@ def from_models(
     judged_poses = {i: pose for i, pose in found.items() if i not in beside}
     wrong = _judged(block.poses, judged_poses, convention, angles, north_deg)
     facts = {
-        "method": "pictures",
+        "poses_from": "pictures",
         "stays": False,
         "frame": "own" if own else "world",
         "models": [dict(model.figures) | {"kind": model.kind} for model in models],

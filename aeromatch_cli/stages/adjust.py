@@ -230,6 +230,8 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
             reasons[image_id] = "in no pair: it overlaps no other image"
         elif not verified[image_id]:
             reasons[image_id] = f"none of its {pairs[image_id]} pairs could be verified"
+        elif not adjusted.poses:
+            reasons[image_id] = f"no image could be oriented ({verified[image_id]} verified pairs of this one)"
         elif not tied[image_id]:
             reasons[image_id] = f"its {verified[image_id]} verified pairs are with images that are not oriented either"
         else:

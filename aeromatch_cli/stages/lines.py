@@ -65,13 +65,13 @@ def _filter_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -
 
 def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> list[str]:
     """How the block was oriented, and what of that which was given is wrong. facts: of the stage orient."""
-    if "method" not in facts:
+    if "poses_from" not in facts:
         return []
     names = {image.image_id: image.name for image in block.images}
     matched, explained = facts["images_matched"], facts["given_poses_explained"]
     attitudes = sum(pose.world_rotation is not None for pose in given.poses.values())
     explains = f"given poses explain the matches of {explained} of {matched} images"
-    if facts["method"] == "given":
+    if facts["poses_from"] == "given poses":
         unjudged = "no matches to judge the given poses by" if attitudes else "no matches to find it by"
         words = [(explains if attitudes else "no attitudes were given") if matched else unjudged]
     else:

@@ -39,7 +39,7 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
 
     ours = {row["method"] for row in rows if "run_seconds" in row}
     figure, axis = plt.subplots(figsize=_SIZE_IN)
-    points = quality(rows)
+    points = [point for point in quality(rows) if point[2] > 0.0]  # a logarithm has no place for none
     places = np.log([point[1:3] for point in points])
     for (method, seconds, correct, right), place in zip(points, places, strict=True):
         colour = _OURS if method in ours else _PEERS

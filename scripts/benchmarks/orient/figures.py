@@ -51,7 +51,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
         "turn_deg": None if own or not common else whole_deg,
         "adjusted_deg": float(np.median(adjusted)) if len(adjusted) else None,
         "focal_share": max(shares, key=abs),
-        "method": facts.get("method", "none"),
+        "poses_from": facts.get("poses_from", "none"),
         "named": len(named & wrong),
         "wrong": len(wrong),
         "named_without_cause": len(named - wrong),
