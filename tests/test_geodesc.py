@@ -14,7 +14,7 @@ from trainings.patches.validation import Pair, pairs_of, sift, table
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.files import shipped_path
-from aeromatch_cli.nets.geodesc import LENGTH, GeoDesc, describe, load_geodesc
+from aeromatch_cli.nets.geodesc import LENGTH, GeoDesc, Size, describe, load_geodesc
 from aeromatch_cli.nets.patches import SIDE_PX, fold, standardised
 
 
@@ -36,10 +36,10 @@ def noise(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (count, SIDE_PX, SIDE_PX), dtype=np.uint8)
 
 
-def trained_a_little() -> GeoDesc:
+def trained_a_little(size: Size) -> GeoDesc:
     """With statistics in its batch norm that are not those of a new network."""
     torch.manual_seed(0)
-    network = GeoDesc().train()
+    network = GeoDesc(size).train()
     with torch.no_grad():
         for seed in range(3):
             network(torch.from_numpy(noise(32, seed))[:, None])
@@ -70,14 +70,18 @@ def test_light_and_scale_of_values_do_not_matter() -> None:
     assert np.isfinite(describe(np.zeros((1, SIDE_PX, SIDE_PX), np.uint8))).all()
 
 
-def test_folded_answers_as_unfolded() -> None:
-    network = trained_a_little()
+@pytest.mark.parametrize("size", ["large", "small"])
+def test_folded_answers_as_unfolded_and_is_read_back(size: Size, tmp_path: Path) -> None:
+    network = trained_a_little(size)
     patches = torch.from_numpy(noise(16, 9))[:, None]
     with torch.no_grad():
         expected = network(patches)
-        assert fold(network, GeoDesc(folded=True))(patches) == pytest.approx(expected, abs=1e-5)
+        folded = fold(network, GeoDesc(size, folded=True))
+        assert folded(patches) == pytest.approx(expected, abs=1e-5)
+        save_file(folded.state_dict(), tmp_path / "own.safetensors")
+        assert load_geodesc(tmp_path / "own.safetensors", "float32")(patches) == pytest.approx(expected, abs=1e-5)
     with pytest.raises(TypeError, match="folded already"):
-        fold(GeoDesc(folded=True), GeoDesc(folded=True))
+        fold(folded, GeoDesc(size, folded=True))
 
 
 @pytest.mark.slow

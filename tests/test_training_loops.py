@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from trainings.lightglue.data import write_block
 from trainings.lightglue.sides import Partners, Seen
 from trainings.orientation import command as train_orientation
 from trainings.patches.draws import sources_of
-from trainings.patches.runs import Run
+from trainings.patches.runs import Run, ship
 from trainings.patches.sources import homography
 
 from aeromatch_cli.nets.geodesc import GeoDesc
@@ -46,10 +47,21 @@ def same(first: nn.Module, second: nn.Module) -> bool:
     return all(torch.equal(one, other) for one, other in pairs)
 
 
-@pytest.mark.parametrize(("recipe", "make"), [(train_descriptor, GeoDesc), (train_orientation, OrientationNet)])
+@pytest.mark.parametrize(
+    ("recipe", "make", "taught"),
+    [
+        (train_descriptor, partial(GeoDesc, "large"), False),
+        (train_descriptor, partial(GeoDesc, "small"), True),
+        (train_orientation, OrientationNet, False),
+    ],
+    ids=["large descriptor", "small descriptor", "orientation"],
+)
 def test_patch_trainings_go_on_where_they_were(
-    recipe: object, make: Callable[[], nn.Module], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recipe: object, make: Callable[[], nn.Module], taught: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    teacher = tmp_path / "teacher.safetensors" if taught else None
+    if teacher:
+        ship(GeoDesc("large", folded=True), teacher)
     texture = np.random.default_rng(5).random((500, 600))
     gray = cv2.normalize(cv2.GaussianBlur(texture, (0, 0), 3.0), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "texture.png"), gray)
@@ -58,7 +70,7 @@ def test_patch_trainings_go_on_where_they_were(
     monkeypatch.setattr(recipe, "table", lambda *_: {"all": {"fpr95": 1.0}})
     weights = []
     for minutes in (0.0, 1e-9):
-        args = options(tmp_path / str(minutes))
+        args = options(tmp_path / str(minutes), teacher=teacher)
         args.out.mkdir()
         args.minutes = minutes
         for _ in range(STEPS if minutes else 1):

@@ -1,4 +1,4 @@
-"""Train the descriptor that ships with the package: GeoDesc's recipe on the L2-Net architecture.
+"""Train the descriptors that ship with the package: GeoDesc's recipe on the L2-Net architecture, then on a small one.
 
 Pairs of patches show one ground point in two pictures (trainings.patches.sources): rendered blocks by exact truth, with
 parallax, occlusion, oblique views and two suns; homographies of real pictures, developed anew; sparse points of
@@ -10,6 +10,9 @@ A batch is made of groups from one block each, of places of like size: its harde
 scene; two places that overlap are no negatives. Pairs are drawn by view angle, small ones first, large ones later. The
 loss is HardNet's plus a softmax over the batch. The learning rate falls along a cosine; what is kept is a moving
 average.
+
+With --teacher, weights of the large network, it is the small one that learns, to answer as the teacher does, too: it
+takes a quarter of the seconds, and its descriptors can stand in for the teacher's.
 
 Validation knows neither the scenes nor the flights: pairs of pictures of rendered blocks of other seeds. Beside it
 stand RootSIFT and, with --reference, TFeat and HardTFeat on the same patches.
@@ -25,23 +28,28 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
-from aeromatch_cli.nets.geodesc import GeoDesc, describe
+from aeromatch_cli.nets.geodesc import GeoDesc, Size, describe, load_geodesc
 from aeromatch_cli.nets.patches import fold
 from trainings.patches.data import prepare, read
 from trainings.patches.draws import Source, distinct, drawn, looked_at, sources_of
 from trainings.patches.loss import descriptor_loss
 from trainings.patches.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
 from trainings.patches.validation import Describe, Pair, pairs_of, sift, table, tfeat
+from trainings.runs import check_recipe
 
 GROUPS = 4  # of a batch, each from one block
 # How much pairs of larger view angle are favoured, at the first step and at the last.
 HARDNESS = (-1.0, 1.0)
+# Weight of 1 - cosine to the teacher's answer.
+LIKENESS = 4.0
 REPORT_EVERY, SAVE_EVERY = 100, 25  # steps
 QUICK = 120  # tracks of a pair of pictures, and every so many pairs, while it trains
 PEERS = {"TFeat": "tfeat-liberty.params", "HardTFeat": "HardTFeat.pth"}
@@ -49,6 +57,7 @@ PEERS = {"TFeat": "tfeat-liberty.params", "HardTFeat": "HardTFeat.pth"}
 
 def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Namespace) -> bool:
     """Whether it came to the end; False where --minutes ended it before."""
+    teacher = None if args.teacher is None else load_geodesc(args.teacher, "bfloat16", str(run.device))
     weights = np.array([source.weight for source in known])
     started, losses = time.monotonic(), []
     while run.step < args.steps:
@@ -63,12 +72,14 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
         both = answered(run.network, torch.stack([first, second], dim=1).flatten(0, 1), run.device)
         both = both.view(len(first), 2, -1)
         loss = descriptor_loss(both[:, 0], both[:, 1], distinct(groups).to(run.device))
+        if teacher is not None:
+            loss = loss + LIKENESS * unlikeness(both[:, 0], first, teacher, run.device)
         run.learn(loss, rate_at(run.step, args.steps, args.rate))
         losses.append(float(loss.detach()))
         if run.step % REPORT_EVERY == 0 or run.step == args.steps:
             minutes = round((time.monotonic() - started) / 60.0, 1)
             row = {"step": run.step, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
-            run.log.append(row | {"unseen": table(described_by(run), quick)["all"]})
+            run.log.append(row | {"unseen": table(described_by(run, args), quick)["all"]})
             print(json.dumps(run.log[-1]), flush=True)
             losses = []
         if run.step % SAVE_EVERY == 0 or run.step == args.steps:
@@ -79,9 +90,25 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
     return True
 
 
-def described_by(run: Run) -> Describe:
+def unlikeness(own: Tensor, patches: Tensor, teacher: nn.Module, device: torch.device) -> Tensor:
+    """Mean of 1 - cosine between own descriptors (N, 128) of patches (N, 1, 32, 32) and the teacher's."""
+    with torch.no_grad():
+        taught = answered(teacher, patches, device)
+    return (1.0 - (own * taught).sum(dim=1)).mean()
+
+
+def folded(run: Run, args: argparse.Namespace) -> GeoDesc:
+    """The averaged network as it is shipped."""
+    return fold(run.average.eval(), GeoDesc(size_of(args), folded=True))
+
+
+def size_of(args: argparse.Namespace) -> Size:
+    return "large" if args.teacher is None else "small"
+
+
+def described_by(run: Run, args: argparse.Namespace) -> Describe:
     """The averaged network as it is used, in bfloat16."""
-    network = fold(run.average.eval(), GeoDesc(folded=True)).to(run.device, torch.bfloat16)
+    network = folded(run, args).to(run.device, torch.bfloat16)
     network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return lambda patches: describe(patches, network)
 
@@ -100,10 +127,13 @@ def peer_weights(path: Path) -> Any:
     return content.get("state_dict", content)
 
 
-def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> None:
+def compare(run: Run, unseen: list[Pair], args: argparse.Namespace) -> None:
     """OUT/table.json: every descriptor on the same patches."""
-    found = {name: table(way, unseen) for name, way in {"GeoDesc": described_by(run), **peers(reference)}.items()}
-    (out / "table.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    ways = {"GeoDesc": described_by(run, args)}
+    if args.teacher is not None:
+        ways["teacher"] = partial(describe, network=load_geodesc(args.teacher, "bfloat16"))
+    found = {name: table(way, unseen) for name, way in {**ways, **peers(args.reference)}.items()}
+    (args.out / "table.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     for row in found["GeoDesc"]:
         cells = (f"{way} {rows[row]['fpr95']:.3f} {rows[row]['map']:.3f}" for way, rows in found.items())
         print(f"{row} ({found['GeoDesc'][row]['pairs']}): {' | '.join(cells)}", flush=True)
@@ -112,23 +142,26 @@ def compare(run: Run, unseen: list[Pair], out: Path, reference: Path | None) -> 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser, others="descriptors", steps=3200, batch=512)
+    parser.add_argument("--teacher", type=Path, help="weights of the large network, for the small one to learn from")
     parser.add_argument("--only-data", action="store_true", help="make the data and stop")
     parser.add_argument("--only-table", action="store_true", help="compare the state as it is and write its weights")
     args = parsed(parser, arguments, PEERS.values())
+    check_recipe(parser, args, ("teacher",))
     known, unseen = prepare(args.patches, args.rendered, args.data, args.real.split(","), args)
     if args.only_data:
         return
     patches = read(args.patches / "unseen", unseen)
-    run = Run.begin(args.out / "state.pt", GeoDesc, args.rate, args.seed)
+    run = Run.begin(args.out / "state.pt", partial(GeoDesc, size_of(args)), args.rate, args.seed)
     quick = pairs_of(patches, QUICK)[::5]
     if args.only_table and not run.log:
         parser.error(f"--only-table: {args.out} has no state of a training yet")
-    if not args.only_table and not train(run, sources_of(read(args.patches / "known", known)), quick, args):
+    sources = [] if args.only_table else sources_of(read(args.patches / "known", known))
+    if not args.only_table and not train(run, sources, quick, args):
         run.tell_unfinished(args.steps)
         return
-    ship(fold(run.average.eval(), GeoDesc(folded=True)), args.out / "geodesc.safetensors")
+    ship(folded(run, args), args.out / "geodesc.safetensors")
     (args.out / "log.json").write_text(json.dumps(run.log, indent=1) + "\n", encoding="utf-8")
-    compare(run, pairs_of(patches), args.out, args.reference)
+    compare(run, pairs_of(patches), args)
     others = {way: table(peer, quick)["all"] for way, peer in peers(args.reference).items()}
     values = {name: [row["unseen"][name] for row in run.log] for name in ("fpr95", "map")}
     lines = {f"{way} {name}": rows[name] for way, rows in others.items() for name in values}
