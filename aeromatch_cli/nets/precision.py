@@ -42,9 +42,14 @@ def layer_type(precision: Precision, device: str = "cpu") -> torch.dtype:
 
 
 def has_bfloat16(device: str = "cpu") -> bool:
-    """Whether this processor ("cpu" or "cuda") multiplies bfloat16 itself; emulated it is slower than float32."""
+    """Whether this processor ("cpu" or "cuda") multiplies bfloat16 itself; emulated it is slower than float32.
+
+    A processor that torch is held to use as an older one (ATEN_CPU_CAPABILITY=avx2) does not.
+    """
     import torch
 
     if device == "cuda":
         return bool(torch.cuda.is_bf16_supported())
+    if torch.backends.cpu.get_cpu_capability() in ("DEFAULT", "AVX2"):
+        return False
     return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())

@@ -82,6 +82,8 @@ def machine() -> str:
     flags = set(info.read_text(encoding="utf-8", errors="replace").split()) if info.is_file() else set()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parts = [f"{cores} cores", *(name for flag, name in _FEATURES.items() if flag in flags)]
+    if "avx512f" in flags and torch.backends.cpu.get_cpu_capability() == "AVX2":
+        parts.append("used as AVX2")
     parts.append("bfloat16" if has_bfloat16() else "no bfloat16")
     return ", ".join(parts + ([torch.cuda.get_device_name()] if torch.cuda.is_available() else []))
 
