@@ -409,6 +409,21 @@ def test_sigterm_is_heard_while_pycolmap_is_loaded():
     assert done.stdout == "heard\n", done.stderr
 
 
+def test_an_interrupt_in_code_made_from_text_leaves_with_130(tmp_path):
+    """As while a module with dataclasses is imported: `python -m` would end as if killed by the signal."""
+    lines = (
+        "import typer",
+        "from aeromatch_cli.cli.output import guarded",
+        "def main():",
+        "    guarded(lambda: exec('raise KeyboardInterrupt'), 'run', quiet=True, as_json=True, log_file=None)",
+        "typer.run(main)",
+    )
+    (tmp_path / "stopped.py").write_text("\n".join(lines), encoding="utf-8")
+    done = subprocess.run([sys.executable, "-m", "stopped"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130, done.stderr
+    assert "run the same command again" in done.stderr
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_leaves_with_130_and_resumes(done_site, number):
     work = done_site.root / "stopped"

@@ -69,6 +69,7 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
         record.debug("stopped by", exc_info=True)
         return {"error": str(error), "exit_code": error.exit_code}
     except KeyboardInterrupt:
+        _forget_interrupt()
         typer.echo("interrupted; run the same command again to resume", err=True)
         record.error("interrupted")
         return {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
@@ -102,6 +103,13 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _forget_interrupt() -> None:
+    """Keeps the exit code: `python -m` ends as if killed by SIGINT where an interrupt has left code that was made from
+    text, as dataclasses make it while a module is imported. Running other such code takes that mark away.
+    """
+    exec("")
 
 
 @contextmanager
