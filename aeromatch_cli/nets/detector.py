@@ -156,4 +156,4 @@ def load_detector(path: Path | None = None, precision: Precision = "auto", devic
 
     Raises ConfigError where the file is missing or holds another.
     """
-    return load_network(Detector, path or shipped_path("detector"), precision, device)
+    return load_network(lambda _: Detector(), path or shipped_path("detector"), precision, device)

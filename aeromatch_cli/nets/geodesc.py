@@ -9,7 +9,6 @@ scripts/train descriptor documents the recipe of the weights that ship.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from aeromatch_cli.nets.files import read_tensors, shipped_path
+from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.loading import load_network, once_per_file
 from aeromatch_cli.nets.patches import Convolution, answers, convolutions, in_channels_last, standardised
 from aeromatch_cli.nets.precision import Precision
@@ -60,10 +59,14 @@ def load_geodesc(path: Path | None = None, precision: Precision = "auto", device
 
     Of either size. Raises ConfigError where the file is missing or holds another.
     """
-    path = path or shipped_path("geodesc")
-    first = read_tensors(path).get(_FIRST)
-    size: Size = "small" if first is not None and len(first) == _LAYERS["small"][0][0] else "large"
-    return in_channels_last(load_network(partial(GeoDesc, size, folded=True), path, precision, device))
+    return in_channels_last(load_network(_fitting, path or shipped_path("geodesc"), precision, device))
+
+
+def _fitting(tensors: Mapping[str, Tensor]) -> GeoDesc:
+    """A network of the size that the tensors have."""
+    first = tensors.get(_FIRST)
+    small = first is not None and len(first) == _LAYERS["small"][0][0]
+    return GeoDesc("small" if small else "large", folded=True)
 
 
 def describe(patches: NDArray[Any], network: GeoDesc | None = None) -> NDArray[np.float32]:

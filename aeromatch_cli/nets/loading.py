@@ -47,16 +47,16 @@ def content_stamp(path: Path) -> tuple[int, int] | None:
 
 
 def load_network(
-    make: Callable[[], Network], path: Path, precision: Precision = "float32", device: str = "cpu"
+    make: Callable[[Mapping[str, Tensor]], Network], path: Path, precision: Precision = "float32", device: str = "cpu"
 ) -> Network:
-    """What `make` makes, with the weights of a file in this precision, on "cpu" or "cuda", for evaluation.
+    """What `make` makes for a file's tensors, with these weights in this precision, on "cpu" or "cuda", for evaluation.
 
     Every tensor comes from the file and every tensor of the file is used; raises ConfigError otherwise. The global
     generator stays as it was.
     """
     given = read_tensors(path)
     with torch.random.fork_rng(devices=[]):
-        network = make()
+        network = make(given)
     try:
         check_same_tensors(network.state_dict(), given)
     except ValueError as error:

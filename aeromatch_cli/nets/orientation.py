@@ -8,7 +8,6 @@ scripts/train orientation documents the recipe of the weights that ship.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,8 +82,8 @@ def load_orientation(path: Path | None = None, precision: Precision = "auto", de
 
     Raises ConfigError where the file is missing or holds another.
     """
-    make = partial(OrientationNet, folded=True)
-    return in_channels_last(load_network(make, path or shipped_path("orientation"), precision, device))
+    path = path or shipped_path("orientation")
+    return in_channels_last(load_network(lambda _: OrientationNet(folded=True), path, precision, device))
 
 
 def directions(patches: NDArray[Any], network: OrientationNet | None = None) -> NDArray[np.float32]:

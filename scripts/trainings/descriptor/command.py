@@ -37,7 +37,7 @@ import torch
 from torch import Tensor, nn
 
 from aeromatch_cli.nets.geodesc import GeoDesc, Size, describe, load_geodesc
-from aeromatch_cli.nets.patches import fold
+from aeromatch_cli.nets.patches import fold, in_channels_last
 from trainings.patches.data import prepare, read
 from trainings.patches.draws import Source, distinct, drawn, looked_at, sources_of
 from trainings.patches.loss import descriptor_loss
@@ -108,8 +108,7 @@ def size_of(args: argparse.Namespace) -> Size:
 
 def described_by(run: Run, args: argparse.Namespace) -> Describe:
     """The averaged network as it is used, in bfloat16."""
-    network = folded(run, args).to(run.device, torch.bfloat16)
-    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = in_channels_last(folded(run, args).to(run.device, torch.bfloat16))
     return lambda patches: describe(patches, network)
 
 

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from aeromatch_cli.nets.orientation import BINS, OrientationNet, directions
-from aeromatch_cli.nets.patches import fold
+from aeromatch_cli.nets.patches import fold, in_channels_last
 from trainings.patches.data import prepare, read
 from trainings.patches.draws import Source, developed, drawn, photographed, sources_of
 from trainings.patches.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
@@ -102,8 +102,7 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
 
 def oriented_by(run: Run) -> Orient:
     """The averaged network as it is used, in bfloat16."""
-    network = fold(run.average.eval(), OrientationNet(folded=True)).to(run.device, torch.bfloat16)
-    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = in_channels_last(fold(run.average.eval(), OrientationNet(folded=True)).to(run.device, torch.bfloat16))
 
     def orient(patches: Any) -> Any:
         found = directions(patches, network)
