@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from aeromatch_cli.orientation import mapper
 from aeromatch_cli.orientation.adjusting import (
     _prefer_prior_focal_lengths,
     drop_far_images,
     images_by_camera,
     reset_lenses,
 )
-from aeromatch_cli.orientation.mapper import _far_from_priors
+from aeromatch_cli.orientation.mapper import _calibrate_large_block, _far_from_priors
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
 
@@ -114,3 +116,28 @@ def test_a_focal_length_near_its_prior_is_weighed_with_it(model: Any, rise: floa
     _prefer_prior_focal_lengths(model, {"1": priors(model)["1"]}, 100.0, adjuster)
     assert model.cameras[1].params[0] == pytest.approx(840.0 - 40.0 * share, abs=0.01)
     assert model.cameras[1].params[3] == pytest.approx(0.02 - 0.01 * share, abs=1e-5)
+
+
+@pytest.mark.parametrize(("images", "found"), [(21, True), (20, False)])
+def test_a_large_block_starts_from_focal_lengths_of_a_rough_mapping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: int, found: bool
+) -> None:
+    import pycolmap
+
+    monkeypatch.setattr(mapper, "_LARGE_BLOCK", 20)
+
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = options.num_cameras_per_rig = 1
+    options.num_frames_per_rig, options.num_points3D, options.num_points2D_without_point3D = images, 60, 0
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [800.0, 512.0, 384.0, 0.0]
+    database = tmp_path / "database.db"
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.synthesize_dataset(options, opened)
+        camera = opened.read_all_cameras()[0]
+        camera.params = [960.0, 512.0, 384.0, 0.0]
+        opened.update_camera(camera)
+    _calibrate_large_block(pycolmap, database, tmp_path / "rough")
+    with pycolmap.Database.open(database) as opened:
+        focal_px = opened.read_all_cameras()[0].mean_focal_length()
+    assert focal_px == pytest.approx(800.0 if found else 960.0, rel=0.01)

@@ -38,6 +38,9 @@ _MIN_IMAGES = 3
 # take 13 s with 100, 36 s with 300. Small blocks need them: lewis 0.5 degrees with 100, 0.1 with 300. Points after that
 # are left to the adjustment of the final matches.
 _TRACKS_PER_IMAGE, _LEAST_TRACKS, _TRACKS = 300, 100, 30_000
+# In blocks of more images than this, focal lengths are found before by a rough mapping of so few tracks per image: 8 s
+# for 300 images, where a start that has to be made again takes 30 s.
+_LARGE_BLOCK, _ROUGH_TRACKS = 100, 30
 # Adjustments end when a step lowers the cost by a smaller share: exact enough for views and search.
 _COST_TOLERANCE = 1e-4
 
@@ -78,6 +81,8 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
     """
     models: list[Any] = []
     database = folder / "database.db"
+    if mapper == "global":
+        _calibrate_large_block(pycolmap, database, folder / "rough")
     for start in range(_MAX_STARTS):
         out = folder / f"start{start}"
         out.mkdir(exist_ok=True)
@@ -85,6 +90,21 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
         if not models or not _update_focal_lengths(pycolmap, database, models):
             break
     return models
+
+
+def _calibrate_large_block(pycolmap: ModuleType, database: Path, out: Path) -> None:
+    """Write the focal lengths that a rough mapping finds, where the block is large."""
+    with pycolmap.Database.open(database) as opened:
+        if opened.num_images() <= _LARGE_BLOCK:
+            return
+    options = _global_options(pycolmap, database, free=True)
+    options.mapper.track_required_tracks_per_view = _ROUGH_TRACKS
+    options.mapper.ba_skip_fixed_rotation_stage = True
+    options.mapper.ba_num_iterations = 1
+    out.mkdir(exist_ok=True)
+    models = pycolmap.global_mapping(database, out, out, options)
+    by_size = sorted(models.values(), key=lambda model: -model.num_reg_images())
+    _update_focal_lengths(pycolmap, database, by_size)
 
 
 def _once(pycolmap: ModuleType, database: Path, out: Path, mapper: str, *, free: bool) -> list[Any]:
@@ -142,6 +162,12 @@ def _sees(model: Any, camera_id: int) -> bool:
 
 
 def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
+    options = _global_options(pycolmap, database, free)
+    found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
+    return found
+
+
+def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     with pycolmap.Database.open(database) as opened:
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
@@ -154,8 +180,7 @@ def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
     options.mapper.bundle_adjustment.refine_focal_length = free
     options.mapper.bundle_adjustment.refine_extra_params = free and most >= GIVEN_DISTORTION_IMAGES
-    found: dict[int, Any] = pycolmap.global_mapping(database, out, out, options)
-    return found
+    return options
 
 
 def _incremental(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:

@@ -55,7 +55,8 @@ from aeromatch_cli.workspace import (
 
 log = logging.getLogger("aeromatch")
 
-VERSION = 16
+# The second counts for blocks that are large (`first_pass.is_large`) alone.
+VERSION, _LARGE_BLOCK_VERSION = 16, 1
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
@@ -86,7 +87,7 @@ def run(
     if record is None:
         same = before.get("settings") == settings
         kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
-        solution = _solution(context, recipe, kept, before)
+        solution = _solution(context, first_pass.fitted(recipe, context.block), kept, before)
         head = {"fingerprint": report.fingerprint, "settings": settings, "images": images}
         record = _write(context, solution, head)
         report.done = report.items
@@ -297,6 +298,8 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
     how: list[Any] = [settings.orient, settings.block.max_size_px, settings.block.masks]
     if isinstance(settings.pairs, Similar):
         how.append(settings.pairs)
+    if first_pass.is_large(block):
+        how.append(_LARGE_BLOCK_VERSION)
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
 
 

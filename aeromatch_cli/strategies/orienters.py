@@ -26,10 +26,14 @@ class FirstPass(Strategy):
     keypoints: int = Field(
         2000,
         ge=100,
-        description="Largest number of keypoints per image of the first pass. Larger: more time, more ties.",
+        description="Largest number of keypoints per image of the first pass; small images in blocks of more than "
+        "100 take one per 200 pixels. Larger: more time, more ties.",
     )
     neighbours: int = Field(
-        20, ge=2, description="Number of nearest images by position that an image is compared with. Larger: more time."
+        20,
+        ge=2,
+        description="Number of nearest images by position that an image is compared with, at most 12 in a block of "
+        "more than 100. Larger: more time.",
     )
 
 
