@@ -30,7 +30,10 @@ def truth() -> Truth:
 
 
 def matched(truth: Truth) -> list[MatchedKeypoints]:
-    return [MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified) for p in truth.pairs]
+    return [
+        MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified, np.full(len(p.verified), 0.5))
+        for p in truth.pairs
+    ]
 
 
 def held_together(truth: Truth, groups: list[set[str]]) -> AdjustedBlock:

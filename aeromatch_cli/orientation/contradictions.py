@@ -8,13 +8,14 @@ holds the pair's geometry from all images, and a point that two images see has i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
+from aeromatch_cli.orientation.probability import MatchEvidence, off_neighbours_px, probabilities
 
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
@@ -35,7 +36,8 @@ class Limits:
     in a pair whose median distance times this is larger, that counts: an image that the block holds less exactly than
     others has larger distances in all of its matches. third_px: distance of a third image's keypoint from the place of
     the point there. confirm_px: nearer than this one of them must be, where there are any; 0 for never. Where the rays
-    leave the point's place in a third image open by more than a pixel, both grow with that.
+    leave the point's place in a third image open by more than a pixel, both grow with that. min_probability: a match
+    that is less likely to be right counts as contradicting; 0 for never.
     """
 
     epipolar_px: float
@@ -43,15 +45,17 @@ class Limits:
     medians: float
     third_px: float
     confirm_px: float
+    min_probability: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedKeypoints:
-    """Verified matches of two images: keypoint indices (M, 2)."""
+    """Verified matches of two images: keypoint indices (M, 2) and the matcher's scores (M,)."""
 
     image_id0: str
     image_id1: str
     indices: IntArray
+    scores: FloatArray
 
 
 def contradicting(
@@ -71,20 +75,72 @@ def contradicting(
     images lie beside the place of its point there than lie on it; see also `Limits`. Groups of images that no point
     connects have a frame each, less exact than matches: pairs between them are not judged.
     """
+    view, masks, doubtful = _settled(block, cameras, keypoints_px, pairs, limits)
+    found = [
+        np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
+        for pair, mask in zip(pairs, masks, strict=True)
+    ]
+    if limits.min_probability > 0.0:
+        for mask, evidence in zip(found, _evidence(view, pairs, masks), strict=True):
+            if evidence is not None:
+                mask[~mask] = probabilities(evidence) < limits.min_probability
+    return found, sorted(doubtful)
+
+
+def evidence_of(
+    block: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    keypoints_px: Callable[[str], FloatArray],
+    pairs: Sequence[MatchedKeypoints],
+    limits: Limits,
+) -> list[tuple[IntArray, MatchEvidence]]:
+    """Of every pair, rows of the matches that do not contradict the block, and what tells how probable they are.
+
+    Arguments as of `contradicting`; none in pairs of images that the block does not hold together.
+    """
+    view, masks, _ = _settled(block, cameras, keypoints_px, pairs, limits)
+    nothing = np.zeros(0, dtype=np.int64), MatchEvidence(*[np.zeros(0)] * 7)
+    return [
+        nothing if mask is None or evidence is None else (np.flatnonzero(~mask), evidence)
+        for mask, evidence in zip(masks, _evidence(view, pairs, masks), strict=True)
+    ]
+
+
+def _settled(
+    block: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    keypoints_px: Callable[[str], FloatArray],
+    pairs: Sequence[MatchedKeypoints],
+    limits: Limits,
+) -> tuple[_Rays, list[BoolArray | None], set[str]]:
+    """The block's rays, of every pair which matches contradict it, None where it is not judged, and doubtful images."""
     group, doubtful = _groups(block), set[str]()
     view = _Rays.of(block, cameras, keypoints_px, sorted(group.keys() & _images(pairs)))
-    masks: list[BoolArray | None] = []
     for _ in range(_MOST_ROUNDS):
         masks = _masks(view, pairs, limits, group)
         worse = _worst_held(pairs, masks)
         if not worse:
-            break
+            return view, masks, doubtful
         doubtful |= worse
         group = {image_id: number for image_id, number in group.items() if image_id not in worse}
-    else:  # so many images in wrong places: the block itself is no judge
-        masks = [None] * len(pairs)
-    none = [np.zeros(len(pair.indices), dtype=bool) for pair in pairs]
-    return [nothing if mask is None else mask for mask, nothing in zip(masks, none, strict=True)], sorted(doubtful)
+    # So many images in wrong places: the block itself is no judge.
+    return view, [None] * len(pairs), doubtful
+
+
+def _evidence(
+    view: _Rays, pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | None]
+) -> list[MatchEvidence | None]:
+    """Of the matches that do not contradict the block, by each other alone."""
+    kept = [
+        None if mask is None else replace(pair, indices=pair.indices[~mask], scores=pair.scores[~mask])
+        for pair, mask in zip(pairs, masks, strict=True)
+    ]
+    ends = [None if pair is None else view.keypoints_of(pair) for pair in kept]
+    ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
+    return [
+        None if pair is None or both is None else _of_pair(view, ties, *both, pair.scores)
+        for pair, both in zip(kept, ends, strict=True)
+    ]
 
 
 def _images(pairs: Sequence[MatchedKeypoints]) -> set[str]:
@@ -189,36 +245,91 @@ class _Ties:
         return rows, self.others[self.start[keypoints][rows] + within]
 
 
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """Where the rays of matches (M,) of one pair meet.
+
+    between_m: (3,) from centre to centre. error_px, depth_m (along rays0), angle_rad: (M,). points_m, shifted_m: (M, 3)
+    the points, and as far along rays0 as the error of a keypoint may put them.
+    """
+
+    between_m: FloatArray
+    error_px: FloatArray
+    depth_m: FloatArray
+    angle_rad: FloatArray
+    points_m: FloatArray
+    shifted_m: FloatArray
+
+    @classmethod
+    def of(cls, view: _Rays, ends0: IntArray, ends1: IntArray) -> _Meeting:
+        image0, image1 = view.image[ends0[0]], view.image[ends1[0]]
+        between_m = view.centers_m[image1] - view.centers_m[image0]
+        rays0, rays1 = view.rays[ends0], view.rays[ends1]
+        error_px = _epipolar_px(between_m, rays0, rays1, view.focal_px[image0], view.focal_px[image1])
+        depth_m, angle_rad = _depths(between_m, rays0, rays1)
+        shift_m = depth_m * _KEYPOINT_PX / (view.focal_px[image1] * np.maximum(angle_rad, 1e-6))
+        points_m = view.centers_m[image0] + rays0 * depth_m[:, None]
+        return cls(between_m, error_px, depth_m, angle_rad, points_m, points_m + rays0 * shift_m[:, None])
+
+    @property
+    def meet(self) -> BoolArray:
+        return np.asarray(self.angle_rad > np.deg2rad(_LEAST_ANGLE_DEG))
+
+    @property
+    def behind(self) -> BoolArray:
+        return self.meet & (self.depth_m <= 0.0)
+
+    def in_third_images(
+        self, view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray
+    ) -> Iterator[tuple[IntArray, FloatArray]]:
+        """For either end, rows of matches (T,), and how far a keypoint of a third image with which that end is matched
+        lies from the place of the point there: pixels, or shares of what the keypoints' error leaves open."""
+        usable = self.meet & ~self.behind
+        for ends, other in ((ends0, view.image[ends1[0]]), (ends1, view.image[ends0[0]])):
+            rows, third = ties.of_keypoints(ends)
+            known = usable[rows] & (view.image[third] != other)
+            rows, third = rows[known], third[known]
+            open_px = np.maximum(_apart_px(view, third, self.points_m[rows], self.shifted_m[rows]), 1.0)
+            yield rows, _away_px(view, third, self.points_m[rows]) / open_px
+
+
 def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: Limits) -> BoolArray:
     """Which matches (M,) of one pair contradict the block."""
     if not len(ends0):
         return np.zeros(0, dtype=bool)
-    image0, image1 = view.image[ends0[0]], view.image[ends1[0]]
-    between_m = view.centers_m[image1] - view.centers_m[image0]
-    rays0, rays1 = view.rays[ends0], view.rays[ends1]
-    error_px = _epipolar_px(between_m, rays0, rays1, view.focal_px[image0], view.focal_px[image1])
-    depth_m, angle_rad = _depths(between_m, rays0, rays1)
-    meet = angle_rad > np.deg2rad(_LEAST_ANGLE_DEG)
-    behind = meet & (depth_m <= 0.0)
-    # Where the point may lie along its ray, by the error of a keypoint.
-    shift_m = depth_m * _KEYPOINT_PX / (view.focal_px[image1] * np.maximum(angle_rad, 1e-6))
-    points = view.centers_m[image0] + rays0 * depth_m[:, None]
-    shifted = points + rays0 * shift_m[:, None]
-    usable = meet & ~behind
+    meeting = _Meeting.of(view, ends0, ends1)
     asked, near, on = (np.zeros(len(ends0), dtype=np.int64) for _ in range(3))
-    for ends, other in ((ends0, image1), (ends1, image0)):
-        rows, third = ties.of_keypoints(ends)
-        known = usable[rows] & (view.image[third] != other)
-        rows, third = rows[known], third[known]
-        open_px = np.maximum(_apart_px(view, third, points[rows], shifted[rows]), 1.0)
-        away = _away_px(view, third, points[rows]) / open_px
+    for rows, away in meeting.in_third_images(view, ties, ends0, ends1):
         np.add.at(asked, rows, 1)
         np.add.at(near, rows, away <= limits.third_px)
         np.add.at(on, rows, away <= limits.confirm_px)
-    least_px = limits.medians * float(np.median(error_px))
-    beside = error_px > np.maximum(np.where(asked > 0, limits.epipolar_px, limits.alone_px), least_px)
+    least_px = limits.medians * float(np.median(meeting.error_px))
+    most_px = np.maximum(np.where(asked > 0, limits.epipolar_px, limits.alone_px), least_px)
     unconfirmed = (asked > 0) & (on == 0) if limits.confirm_px > 0.0 else np.zeros(len(ends0), dtype=bool)
-    return np.asarray(beside | behind | (2 * near < asked) | unconfirmed)
+    return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < asked) | unconfirmed)
+
+
+def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores: FloatArray) -> MatchEvidence:
+    """Evidence of the matches (M,) of one pair."""
+    if not len(ends0):
+        return MatchEvidence(*[np.zeros(0)] * 7)
+    meeting = _Meeting.of(view, ends0, ends1)
+    known, confirming = np.zeros(len(ends0)), np.zeros(len(ends0))
+    for rows, away in meeting.in_third_images(view, ties, ends0, ends1):
+        np.add.at(known, rows, 1)
+        np.add.at(confirming, rows, away <= 1.0)
+    sides = [(view.centers_m[view.image[ends[0]]], view.rays[ends], view.image[ends[0]]) for ends in (ends0, ends1)]
+    (center0_m, rays0, image0), (center1_m, rays1, image1) = sides
+    heights_m = meeting.points_m[:, 2]
+    return MatchEvidence(
+        scores=np.asarray(scores, dtype=np.float64),
+        error_px=meeting.error_px,
+        known=known,
+        confirming=confirming,
+        off0_px=off_neighbours_px(center0_m, rays0, center1_m, rays1, heights_m, float(view.focal_px[image1])),
+        off1_px=off_neighbours_px(center1_m, rays1, center0_m, rays0, heights_m, float(view.focal_px[image0])),
+        angle_deg=np.rad2deg(meeting.angle_rad),
+    )
 
 
 def _epipolar_px(

@@ -58,8 +58,11 @@ def run(context: Context) -> StageReport:
     with context.executor.step("consistency"):
         cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
-        pairs = [MatchedKeypoints(p.image_id0, p.image_id1, entry.matches.indices) for p, entry in entries]
-        limits = Limits(recipe.epipolar_px, recipe.alone_px, recipe.medians, recipe.third_image_px, recipe.confirm_px)
+        pairs = [
+            MatchedKeypoints(pair.image_id0, pair.image_id1, entry.matches.indices, entry.matches.scores)
+            for pair, entry in entries
+        ]
+        limits = limits_of(recipe)
         masks, doubtful = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
@@ -70,6 +73,17 @@ def run(context: Context) -> StageReport:
     report.facts = {**_facts(context, entries), "doubtful": doubtful, "ties": _ties(context, adjusted)}
     report.done = report.items
     return report.write(context.workspace)
+
+
+def limits_of(recipe: BlockConsistency) -> Limits:
+    return Limits(
+        recipe.epipolar_px,
+        recipe.alone_px,
+        recipe.medians,
+        recipe.third_image_px,
+        recipe.confirm_px,
+        recipe.min_probability,
+    )
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:

@@ -44,6 +44,13 @@ class BlockConsistency(Strategy):
         description="Where third images know the keypoints of a match, one of them must lie this near to the place "
         "of the point there, pixels; 0 = none needs to. Smaller, but for 0: fewer matches, fewer of them wrong.",
     )
+    min_probability: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="Matches that are less likely to be right are dropped, by their score, their distance from the "
+        "epipolar line, third images and neighbouring matches; 0 = none. Larger: fewer matches, fewer of them wrong.",
+    )
     min_matches: int = Field(
         15,
         ge=1,

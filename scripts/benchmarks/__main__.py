@@ -22,6 +22,7 @@ TABLE: Table = {
     "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),
     "lightglue": ("benchmarks.lightglue.command", "the network beside the ratio test, and its seconds"),
     "extraction": ("benchmarks.extraction", "seconds of an image's features, by extractor"),
+    "probability": ("benchmarks.probability", "how far the probability that a match is right can be relied on"),
     "filters": ("benchmarks.filters", "filters on the same matches, by exact truth"),
     "rectification": ("benchmarks.rectification", "scale and rotation that remain between views of oblique pairs"),
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),

@@ -1,0 +1,196 @@
+"""How far the probability that a match is right can be relied on, on rendered blocks, by exact truth.
+
+Every block is one `aeromatch run auto` with its noisy poses, without a least probability. Of the verified matches that
+do not contradict the adjusted block, `aeromatch_cli.orientation.probability` says how likely each is to be right:
+within 3 px of the exact place, which both images see. Stated: the mean of what it says; right: the share that is.
+Left: of the right ones, those that are stated to be at least as likely as asked (--least), and the share of right ones
+among all that are left.
+
+--fit SEEDS renders other blocks of the same scenes and flights, finds the weights from these alone, and prints them:
+WEIGHTS of that module are those of the command that docs/results/auto.md shows. Writes OUT/probability.md and
+OUT/reliability.svg. What OUT has is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.evaluate import open_truth
+from aeromatch_cli.evaluate.scores import CORRECT_PX
+from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import read_verified_row
+from aeromatch_cli.formats.tables import read_images
+from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, evidence_of
+from aeromatch_cli.orientation.probability import WEIGHTS, MatchEvidence, columns, fitted_weights
+from aeromatch_cli.strategies.consistencies import BlockConsistency
+from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.workspace import Workspace
+from benchmarks import options, stamps
+from benchmarks.pages import FOLDER
+from benchmarks.processes import limit_threads
+from benchmarks.scenes import NOISY_POSES, render_asked
+from benchmarks.tables import markdown, number, percent
+from benchmarks.whole import whole_run
+
+_EDGES = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
+_SIZE_IN = (5.0, 4.6)
+
+Block = tuple[str, FloatArray, BoolArray]
+
+
+def block_of(args: argparse.Namespace, scene: str, flight: str, seed: int) -> Block:
+    """Name, `columns` (M, F) of the matches of a block, and which of them (M,) are right."""
+    name = f"{scene}:{flight}, seed {seed}"
+    folder = args.out / "runs" / f"{scene}-{flight}-{seed}"
+    path = folder / "evidence.npz"
+    if not path.is_file():
+        block = render_asked(args, scene, flight=flight, seed=seed)
+        given = ["--poses", str(block / NOISY_POSES), "--cameras", str(block / "block.json"), "--crs", "local"]
+        settings = [f"extract.keypoints={args.keypoints}", f"cascade.learned.keypoints={args.keypoints}"]
+        run = whole_run(
+            "run", "auto", block / "images", folder / "work", extra=given, jobs=args.jobs, settings=settings
+        )
+        if not run.answer:
+            raise SystemExit(f"aeromatch run on {name} failed with exit code {run.code}:\n{run.said}")
+        evidence, right = _judged(Workspace(folder / "work"), block)
+        named = {field.name: getattr(evidence, field.name) for field in fields(evidence)}
+        np.savez(path, right=right, **named)
+    with np.load(path) as stored:
+        found = MatchEvidence(*(stored[field.name] for field in fields(MatchEvidence)))
+        return name, columns(found), stored["right"]
+
+
+def _judged(workspace: Workspace, truth_folder: Path) -> tuple[MatchEvidence, BoolArray]:
+    """Evidence of all matches of a workspace that do not contradict its adjusted block, and which are right."""
+    truth = open_truth(truth_folder)
+    images = {image.image_id: image for image in read_images(workspace.images)}
+    block = read_adjusted(workspace.adjusted)
+    cameras = {image_id: block.cameras[image.camera_id] for image_id, image in images.items()}
+    keypoints = {image_id: np.asarray(read_keypoints(workspace.features(image_id))[0], float) for image_id in images}
+    pairs = [
+        MatchedKeypoints(image_id, entry.image_id1, entry.matches.indices, entry.matches.scores)
+        for image_id in sorted(images)
+        if workspace.verified(image_id).is_file()
+        for entry in read_verified_row(workspace.verified(image_id)).values()
+        if entry.verdict.state == "verified"
+    ]
+    recipe = BlockConsistency()
+    limits = Limits(recipe.epipolar_px, recipe.alone_px, recipe.medians, recipe.third_image_px, recipe.confirm_px)
+    parts, right = [], []
+    for pair, (rows, evidence) in zip(
+        pairs, evidence_of(block, cameras, keypoints.__getitem__, pairs, limits), strict=True
+    ):
+        ends = pair.image_id0, pair.image_id1
+        points = [keypoints[i][pair.indices[rows, side]] for side, i in enumerate(ends)]
+        errors_px, hidden = truth.errors(images[ends[0]].name, images[ends[1]].name, *points)
+        parts.append(evidence)
+        right.append((np.nan_to_num(errors_px, nan=np.inf) <= CORRECT_PX) & ~hidden)
+    joined = [np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(MatchEvidence)]
+    return MatchEvidence(*joined), np.concatenate(right)
+
+
+def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]:
+    for seed in seeds:
+        for flight in args.flights:
+            for scene in args.scenes:
+                yield block_of(args, scene, flight, seed)
+                print(f"{scene}:{flight}, seed {seed}", file=sys.stderr, flush=True)
+
+
+def stated(values: FloatArray) -> FloatArray:
+    """(M,) probabilities by the weights that ship."""
+    return np.asarray(1.0 / (1.0 + np.exp(-values @ np.array(WEIGHTS))))
+
+
+def table_of(blocks: Sequence[Block], least: float) -> str:
+    """Blocks, and classes of probability."""
+    lines = []
+    for name, values, right in blocks:
+        p = stated(values)
+        left = p >= least
+        lines.append(
+            [name, number(len(right)), percent(p.mean(), 1), percent(right.mean(), 1),
+             percent(right[left].sum() / right.sum(), 1), percent(right[left].mean(), 1)]
+        )  # fmt: skip
+    all_p = np.concatenate([stated(values) for _, values, _ in blocks])
+    all_right = np.concatenate([right for _, _, right in blocks])
+    classes = []
+    for low, high in pairwise(_EDGES):
+        own = (all_p >= low) & (all_p < high)
+        if own.any():
+            classes.append(
+                [f"{low:g} to {high:g}", number(int(own.sum())), percent(all_p[own].mean(), 1),
+                 percent(all_right[own].mean(), 1)]
+            )  # fmt: skip
+    return "\n\n".join(
+        [
+            "#### By block\n\n"
+            + markdown(
+                ["block", "matches", "stated", "right", f"right ones left at {least:g}", "right of these"], lines
+            ),
+            "#### By stated probability\n\n" + markdown(["probability", "matches", "stated", "right"], classes),
+        ]
+    )
+
+
+def draw_reliability(path: Path, blocks: Sequence[Block]) -> None:
+    """Write an SVG: of every class of stated probability, the share that is right, block by block and together."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams["svg.hashsalt"] = "reliability"
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=_SIZE_IN)
+    axis.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
+    together = ("all", np.concatenate([v for _, v, _ in blocks]), np.concatenate([r for _, _, r in blocks]))
+    for name, values, right in (*blocks, together):
+        p = stated(values)
+        classes = np.digitize(p, _EDGES[1:-1])
+        shown = [k for k in range(len(_EDGES) - 1) if (classes == k).sum() >= 30]
+        means = [(p[classes == k].mean(), right[classes == k].mean()) for k in shown]
+        style = {"color": "#1f6f3f", "linewidth": 2.0} if name == "all" else {"color": "#b0c8b8", "linewidth": 0.8}
+        axis.plot(*zip(*means, strict=True), marker="o", markersize=3, **style)
+    axis.set_xlabel("stated probability")
+    axis.set_ylabel("share that is right")
+    axis.set_xlim(0, 1)
+    axis.set_ylim(0, 1)
+    axis.set_aspect("equal")
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = options.make_parser("probability", __doc__)
+    add = parser.add_argument
+    options.add_rendered(parser, scenes=",".join(PRESETS), size="640x480", images=7, flights="nadir,mixed")
+    add("--fit", type=options.numbers, help="seeds of the blocks from which the weights are found, comma-separated")
+    add("--keypoints", type=options.positive, default=2048, help="descriptors per image, of every step of the cascade")
+    add("--least", type=float, default=0.8, help="least probability of the matches that are left")
+    add("--jobs", type=options.positive, default=2)
+    options.add_output(parser)
+    args = options.parse(parser, arguments, {"scenes": "suburb", "flights": "nadir", "size": "480x360"})
+    limit_threads(2)
+    if args.fit:
+        fit = list(blocks_of(args, args.fit))
+        weights = fitted_weights(np.concatenate([v for _, v, _ in fit]), np.concatenate([r for _, _, r in fit]))
+        print("WEIGHTS =", tuple(round(float(weight), 2) for weight in weights))
+    blocks = list(blocks_of(args, [args.seed]))
+    draw_reliability(args.out / "reliability.svg", blocks)
+    if args.docs is not None:
+        draw_reliability(FOLDER / "reliability.svg", blocks)
+    options.publish(
+        args, table_of(blocks, args.least) + "\n", args.out / "probability.md", table="bench_probability",
+        command=options.command_line(parser, args), versions=stamps.of_chain("auto"),
+    )  # fmt: skip
