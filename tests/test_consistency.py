@@ -20,7 +20,7 @@ from aeromatch_cli.geometry.epipolar import triangulate
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 
-LIMITS = Limits(epipolar_px=1.5, alone_px=1.5, medians=4.0, third_px=4.0, confirm_px=0.0)
+LIMITS = Limits(epipolar_px=1.5, medians=4.0, third_px=4.0)
 WRONG = 12
 
 
@@ -48,9 +48,9 @@ def held_together(truth: Truth, groups: list[set[str]]) -> AdjustedBlock:
 
 def judged(truth: Truth, keypoints: dict[str, FloatArray], pairs: list[MatchedKeypoints]) -> list[FloatArray]:
     block = held_together(truth, [set(truth.block.poses)])
-    masks, doubtful = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, LIMITS)
-    assert doubtful == []
-    return masks
+    found = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, LIMITS)
+    assert (found.doubtful, found.expected_right) == ([], None)
+    return found.masks
 
 
 def noisy(truth: Truth) -> dict[str, FloatArray]:
@@ -105,20 +105,18 @@ def test_matches_along_the_epipolar_line_are_found_by_third_images(truth: Truth)
     assert np.concatenate([found[0][WRONG:], *found[1:]]).mean() < 0.02
 
 
-def test_third_images_must_confirm_where_that_is_asked(truth: Truth) -> None:
-    """Keypoints of img1 some 5 px along their epipolar lines: near enough for third images not to speak against
-    them, too far to confirm them."""
+def test_improbable_matches_are_dropped_where_that_is_asked(truth: Truth) -> None:
+    """Of one pair alone, keypoints along their epipolar lines, poor scores: not likely, contradicted by nothing."""
     keypoints, pairs = noisy(truth), matched(truth)
-    keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices, 1.02)
-    changed = [replace(pairs[0], indices=wrong), *pairs[1:]]
-    strict = replace(LIMITS, third_px=12.0, confirm_px=1.0)
+    keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices)
+    scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
+    changed = [replace(pairs[0], indices=wrong, scores=scores)]
     block = held_together(truth, [set(truth.block.poses)])
-    for limits, least in ((replace(LIMITS, third_px=12.0), 0.0), (strict, 0.5)):
-        found, _ = contradicting(block, cameras(truth), keypoints.__getitem__, changed, limits)
-        share = found[0][:WRONG].mean()
-        assert share >= least
-        assert least > 0.0 or share < 0.1
-        assert np.concatenate([found[0][WRONG:], *found[1:]]).mean() < 0.05
+    for limits, least, most in ((LIMITS, 0.0, 0.1), (replace(LIMITS, min_probability=0.95), 0.7, 1.0)):
+        found = contradicting(block, cameras(truth), keypoints.__getitem__, changed, limits)
+        assert least <= found.masks[0][:WRONG].mean() <= most
+        assert found.masks[0][WRONG:].mean() < 0.15
+    assert found.expected_right == pytest.approx(0.97, abs=0.03)
 
 
 def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:
@@ -129,9 +127,9 @@ def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth
         indices = pair.indices.copy()
         indices[:WRONG, 1] = np.roll(indices[:WRONG, 1], 1)
         pairs.append(replace(pair, indices=indices))
-    found, doubtful = contradicting(held, cameras(truth), noisy(truth).__getitem__, pairs, LIMITS)
-    assert doubtful == []
-    for pair, wrong in zip(pairs, found, strict=True):
+    found = contradicting(held, cameras(truth), noisy(truth).__getitem__, pairs, LIMITS)
+    assert found.doubtful == []
+    for pair, wrong in zip(pairs, found.masks, strict=True):
         assert wrong.shape == (len(pair.indices),)
         together = {pair.image_id0, pair.image_id1} <= {"img1", "img2", "img3", "img4"}
         assert wrong.any() == together
@@ -142,9 +140,9 @@ def test_an_image_in_a_wrong_place_is_named_and_its_matches_stay(truth: Truth) -
     turn = from_omega_phi_kappa(0.0, 0.0, 20.0)
     poses = {**block.poses, "img2": replace(block.poses["img2"], rotation=block.poses["img2"].rotation @ turn)}
     wrong = replace(block, poses=poses)
-    masks, doubtful = contradicting(wrong, cameras(truth), noisy(truth).__getitem__, matched(truth), LIMITS)
-    assert doubtful == ["img2"]
-    assert np.concatenate(masks).mean() < 0.01
+    found = contradicting(wrong, cameras(truth), noisy(truth).__getitem__, matched(truth), LIMITS)
+    assert found.doubtful == ["img2"]
+    assert np.concatenate(found.masks).mean() < 0.01
 
 
 def test_what_is_dropped_is_read_again(tmp_path: Path) -> None:

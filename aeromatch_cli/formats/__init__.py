@@ -194,9 +194,10 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
-- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `doubtful` (images
-  that the block seems to hold in a wrong place), `ties` (image_id -> ninths of the image that hold a point of the
-  adjusted block, and its points that three or more images see).
+- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`,
+  `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
+  `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `ties` (image_id ->
+  ninths of the image that hold a point of the adjusted block, and its points that three or more images see).
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).

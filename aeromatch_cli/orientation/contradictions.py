@@ -30,22 +30,33 @@ _KEYPOINT_PX = 1.0
 
 @dataclass(frozen=True)
 class Limits:
-    """When a match contradicts the block, in pixels.
+    """When a match contradicts the block.
 
-    epipolar_px: distance from its epipolar line; alone_px: the same where no third image knows its keypoints. medians:
-    in a pair whose median distance times this is larger, that counts: an image that the block holds less exactly than
-    others has larger distances in all of its matches. third_px: distance of a third image's keypoint from the place of
-    the point there. confirm_px: nearer than this one of them must be, where there are any; 0 for never. Where the rays
-    leave the point's place in a third image open by more than a pixel, both grow with that. min_probability: a match
-    that is less likely to be right counts as contradicting; 0 for never.
+    epipolar_px: distance from its epipolar line. medians: in a pair whose median distance times this is larger, that
+    counts: an image that the block holds less exactly than others has larger distances in all of its matches. third_px:
+    distance of a third image's keypoint from the place of the point there; where the rays leave that place open by more
+    than a pixel, it grows with that. min_probability: a match that is less likely to be right counts as contradicting;
+    0 for never.
     """
 
     epipolar_px: float
-    alone_px: float
     medians: float
     third_px: float
-    confirm_px: float
     min_probability: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Contradictions:
+    """What contradicts the block.
+
+    masks: of every pair, which matches (M,) do. doubtful: image ids whose adjusted poses too many of their matches
+    contradict: there the block is wrong, and none of their matches counts as contradicting. expected_right: the share
+    of the matches left that is right to 3 pixels, by their probabilities; None where these were not asked for.
+    """
+
+    masks: list[BoolArray]
+    doubtful: list[str]
+    expected_right: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +75,8 @@ def contradicting(
     keypoints_px: Callable[[str], FloatArray],
     pairs: Sequence[MatchedKeypoints],
     limits: Limits,
-) -> tuple[list[BoolArray], list[str]]:
-    """Of every pair, which matches (M,) contradict the block; none in pairs of images that it does not hold together.
-
-    Also image ids: those whose adjusted poses too many of their matches contradict. There the block is wrong, and none
-    of their matches counts as contradicting.
+) -> Contradictions:
+    """Which matches contradict the block; none in pairs of images that it does not hold together.
 
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
@@ -80,11 +88,15 @@ def contradicting(
         np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
         for pair, mask in zip(pairs, masks, strict=True)
     ]
+    left: list[FloatArray] = [np.zeros(0)]
     if limits.min_probability > 0.0:
         for mask, evidence in zip(found, _evidence(view, pairs, masks), strict=True):
             if evidence is not None:
-                mask[~mask] = probabilities(evidence) < limits.min_probability
-    return found, sorted(doubtful)
+                probable = probabilities(evidence)
+                mask[~mask] = probable < limits.min_probability
+                left.append(probable[probable >= limits.min_probability])
+    judged = np.concatenate(left)
+    return Contradictions(found, sorted(doubtful), float(judged.mean()) if len(judged) else None)
 
 
 def evidence_of(
@@ -298,15 +310,12 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
     if not len(ends0):
         return np.zeros(0, dtype=bool)
     meeting = _Meeting.of(view, ends0, ends1)
-    asked, near, on = (np.zeros(len(ends0), dtype=np.int64) for _ in range(3))
+    asked, near = (np.zeros(len(ends0), dtype=np.int64) for _ in range(2))
     for rows, away in meeting.in_third_images(view, ties, ends0, ends1):
         np.add.at(asked, rows, 1)
         np.add.at(near, rows, away <= limits.third_px)
-        np.add.at(on, rows, away <= limits.confirm_px)
-    least_px = limits.medians * float(np.median(meeting.error_px))
-    most_px = np.maximum(np.where(asked > 0, limits.epipolar_px, limits.alone_px), least_px)
-    unconfirmed = (asked > 0) & (on == 0) if limits.confirm_px > 0.0 else np.zeros(len(ends0), dtype=bool)
-    return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < asked) | unconfirmed)
+    most_px = max(limits.epipolar_px, limits.medians * float(np.median(meeting.error_px)))
+    return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < asked))
 
 
 def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores: FloatArray) -> MatchEvidence:

@@ -6,18 +6,23 @@ A logistic model of a few properties that every match has. It was fitted on rend
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
 
-# Beyond these, more says nothing more: pixels, images, pixels, degrees.
-_MOST_ERROR_PX, _MOST_CONFIRMING, _MOST_OFF_PX, _MOST_ANGLE_DEG = 2.0, 4, 16.0, 60.0
-# Of as many nearest matches of the pair, this one's height counts: a match is on the surface of two of them.
+# Distances count in multiples of the pair's median, which is at least so many pixels: some images are held less exactly
+# than others, and rough ground lies off its neighbours' heights everywhere.
+_LEAST_ERROR_PX, _LEAST_OFF_PX = 0.2, 0.3
+# Beyond these, more says nothing more: medians, images, medians, degrees.
+_MOST_ERRORS, _MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 6.0, 4, 15.0, 60.0
+# A match that has no neighbours, or lies where their heights are not seen, is as far off as this, pixels.
+_NOWHERE_PX = 16.0
+# Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+WEIGHTS = (3.72, 2.89, 0.45, 1.41, 0.26, -1.4, -0.07, -1.22)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +43,6 @@ class MatchEvidence:
     off1_px: FloatArray
     angle_deg: FloatArray
 
-    def take(self, which: BoolArray) -> MatchEvidence:
-        return MatchEvidence(*(getattr(self, field.name)[which] for field in fields(self)))
-
 
 def off_neighbours_px(
     center0_m: FloatArray,
@@ -59,42 +61,52 @@ def off_neighbours_px(
 
     count = min(NEIGHBOURS + 1, len(rays0))
     if count <= SUPPORTING:
-        return np.full(len(rays0), _MOST_OFF_PX)
+        return np.full(len(rays0), _NOWHERE_PX)
     _, near = cKDTree(rays0).query(rays0, k=count)
     with np.errstate(divide="ignore", invalid="ignore"):
         along_m = (heights_m[near[:, 1:]] - center0_m[2]) / rays0[:, None, 2]
         ways = center0_m + rays0[:, None, :] * along_m[..., None] - center1_m
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
         off_px = np.linalg.norm(np.cross(ways, rays1[:, None, :]), axis=2) * focal1_px
-    off_px = np.where((along_m > 0.0) & np.isfinite(off_px), off_px, _MOST_OFF_PX)
+    off_px = np.where((along_m > 0.0) & np.isfinite(off_px), off_px, _NOWHERE_PX)
     return np.asarray(np.sort(off_px, axis=1)[:, SUPPORTING - 1])
 
 
 def columns(evidence: MatchEvidence) -> FloatArray:
-    """(M, 9) what the model is linear in."""
-    off_px = np.minimum(np.stack([evidence.off0_px, evidence.off1_px]), _MOST_OFF_PX)
+    """(M, 8) what the model is linear in: one, score, not known in third images, confirmations, known and not
+    confirmed, angle between the rays, distance from the epipolar line, distance from the neighbours' heights."""
+    if not len(evidence.scores):
+        return np.zeros((0, len(WEIGHTS)))
+    off_px = np.minimum(np.maximum(evidence.off0_px, evidence.off1_px), _NOWHERE_PX)
+    error_px = evidence.error_px
+    errors = error_px / max(float(np.median(error_px)), _LEAST_ERROR_PX)
+    off = off_px / max(float(np.median(off_px)), _LEAST_OFF_PX)
     return np.column_stack(
         [
-            np.ones(len(evidence.scores)),
+            np.ones(len(off)),
             evidence.scores,
             evidence.known == 0,
-            np.minimum(evidence.error_px, _MOST_ERROR_PX),
             np.sqrt(np.minimum(evidence.confirming, _MOST_CONFIRMING)),
             (evidence.known > 0) & (evidence.confirming == 0),
-            np.log2(1.0 + off_px.max(axis=0)),
-            np.log2(1.0 + off_px.min(axis=0)),
             np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
+            np.minimum(errors, _MOST_ERRORS),
+            np.log2(1.0 + np.minimum(off, _MOST_OFF)),
         ]
     ).astype(np.float64)
 
 
+def stated(values: FloatArray) -> FloatArray:
+    """(M,) probabilities of matches with such `columns` (M, 8)."""
+    return np.asarray(1.0 / (1.0 + np.exp(-values @ np.array(WEIGHTS))))
+
+
 def probabilities(evidence: MatchEvidence) -> FloatArray:
-    """(M,) that the matches are right, to 3 pixels."""
-    return np.asarray(1.0 / (1.0 + np.exp(-columns(evidence) @ np.array(WEIGHTS))))
+    """(M,) that the matches of a pair are right, to 3 pixels."""
+    return stated(columns(evidence))
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 9) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Weights of `columns` (M, 8) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = 1.0 / (1.0 + np.exp(-values @ weights))

@@ -38,7 +38,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None or not isinstance(recipe, BlockConsistency):
-        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "doubtful": [], "ties": {}}
+        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "ties": {}}
         if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
             report.facts["remark"] = f"not done: match {context.settings.match.name} measures points without keypoints"
         with translated_os_errors(path):
@@ -62,28 +62,18 @@ def run(context: Context) -> StageReport:
             MatchedKeypoints(pair.image_id0, pair.image_id1, entry.matches.indices, entry.matches.scores)
             for pair, entry in entries
         ]
-        limits = limits_of(recipe)
-        masks, doubtful = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
+        limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability)
+        found = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
-        for (pair, entry), mask in zip(entries, masks, strict=True)
+        for (pair, entry), mask in zip(entries, found.masks, strict=True)
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    report.facts = {**_facts(context, entries), "doubtful": doubtful, "ties": _ties(context, adjusted)}
+    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, "ties": _ties(context, adjusted)}
+    report.facts = {**_facts(context, entries), **known}
     report.done = report.items
     return report.write(context.workspace)
-
-
-def limits_of(recipe: BlockConsistency) -> Limits:
-    return Limits(
-        recipe.epipolar_px,
-        recipe.alone_px,
-        recipe.medians,
-        recipe.third_image_px,
-        recipe.confirm_px,
-        recipe.min_probability,
-    )
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:

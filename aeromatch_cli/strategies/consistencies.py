@@ -20,16 +20,10 @@ class BlockConsistency(Strategy):
         description="Largest distance of a match from the epipolar lines of the adjusted block, pixels. Larger: more "
         "matches, less accurate ones.",
     )
-    alone_px: float = Field(
-        1.5,
-        gt=0.0,
-        description="The same for a match whose keypoints no third image knows. Larger: more matches, more of them "
-        "wrong.",
-    )
     medians: float = Field(
         4.0,
         ge=1.0,
-        description="Both distances are at least this many times the median of the pair: some images are held less "
+        description="That distance is at least this many times the median of the pair: some images are held less "
         "exactly than others. Larger: more matches, less accurate ones.",
     )
     third_image_px: float = Field(
@@ -37,12 +31,6 @@ class BlockConsistency(Strategy):
         gt=0.0,
         description="A keypoint of a third image speaks for the match up to this distance from the place of the point "
         "there, pixels, beyond it against. Larger: fewer matches are dropped.",
-    )
-    confirm_px: float = Field(
-        0.0,
-        ge=0.0,
-        description="Where third images know the keypoints of a match, one of them must lie this near to the place "
-        "of the point there, pixels; 0 = none needs to. Smaller, but for 0: fewer matches, fewer of them wrong.",
     )
     min_probability: float = Field(
         0.0,

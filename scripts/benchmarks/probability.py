@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, evidence_of
-from aeromatch_cli.orientation.probability import WEIGHTS, MatchEvidence, columns, fitted_weights
+from aeromatch_cli.orientation.probability import columns, fitted_weights, stated
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import Workspace
@@ -50,27 +49,19 @@ Block = tuple[str, FloatArray, BoolArray]
 def block_of(args: argparse.Namespace, scene: str, flight: str, seed: int) -> Block:
     """Name, `columns` (M, F) of the matches of a block, and which of them (M,) are right."""
     name = f"{scene}:{flight}, seed {seed}"
-    folder = args.out / "runs" / f"{scene}-{flight}-{seed}"
-    path = folder / "evidence.npz"
-    if not path.is_file():
-        block = render_asked(args, scene, flight=flight, seed=seed)
+    work = args.out / "runs" / f"{scene}-{flight}-{seed}"
+    block = render_asked(args, scene, flight=flight, seed=seed)
+    if not (work / "orientation" / "adjusted.npz").is_file():
         given = ["--poses", str(block / NOISY_POSES), "--cameras", str(block / "block.json"), "--crs", "local"]
         settings = [f"extract.keypoints={args.keypoints}", f"cascade.learned.keypoints={args.keypoints}"]
-        run = whole_run(
-            "run", "auto", block / "images", folder / "work", extra=given, jobs=args.jobs, settings=settings
-        )
+        run = whole_run("run", "auto", block / "images", work, extra=given, jobs=args.jobs, settings=settings)
         if not run.answer:
             raise SystemExit(f"aeromatch run on {name} failed with exit code {run.code}:\n{run.said}")
-        evidence, right = _judged(Workspace(folder / "work"), block)
-        named = {field.name: getattr(evidence, field.name) for field in fields(evidence)}
-        np.savez(path, right=right, **named)
-    with np.load(path) as stored:
-        found = MatchEvidence(*(stored[field.name] for field in fields(MatchEvidence)))
-        return name, columns(found), stored["right"]
+    return name, *_judged(Workspace(work), block)
 
 
-def _judged(workspace: Workspace, truth_folder: Path) -> tuple[MatchEvidence, BoolArray]:
-    """Evidence of all matches of a workspace that do not contradict its adjusted block, and which are right."""
+def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolArray]:
+    """`columns` of all matches of a workspace that do not contradict its adjusted block, and which are right."""
     truth = open_truth(truth_folder)
     images = {image.image_id: image for image in read_images(workspace.images)}
     block = read_adjusted(workspace.adjusted)
@@ -84,7 +75,7 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[MatchEvidence, Bo
         if entry.verdict.state == "verified"
     ]
     recipe = BlockConsistency()
-    limits = Limits(recipe.epipolar_px, recipe.alone_px, recipe.medians, recipe.third_image_px, recipe.confirm_px)
+    limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
     parts, right = [], []
     for pair, (rows, evidence) in zip(
         pairs, evidence_of(block, cameras, keypoints.__getitem__, pairs, limits), strict=True
@@ -92,10 +83,9 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[MatchEvidence, Bo
         ends = pair.image_id0, pair.image_id1
         points = [keypoints[i][pair.indices[rows, side]] for side, i in enumerate(ends)]
         errors_px, hidden = truth.errors(images[ends[0]].name, images[ends[1]].name, *points)
-        parts.append(evidence)
+        parts.append(columns(evidence))
         right.append((np.nan_to_num(errors_px, nan=np.inf) <= CORRECT_PX) & ~hidden)
-    joined = [np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(MatchEvidence)]
-    return MatchEvidence(*joined), np.concatenate(right)
+    return np.concatenate(parts), np.concatenate(right)
 
 
 def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]:
@@ -104,11 +94,6 @@ def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]
             for scene in args.scenes:
                 yield block_of(args, scene, flight, seed)
                 print(f"{scene}:{flight}, seed {seed}", file=sys.stderr, flush=True)
-
-
-def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities by the weights that ship."""
-    return np.asarray(1.0 / (1.0 + np.exp(-values @ np.array(WEIGHTS))))
 
 
 def table_of(blocks: Sequence[Block], least: float) -> str:

@@ -1,0 +1,95 @@
+"""How probable it is that a verified match is right: what tells it, and the weights found from examples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.probability import (
+    WEIGHTS,
+    MatchEvidence,
+    columns,
+    fitted_weights,
+    off_neighbours_px,
+    probabilities,
+)
+
+# Score, error, known, confirming, off either way, angle: eleven usual matches of a pair; the first one is changed.
+USUAL = MatchEvidence(*(np.full(11, value) for value in (0.5, 0.3, 2.0, 2.0, 0.5, 0.5, 20.0)))
+
+
+def probability(**changed: float) -> float:
+    first = np.arange(11) == 0
+    values = {key: np.where(first, value, getattr(USUAL, key)) for key, value in changed.items()}
+    return float(probabilities(replace(USUAL, **values))[0])
+
+
+def test_the_usual_match_is_right() -> None:
+    assert probability() > 0.95
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"scores": 0.05},
+        {"error_px": 1.5},
+        {"confirming": 0.0},
+        {"known": 0.0, "confirming": 0.0},
+        {"off0_px": 8.0},
+        {"off1_px": 8.0},
+        {"angle_deg": 55.0},
+    ],
+)
+def test_what_speaks_against_a_match_makes_it_less_probable(changed: dict[str, float]) -> None:
+    assert probability(**changed) < probability() - 0.001
+
+
+def test_a_doubtful_match_without_support_falls_below_the_least_probability_of_auto() -> None:
+    assert probability(scores=0.05, error_px=1.0, known=0.0, confirming=0.0, off0_px=6.0, off1_px=6.0) < 0.5
+
+
+def test_distances_count_by_what_is_usual_in_the_pair() -> None:
+    rough = replace(USUAL, off0_px=np.full(11, 6.0), error_px=np.full(11, 1.0))
+    np.testing.assert_allclose(probabilities(rough), probabilities(USUAL), atol=1e-3)
+
+
+def two_views(heights_m: FloatArray) -> tuple[FloatArray, ...]:
+    """Centres 20 m apart, 100 m up, and unit rays to points of these heights on a grid."""
+    side = int(np.sqrt(len(heights_m)))
+    x, y = np.meshgrid(np.linspace(-30, 30, side), np.linspace(-30, 30, side))
+    points = np.column_stack([x.ravel(), y.ravel(), heights_m])
+    centers = np.array([-10.0, 0.0, 100.0]), np.array([10.0, 0.0, 100.0])
+    rays = [(points - center) / np.linalg.norm(points - center, axis=1, keepdims=True) for center in centers]
+    return centers[0], rays[0], centers[1], rays[1]
+
+
+def test_a_match_on_the_surface_of_its_neighbours_is_where_they_put_it() -> None:
+    rng = np.random.default_rng(0)
+    heights_m = np.zeros(144)
+    wrong = rng.choice(144, 10, replace=False)
+    heights_m[wrong] = 9.0
+    off_px = off_neighbours_px(*two_views(heights_m), heights_m, 1000.0)
+    # 9 m of 100 m at a base of 20 m: 1000 * 20 * (1 / 91 - 1 / 100) = 19.8 px in the middle of an image.
+    assert off_px[wrong].min() > 10.0
+    right = np.setdiff1d(np.arange(144), wrong)
+    np.testing.assert_allclose(off_px[right], 0.0, atol=1e-6)
+
+
+def test_too_few_matches_have_no_neighbours() -> None:
+    heights_m = np.zeros(1)
+    assert off_neighbours_px(*two_views(heights_m), heights_m, 1000.0).tolist() == [16.0]
+
+
+def test_weights_are_found_again() -> None:
+    rng = np.random.default_rng(3)
+    values = np.column_stack([np.ones(40_000), rng.normal(size=(40_000, 3))])
+    true = np.array([1.0, -0.5, 2.0, 0.0])
+    right = rng.random(40_000) < 1.0 / (1.0 + np.exp(-values @ true))
+    np.testing.assert_allclose(fitted_weights(values, right), true, atol=0.06)
+
+
+def test_there_is_a_weight_for_every_column() -> None:
+    assert columns(USUAL).shape == (11, len(WEIGHTS))
