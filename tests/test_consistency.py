@@ -106,17 +106,19 @@ def test_matches_along_the_epipolar_line_are_found_by_third_images(truth: Truth)
 
 
 def test_improbable_matches_are_dropped_where_that_is_asked(truth: Truth) -> None:
-    """Of one pair alone, keypoints along their epipolar lines, poor scores: not likely, contradicted by nothing."""
+    """Of one pair alone, keypoints along their epipolar lines, poor scores: less likely, contradicted by nothing. The
+    points of this block lie on no surface, so that neighbours speak for none of them."""
     keypoints, pairs = noisy(truth), matched(truth)
     keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices)
     scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
     changed = [replace(pairs[0], indices=wrong, scores=scores)]
     block = held_together(truth, [set(truth.block.poses)])
-    for limits, least, most in ((LIMITS, 0.0, 0.1), (replace(LIMITS, min_probability=0.95), 0.7, 1.0)):
+    for limits, least, most in ((LIMITS, 0.0, 0.1), (replace(LIMITS, min_probability=0.12), 0.7, 1.0)):
         found = contradicting(block, cameras(truth), keypoints.__getitem__, changed, limits)
         assert least <= found.masks[0][:WRONG].mean() <= most
         assert found.masks[0][WRONG:].mean() < 0.15
-    assert found.expected_right == pytest.approx(0.97, abs=0.03)
+    assert found.expected_right is not None
+    assert 0.12 < found.expected_right < 0.6
 
 
 def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:

@@ -52,7 +52,7 @@ def test_a_doubtful_match_without_support_falls_below_the_least_probability_of_a
 
 
 def test_distances_count_by_what_is_usual_in_the_pair() -> None:
-    rough = replace(USUAL, off0_px=np.full(11, 6.0), error_px=np.full(11, 1.0))
+    rough = replace(USUAL, off0_px=np.full(11, 2.0), error_px=np.full(11, 1.2))
     np.testing.assert_allclose(probabilities(rough), probabilities(USUAL), atol=1e-3)
 
 

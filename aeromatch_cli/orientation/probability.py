@@ -12,17 +12,17 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
 
-# Distances count in multiples of the pair's median, which is at least so many pixels: some images are held less exactly
-# than others, and rough ground lies off its neighbours' heights everywhere.
-_LEAST_ERROR_PX, _LEAST_OFF_PX = 0.2, 0.3
-# Beyond these, more says nothing more: medians, images, medians, degrees.
-_MOST_ERRORS, _MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 6.0, 4, 15.0, 60.0
+# Distances count in multiples of the pair's median distance from epipolar lines, which is at least so many pixels: some
+# images are held less exactly than others.
+_LEAST_UNIT_PX = 0.3
+# Beyond these, more says nothing more: units, images, units, degrees.
+_MOST_ERROR, _MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 6.0, 4, 50.0, 60.0
 # A match that has no neighbours, or lies where their heights are not seen, is as far off as this, pixels.
 _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (3.72, 2.89, 0.45, 1.41, 0.26, -1.4, -0.07, -1.22)
+WEIGHTS = (4.11, 2.51, 0.44, 1.49, 0.42, -0.93, -0.06, -1.23)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +77,8 @@ def columns(evidence: MatchEvidence) -> FloatArray:
     confirmed, angle between the rays, distance from the epipolar line, distance from the neighbours' heights."""
     if not len(evidence.scores):
         return np.zeros((0, len(WEIGHTS)))
-    off_px = np.minimum(np.maximum(evidence.off0_px, evidence.off1_px), _NOWHERE_PX)
-    error_px = evidence.error_px
-    errors = error_px / max(float(np.median(error_px)), _LEAST_ERROR_PX)
-    off = off_px / max(float(np.median(off_px)), _LEAST_OFF_PX)
+    unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
+    off = np.minimum(np.maximum(evidence.off0_px, evidence.off1_px), _NOWHERE_PX) / unit_px
     return np.column_stack(
         [
             np.ones(len(off)),
@@ -89,7 +87,7 @@ def columns(evidence: MatchEvidence) -> FloatArray:
             np.sqrt(np.minimum(evidence.confirming, _MOST_CONFIRMING)),
             (evidence.known > 0) & (evidence.confirming == 0),
             np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
-            np.minimum(errors, _MOST_ERRORS),
+            np.minimum(evidence.error_px / unit_px, _MOST_ERROR),
             np.log2(1.0 + np.minimum(off, _MOST_OFF)),
         ]
     ).astype(np.float64)
