@@ -67,7 +67,7 @@ def off_neighbours_px(
         along_m = (heights_m[near[:, 1:]] - center0_m[2]) / rays0[:, None, 2]
         ways = center0_m + rays0[:, None, :] * along_m[..., None] - center1_m
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
-        off_px = np.linalg.norm(np.cross(ways, rays1[:, None, :]), axis=2) * focal1_px
+        off_px = np.linalg.norm(ways - rays1[:, None, :], axis=2) * focal1_px
     off_px = np.where((along_m > 0.0) & np.isfinite(off_px), off_px, _NOWHERE_PX)
     return np.asarray(np.sort(off_px, axis=1)[:, SUPPORTING - 1])
 
