@@ -124,7 +124,7 @@ def test_a_large_block_starts_from_focal_lengths_of_a_rough_mapping(
 ) -> None:
     import pycolmap
 
-    monkeypatch.setattr(mapper, "_LARGE_BLOCK", 20)
+    monkeypatch.setattr(mapper, "LARGE_BLOCK", 20)
 
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()

@@ -8,7 +8,7 @@ holds the pair's geometry from all images, and a point that two images see has i
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,8 @@ _MANY = 0.3
 _MOST_ROUNDS = 10
 # Standard deviation of a keypoint, pixels: the place of a point along its ray is as uncertain as this makes it.
 _KEYPOINT_PX = 1.0
+# A keypoint of a third image confirms a match that near to the place of the point there.
+_CONFIRMING_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,76 +85,71 @@ def contradicting(
     images lie beside the place of its point there than lie on it; see also `Limits`. Groups of images that no point
     connects have a frame each, less exact than matches: pairs between them are not judged.
     """
-    view, masks, doubtful = _settled(block, cameras, keypoints_px, pairs, limits)
+    settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
     found = [
         np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
-        for pair, mask in zip(pairs, masks, strict=True)
+        for pair, mask in zip(pairs, settled.masks, strict=True)
     ]
     left: list[FloatArray] = [np.zeros(0)]
     if limits.min_probability > 0.0:
-        for mask, evidence in zip(found, _evidence(view, pairs, masks), strict=True):
+        for mask, evidence in zip(found, settled.evidence(), strict=True):
             if evidence is not None:
                 probable = probabilities(evidence)
                 mask[~mask] = probable < limits.min_probability
                 left.append(probable[probable >= limits.min_probability])
     judged = np.concatenate(left)
-    return Contradictions(found, sorted(doubtful), float(judged.mean()) if len(judged) else None)
+    return Contradictions(found, sorted(settled.doubtful), float(judged.mean()) if len(judged) else None)
 
 
-def evidence_of(
-    block: AdjustedBlock,
-    cameras: Mapping[str, Camera],
-    keypoints_px: Callable[[str], FloatArray],
-    pairs: Sequence[MatchedKeypoints],
-    limits: Limits,
-) -> list[tuple[IntArray, MatchEvidence]]:
-    """Of every pair, rows of the matches that do not contradict the block, and what tells how probable they are.
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """What contradicts the block by distances alone, once images in wrong places are left out.
 
-    Arguments as of `contradicting`; none in pairs of images that the block does not hold together.
+    view: the block's rays. masks: of every pair, which matches (M,) contradict the block, None where it is not judged.
     """
-    view, masks, _ = _settled(block, cameras, keypoints_px, pairs, limits)
-    nothing = np.zeros(0, dtype=np.int64), MatchEvidence(*[np.zeros(0)] * 7)
-    return [
-        nothing if mask is None or evidence is None else (np.flatnonzero(~mask), evidence)
-        for mask, evidence in zip(masks, _evidence(view, pairs, masks), strict=True)
-    ]
 
+    view: _Rays
+    pairs: Sequence[MatchedKeypoints]
+    masks: list[BoolArray | None]
+    doubtful: set[str]
 
-def _settled(
-    block: AdjustedBlock,
-    cameras: Mapping[str, Camera],
-    keypoints_px: Callable[[str], FloatArray],
-    pairs: Sequence[MatchedKeypoints],
-    limits: Limits,
-) -> tuple[_Rays, list[BoolArray | None], set[str]]:
-    """The block's rays, of every pair which matches contradict it, None where it is not judged, and doubtful images."""
-    group, doubtful = _groups(block), set[str]()
-    view = _Rays.of(block, cameras, keypoints_px, sorted(group.keys() & _images(pairs)))
-    for _ in range(_MOST_ROUNDS):
-        masks = _masks(view, pairs, limits, group)
-        worse = _worst_held(pairs, masks)
-        if not worse:
-            return view, masks, doubtful
-        doubtful |= worse
-        group = {image_id: number for image_id, number in group.items() if image_id not in worse}
-    # So many images in wrong places: the block itself is no judge.
-    return view, [None] * len(pairs), doubtful
+    @classmethod
+    def of(
+        cls,
+        block: AdjustedBlock,
+        cameras: Mapping[str, Camera],
+        keypoints_px: Callable[[str], FloatArray],
+        pairs: Sequence[MatchedKeypoints],
+        limits: Limits,
+    ) -> Settled:
+        """Arguments as of `contradicting`."""
+        group, doubtful = _groups(block), set[str]()
+        view = _Rays.of(block, cameras, keypoints_px, sorted(group.keys() & _images(pairs)))
+        for _ in range(_MOST_ROUNDS):
+            masks = _masks(view, pairs, limits, group)
+            worse = _worst_held(pairs, masks)
+            if not worse:
+                return cls(view, pairs, masks, doubtful)
+            doubtful |= worse
+            group = {image_id: number for image_id, number in group.items() if image_id not in worse}
+        # So many images in wrong places: the block itself is no judge.
+        return cls(view, pairs, [None] * len(pairs), doubtful)
 
-
-def _evidence(
-    view: _Rays, pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | None]
-) -> list[MatchEvidence | None]:
-    """Of the matches that do not contradict the block, by each other alone."""
-    kept = [
-        None if mask is None else replace(pair, indices=pair.indices[~mask], scores=pair.scores[~mask])
-        for pair, mask in zip(pairs, masks, strict=True)
-    ]
-    ends = [None if pair is None else view.keypoints_of(pair) for pair in kept]
-    ties = _Ties.of(len(view.rays), [both for both in ends if both is not None])
-    return [
-        None if pair is None or both is None else _of_pair(view, ties, *both, pair.scores)
-        for pair, both in zip(kept, ends, strict=True)
-    ]
+    def evidence(self) -> list[MatchEvidence | None]:
+        """Of every pair, what tells how probable the matches that do not contradict the block are, by each other alone;
+        None where there are none."""
+        kept = [
+            None
+            if mask is None or mask.all()
+            else replace(pair, indices=pair.indices[~mask], scores=pair.scores[~mask])
+            for pair, mask in zip(self.pairs, self.masks, strict=True)
+        ]
+        ends = [None if pair is None else self.view.keypoints_of(pair) for pair in kept]
+        ties = _Ties.of(len(self.view.rays), [both for both in ends if both is not None])
+        return [
+            None if pair is None or both is None else _of_pair(self.view, ties, *both, pair.scores)
+            for pair, both in zip(kept, ends, strict=True)
+        ]
 
 
 def _images(pairs: Sequence[MatchedKeypoints]) -> set[str]:
@@ -261,11 +258,10 @@ class _Ties:
 class _Meeting:
     """Where the rays of matches (M,) of one pair meet.
 
-    between_m: (3,) from centre to centre. error_px, depth_m (along rays0), angle_rad: (M,). points_m, shifted_m: (M, 3)
-    the points, and as far along rays0 as the error of a keypoint may put them.
+    error_px, depth_m (along rays0), angle_rad: (M,). points_m, shifted_m: (M, 3) the points, and as far along rays0 as
+    the error of a keypoint may put them.
     """
 
-    between_m: FloatArray
     error_px: FloatArray
     depth_m: FloatArray
     angle_rad: FloatArray
@@ -281,7 +277,7 @@ class _Meeting:
         depth_m, angle_rad = _depths(between_m, rays0, rays1)
         shift_m = depth_m * _KEYPOINT_PX / (view.focal_px[image1] * np.maximum(angle_rad, 1e-6))
         points_m = view.centers_m[image0] + rays0 * depth_m[:, None]
-        return cls(between_m, error_px, depth_m, angle_rad, points_m, points_m + rays0 * shift_m[:, None])
+        return cls(error_px, depth_m, angle_rad, points_m, points_m + rays0 * shift_m[:, None])
 
     @property
     def meet(self) -> BoolArray:
@@ -292,17 +288,20 @@ class _Meeting:
         return self.meet & (self.depth_m <= 0.0)
 
     def in_third_images(
-        self, view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray
-    ) -> Iterator[tuple[IntArray, FloatArray]]:
-        """For either end, rows of matches (T,), and how far a keypoint of a third image with which that end is matched
-        lies from the place of the point there: pixels, or shares of what the keypoints' error leaves open."""
+        self, view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, near_px: float
+    ) -> tuple[IntArray, IntArray]:
+        """(M,) with how many keypoints of third images either end is matched, and how many of these lie this near to
+        the place of the point there: pixels, or shares of what the keypoints' error leaves open."""
+        known, near = (np.zeros(len(ends0), dtype=np.int64) for _ in range(2))
         usable = self.meet & ~self.behind
         for ends, other in ((ends0, view.image[ends1[0]]), (ends1, view.image[ends0[0]])):
             rows, third = ties.of_keypoints(ends)
-            known = usable[rows] & (view.image[third] != other)
-            rows, third = rows[known], third[known]
+            judged = usable[rows] & (view.image[third] != other)
+            rows, third = rows[judged], third[judged]
             open_px = np.maximum(_apart_px(view, third, self.points_m[rows], self.shifted_m[rows]), 1.0)
-            yield rows, _away_px(view, third, self.points_m[rows]) / open_px
+            np.add.at(known, rows, 1)
+            np.add.at(near, rows, _away_px(view, third, self.points_m[rows]) / open_px <= near_px)
+        return known, near
 
 
 def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: Limits) -> BoolArray:
@@ -310,33 +309,25 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
     if not len(ends0):
         return np.zeros(0, dtype=bool)
     meeting = _Meeting.of(view, ends0, ends1)
-    asked, near = (np.zeros(len(ends0), dtype=np.int64) for _ in range(2))
-    for rows, away in meeting.in_third_images(view, ties, ends0, ends1):
-        np.add.at(asked, rows, 1)
-        np.add.at(near, rows, away <= limits.third_px)
+    known, near = meeting.in_third_images(view, ties, ends0, ends1, limits.third_px)
     most_px = max(limits.epipolar_px, limits.medians * float(np.median(meeting.error_px)))
-    return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < asked))
+    return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < known))
 
 
 def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores: FloatArray) -> MatchEvidence:
-    """Evidence of the matches (M,) of one pair."""
-    if not len(ends0):
-        return MatchEvidence(*[np.zeros(0)] * 7)
+    """Evidence of the matches (M,) of one pair, one at least."""
     meeting = _Meeting.of(view, ends0, ends1)
-    known, confirming = np.zeros(len(ends0)), np.zeros(len(ends0))
-    for rows, away in meeting.in_third_images(view, ties, ends0, ends1):
-        np.add.at(known, rows, 1)
-        np.add.at(confirming, rows, away <= 1.0)
-    sides = [(view.centers_m[view.image[ends[0]]], view.rays[ends], view.image[ends[0]]) for ends in (ends0, ends1)]
-    (center0_m, rays0, image0), (center1_m, rays1, image1) = sides
+    known, confirming = meeting.in_third_images(view, ties, ends0, ends1, _CONFIRMING_PX)
+    image0, image1 = view.image[ends0[0]], view.image[ends1[0]]
+    side0, side1 = (view.centers_m[image0], view.rays[ends0]), (view.centers_m[image1], view.rays[ends1])
     heights_m = meeting.points_m[:, 2]
     return MatchEvidence(
         scores=np.asarray(scores, dtype=np.float64),
         error_px=meeting.error_px,
         known=known,
         confirming=confirming,
-        off0_px=off_neighbours_px(center0_m, rays0, center1_m, rays1, heights_m, float(view.focal_px[image1])),
-        off1_px=off_neighbours_px(center1_m, rays1, center0_m, rays0, heights_m, float(view.focal_px[image0])),
+        off0_px=off_neighbours_px(*side0, *side1, heights_m, float(view.focal_px[image1])),
+        off1_px=off_neighbours_px(*side1, *side0, heights_m, float(view.focal_px[image0])),
         angle_deg=np.rad2deg(meeting.angle_rad),
     )
 

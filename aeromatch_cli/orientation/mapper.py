@@ -38,9 +38,11 @@ _MIN_IMAGES = 3
 # take 13 s with 100, 36 s with 300. Small blocks need them: lewis 0.5 degrees with 100, 0.1 with 300. Points after that
 # are left to the adjustment of the final matches.
 _TRACKS_PER_IMAGE, _LEAST_TRACKS, _TRACKS = 300, 100, 30_000
-# In blocks of more images than this, focal lengths are found before by a rough mapping of so few tracks per image: 8 s
-# for 300 images, where a start that has to be made again takes 30 s.
-_LARGE_BLOCK, _ROUGH_TRACKS = 100, 30
+# A block of more images than this is large: images have ties to spare, and a mapping takes long.
+LARGE_BLOCK = 100
+# There focal lengths are found before by a rough mapping of so few tracks per image: 8 s for 300 images, where a start
+# that has to be made again takes 30 s.
+_ROUGH_TRACKS = 30
 # Adjustments end when a step lowers the cost by a smaller share: exact enough for views and search.
 _COST_TOLERANCE = 1e-4
 
@@ -95,7 +97,7 @@ def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
 def _calibrate_large_block(pycolmap: ModuleType, database: Path, out: Path) -> None:
     """Write the focal lengths that a rough mapping finds, where the block is large."""
     with pycolmap.Database.open(database) as opened:
-        if opened.num_images() <= _LARGE_BLOCK:
+        if opened.num_images() <= LARGE_BLOCK:
             return
     options = _global_options(pycolmap, database, free=True)
     options.mapper.track_required_tracks_per_view = _ROUGH_TRACKS
@@ -103,15 +105,17 @@ def _calibrate_large_block(pycolmap: ModuleType, database: Path, out: Path) -> N
     options.mapper.ba_num_iterations = 1
     out.mkdir(exist_ok=True)
     models = pycolmap.global_mapping(database, out, out, options)
-    by_size = sorted(models.values(), key=lambda model: -model.num_reg_images())
-    _update_focal_lengths(pycolmap, database, by_size)
+    _update_focal_lengths(pycolmap, database, _largest_first(models))
 
 
 def _once(pycolmap: ModuleType, database: Path, out: Path, mapper: str, *, free: bool) -> list[Any]:
     """Models, the largest first. free: whether focal lengths and distortions are unknowns."""
     run = _global if mapper == "global" else _incremental
-    found = run(pycolmap, database, out, free)
-    return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    return _largest_first(run(pycolmap, database, out, free))
+
+
+def _largest_first(models: dict[int, Any]) -> list[Any]:
+    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def _far_from_priors(models: list[Any], priors: dict[str, Any]) -> bool:

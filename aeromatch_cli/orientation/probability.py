@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 
 # Distances count in multiples of the pair's median distance from epipolar lines, which is at least so many pixels: some
 # images are held less exactly than others.
@@ -27,7 +27,7 @@ WEIGHTS = (4.11, 2.51, 0.44, 1.49, 0.42, -0.93, -0.06, -1.23)
 
 @dataclass(frozen=True, eq=False)
 class MatchEvidence:
-    """What is known of the matches of a pair, (M,) each.
+    """What is known of the matches of a pair, (M,) each, one at least.
 
     scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. known, confirming: in
     how many third images their keypoints are matched, and in how many of these within a pixel of the point's place.
@@ -37,8 +37,8 @@ class MatchEvidence:
 
     scores: FloatArray
     error_px: FloatArray
-    known: FloatArray
-    confirming: FloatArray
+    known: IntArray
+    confirming: IntArray
     off0_px: FloatArray
     off1_px: FloatArray
     angle_deg: FloatArray
@@ -75,8 +75,6 @@ def off_neighbours_px(
 def columns(evidence: MatchEvidence) -> FloatArray:
     """(M, 8) what the model is linear in: one, score, not known in third images, confirmations, known and not
     confirmed, angle between the rays, distance from the epipolar line, distance from the neighbours' heights."""
-    if not len(evidence.scores):
-        return np.zeros((0, len(WEIGHTS)))
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
     off = np.minimum(np.maximum(evidence.off0_px, evidence.off1_px), _NOWHERE_PX) / unit_px
     return np.column_stack(
@@ -95,7 +93,7 @@ def columns(evidence: MatchEvidence) -> FloatArray:
 
 def stated(values: FloatArray) -> FloatArray:
     """(M,) probabilities of matches with such `columns` (M, 8)."""
-    return np.asarray(1.0 / (1.0 + np.exp(-values @ np.array(WEIGHTS))))
+    return _logistic(values @ np.array(WEIGHTS))
 
 
 def probabilities(evidence: MatchEvidence) -> FloatArray:
@@ -107,10 +105,14 @@ def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
     """Weights of `columns` (M, 8) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
-        p = 1.0 / (1.0 + np.exp(-values @ weights))
+        p = _logistic(values @ weights)
         curvature = (values.T * (p * (1.0 - p) + 1e-9)) @ values + 1e-2 * np.eye(len(weights))
         step = np.linalg.solve(curvature, values.T @ (right - p))
         weights += step
         if np.abs(step).max() < 1e-8:
             break
     return weights
+
+
+def _logistic(values: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-values)))

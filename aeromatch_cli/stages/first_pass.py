@@ -14,6 +14,7 @@ import numpy as np
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.orientation.judgement import PairPoints
+from aeromatch_cli.orientation.mapper import LARGE_BLOCK
 from aeromatch_cli.orientation.retrieval import similar_pairs
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
@@ -30,24 +31,24 @@ from aeromatch_cli.strategies.simulators.none import SourceOnly
 # no less than so many pixels), share of the keypoints, neighbours.
 _LOOK_SIZE_PX, _LOOK_SHARE, _LOOK_LEAST_PX = 1200, 0.6, 400
 _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 0.5, 8
-# In blocks of more images than this each one takes fewer neighbours, and small pictures fewer keypoints (one for so
+# In large blocks each image takes fewer neighbours, and small pictures fewer keypoints (one for so
 # many pixels): 300 images of 480 x 360 are oriented in half the time, and as exactly.
-_LARGE_BLOCK, _LARGE_BLOCK_NEIGHBOURS, _PX_PER_KEYPOINT, _LEAST_KEYPOINTS = 100, 12, 200, 500
+_LARGE_BLOCK_NEIGHBOURS, _PX_PER_KEYPOINT, _LEAST_KEYPOINTS = 12, 200, 500
 # Up to so many pairs of images without position are all compared: less than two minutes on two cores.
 _MOST_PAIRS = 12_000
 
 
 def is_large(block: Block) -> bool:
     """Whether a block has so many images that each one needs less of the first pass."""
-    return len(block.images) > _LARGE_BLOCK
+    return len(block.images) > LARGE_BLOCK
 
 
 def fitted(recipe: FirstPass, block: Block) -> FirstPass:
     """The first pass as it is made of a block: large ones have ties to spare."""
     if not is_large(block):
         return recipe
-    scales = {image: min(1.0, recipe.size_px / max(image.width_px, image.height_px)) for image in block.images}
-    most_px = max(image.width_px * image.height_px * scale**2 for image, scale in scales.items())
+    sizes_px = {(image.width_px, image.height_px) for image in block.images}
+    most_px = max(w * h * min(1.0, recipe.size_px / max(w, h)) ** 2 for w, h in sizes_px)
     return recipe.model_copy(
         update={
             "keypoints": min(recipe.keypoints, max(_LEAST_KEYPOINTS, round(most_px / _PX_PER_KEYPOINT))),

@@ -153,12 +153,11 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     if not facts["dropped_matches"] and not facts["rejected_pairs"]:
         return lines
     pairs = f", {facts['rejected_pairs']} pairs as a whole" if facts["rejected_pairs"] else ""
-    words = f"{facts['dropped_matches']} matches contradict the adjusted block{pairs}"
-    left = f"{facts['verified_matches']} verified matches are left"
-    if facts["expected_right"] is not None:
-        words = words.replace("block", "block or are not likely to be right", 1)
-        left += f", of which {100 * facts['expected_right']:.1f} % are expected to be right to 3 px"
-    return [f"          {words}; {left}", *lines]
+    expected = facts["expected_right"]
+    unlikely = "" if expected is None else " or are not likely to be right"
+    right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
+    words = f"{facts['dropped_matches']} matches contradict the adjusted block{unlikely}{pairs}"
+    return [f"          {words}; {facts['verified_matches']} verified matches are left{right}", *lines]
 
 
 def _control_words(control: Mapping[str, Any] | None) -> list[str]:

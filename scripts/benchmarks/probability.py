@@ -1,7 +1,7 @@
 """How far the probability that a match is right can be relied on, on rendered blocks, by exact truth.
 
-Every block is one `aeromatch run auto` with its noisy poses, without a least probability. Of the verified matches that
-do not contradict the adjusted block, `aeromatch_cli.orientation.probability` says how likely each is to be right:
+Every block is one `aeromatch run auto` with its noisy poses. Of the verified matches, before any is dropped, that do
+not contradict the adjusted block, `aeromatch_cli.orientation.probability` says how likely each is to be right:
 within 3 px of the exact place, which both images see. Stated: the mean of what it says; right: the share that is.
 Left: of the right ones, those that are stated to be at least as likely as asked (--least), and the share of right ones
 among all that are left.
@@ -21,14 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
-from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, evidence_of
+from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
 from aeromatch_cli.orientation.probability import columns, fitted_weights, stated
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.synthetic import PRESETS
@@ -77,11 +77,12 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
     recipe = BlockConsistency()
     limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
     parts, right = [], []
-    for pair, (rows, evidence) in zip(
-        pairs, evidence_of(block, cameras, keypoints.__getitem__, pairs, limits), strict=True
-    ):
+    settled = Settled.of(block, cameras, keypoints.__getitem__, pairs, limits)
+    for pair, mask, evidence in zip(pairs, settled.masks, settled.evidence(), strict=True):
+        if mask is None or evidence is None:
+            continue
         ends = pair.image_id0, pair.image_id1
-        points = [keypoints[i][pair.indices[rows, side]] for side, i in enumerate(ends)]
+        points = [keypoints[i][pair.indices[~mask, side]] for side, i in enumerate(ends)]
         errors_px, hidden = truth.errors(images[ends[0]].name, images[ends[1]].name, *points)
         parts.append(columns(evidence))
         right.append((np.nan_to_num(errors_px, nan=np.inf) <= CORRECT_PX) & ~hidden)
@@ -96,6 +97,16 @@ def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]
                 print(f"{scene}:{flight}, seed {seed}", file=sys.stderr, flush=True)
 
 
+def together(blocks: Sequence[Block]) -> tuple[FloatArray, BoolArray]:
+    """`columns` of all blocks, and which matches are right."""
+    return np.concatenate([values for _, values, _ in blocks]), np.concatenate([right for _, _, right in blocks])
+
+
+def _classes(p: FloatArray) -> IntArray:
+    """(M,) number of the class of each probability."""
+    return np.digitize(p, _EDGES[1:-1])
+
+
 def table_of(blocks: Sequence[Block], least: float) -> str:
     """Blocks, and classes of probability."""
     lines = []
@@ -106,11 +117,11 @@ def table_of(blocks: Sequence[Block], least: float) -> str:
             [name, number(len(right)), percent(p.mean(), 1), percent(right.mean(), 1),
              percent(right[left].sum() / right.sum(), 1), percent(right[left].mean(), 1)]
         )  # fmt: skip
-    all_p = np.concatenate([stated(values) for _, values, _ in blocks])
-    all_right = np.concatenate([right for _, _, right in blocks])
-    classes = []
-    for low, high in pairwise(_EDGES):
-        own = (all_p >= low) & (all_p < high)
+    all_values, all_right = together(blocks)
+    all_p = stated(all_values)
+    number_of, classes = _classes(all_p), []
+    for k, (low, high) in enumerate(pairwise(_EDGES)):
+        own = number_of == k
         if own.any():
             classes.append(
                 [f"{low:g} to {high:g}", number(int(own.sum())), percent(all_p[own].mean(), 1),
@@ -137,10 +148,9 @@ def draw_reliability(path: Path, blocks: Sequence[Block]) -> None:
 
     figure, axis = plt.subplots(figsize=_SIZE_IN)
     axis.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
-    together = ("all", np.concatenate([v for _, v, _ in blocks]), np.concatenate([r for _, _, r in blocks]))
-    for name, values, right in (*blocks, together):
+    for name, values, right in (*blocks, ("all", *together(blocks))):
         p = stated(values)
-        classes = np.digitize(p, _EDGES[1:-1])
+        classes = _classes(p)
         shown = [k for k in range(len(_EDGES) - 1) if (classes == k).sum() >= 30]
         means = [(p[classes == k].mean(), right[classes == k].mean()) for k in shown]
         style = {"color": "#1f6f3f", "linewidth": 2.0} if name == "all" else {"color": "#b0c8b8", "linewidth": 0.8}
@@ -168,8 +178,7 @@ def main(arguments: Sequence[str]) -> None:
     args = options.parse(parser, arguments, {"scenes": "suburb", "flights": "nadir", "size": "480x360"})
     limit_threads(2)
     if args.fit:
-        fit = list(blocks_of(args, args.fit))
-        weights = fitted_weights(np.concatenate([v for _, v, _ in fit]), np.concatenate([r for _, _, r in fit]))
+        weights = fitted_weights(*together(list(blocks_of(args, args.fit))))
         print("WEIGHTS =", tuple(round(float(weight), 2) for weight in weights))
     blocks = list(blocks_of(args, [args.seed]))
     draw_reliability(args.out / "reliability.svg", blocks)
