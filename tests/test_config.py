@@ -195,7 +195,31 @@ def test_missing_sources(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "null\n", "block:\nrun:\n", "\ufeff\n", "extract: {}\n"])
 def test_empty_files_and_sections_change_nothing(tmp_path: Path, text: str) -> None:
-    assert load(write(tmp_path, text)) == Settings()
+    """A file that names no preset stands on auto, as a command does."""
+    assert load(write(tmp_path, text)) == load("auto")
+
+
+def test_a_file_names_the_preset_that_it_changes(tmp_path: Path) -> None:
+    assert load(write(tmp_path, "preset: baseline\n")) == Settings()
+    found = load(write(tmp_path, "preset: fusion\nmatch: {guided: false}\n"))
+    assert found == load("fusion", ["match.guided=false"])
+    assert "preset 'fusoin' is none of auto, baseline" in fault(write(tmp_path, "preset: fusoin\n"))
+    assert "did you mean 'fusion'?" in fault(write(tmp_path, "preset: fusoin\n"))
+
+
+def test_the_workspaces_own_file_is_whole(tmp_path: Path) -> None:
+    """Nothing of auto is added to it."""
+    settings = load("baseline", ["extract.keypoints=77"], workspace=str(tmp_path))
+    assert load(write(tmp_path, dump(settings))) == settings
+
+
+def test_steps_of_a_cascade_are_taken_cheapest_first() -> None:
+    assert [step.name for step in load("auto", ["cascade=shadow+learned+guided"]).cascade] == [
+        "guided",
+        "learned",
+        "shadow",
+    ]
+    assert "cascade=none" in fault("oblique", "cascade=learned")
 
 
 def test_a_file_holds_only_differences(tmp_path: Path) -> None:
@@ -205,7 +229,7 @@ def test_a_file_holds_only_differences(tmp_path: Path) -> None:
     assert found.extract == Settings().extract.model_copy(update={"keypoints": 77})
     assert [one.name for one in found.filter] == ["pose", "poselib"]
     assert (found.block.ground, found.block.crs) == ("12.5", "32633")
-    assert found.pairs == Settings().pairs
+    assert found.pairs == load("auto").pairs
 
 
 def test_overrides_reach_strategies_and_chains() -> None:

@@ -7,9 +7,6 @@ from typing import Annotated
 
 import typer
 
-# The preset of a command that names none.
-AUTO = "auto"
-
 Config = Annotated[
     str | None,
     typer.Argument(
@@ -54,7 +51,7 @@ WorkspaceDir = Annotated[
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, as extract.keypoints=8000; repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, as extract.keypoints=12000; repeatable."),
 ]
 MaxSize = Annotated[
     int | None,

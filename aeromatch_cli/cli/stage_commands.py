@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from aeromatch_cli import DEFAULT_PRESET
 from aeromatch_cli.cli.options import (
-    AUTO,
     Cameras,
     Config,
     ControlFile,
@@ -46,7 +46,7 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
             "aeromatch run --images IMGS",
             "aeromatch run baseline --images IMGS --poses exif --workspace WORK",
             "aeromatch run fusion --images IMGS --poses poses.csv --crs EPSG:32633",
-            "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=8000",
+            "aeromatch run oblique --images IMGS --poses poses.csv --set extract.keypoints=12000",
         ),
     ),
     "orient": (
@@ -149,7 +149,7 @@ def _recipe(config: str | None, command: str, workspace: Path | None) -> str:
     from aeromatch_cli.config import Settings
 
     own = Path(workspace or Settings.model_fields["workspace"].default) / "config.yaml"
-    return str(own) if command not in _WHOLE and own.is_file() else AUTO
+    return str(own) if command not in _WHOLE and own.is_file() else DEFAULT_PRESET
 
 
 def _absolute(path: Path | None) -> str | None:

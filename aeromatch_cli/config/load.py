@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
+from aeromatch_cli import DEFAULT_PRESET
 from aeromatch_cli.config.faults import accidents, describe, nearest, root_faults
 from aeromatch_cli.config.merge import apply_override, merge
 from aeromatch_cli.config.paths import absolute_paths
@@ -89,8 +90,18 @@ def parse_method(text: str) -> tuple[str, list[str]]:
     return match[1], [part for part in (match[2] or "").split(",") if part]
 
 
+def _merge_preset(tree: dict[str, Any], name: Any, origin: str) -> None:
+    if name not in preset_names():
+        hint = nearest(str(name), preset_names(), otherwise="")
+        raise ConfigError(f"{origin}: preset {name!r} is none of {', '.join(preset_names())}{hint}")
+    merge(tree, differences_of_preset(name)[1])
+
+
 def _read_tree(source: str) -> tuple[dict[str, Any], str]:
-    """Defaults with the differences of a preset or file merged in, and the source in words."""
+    """Defaults with the differences of a preset or file merged in, and the source in words.
+
+    A file stands on a preset: the one that its key `preset` names, else the default preset.
+    """
     tree: dict[str, Any] = Settings().model_dump(mode="json")
     path = Path(source)
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
@@ -111,5 +122,7 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
         raise ConfigError(f"{origin} is not YAML: {error}") from None
     if not isinstance(differences, dict):
         raise ConfigError(f"{origin} must hold keys and values at the top, not a {type(differences).__name__}")
+    if folder is not None:
+        _merge_preset(tree, differences.pop("preset", DEFAULT_PRESET), origin)
     merge(tree, absolute_paths(differences, tree, folder) if folder else differences)
     return tree, origin

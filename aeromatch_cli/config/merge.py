@@ -37,7 +37,7 @@ def apply_override(tree: dict[str, Any], text: str) -> None:
     key, separator, value_text = text.partition("=")
     parts = key.strip().split(".")
     if not separator or not all(parts):
-        raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set extract.keypoints=8000")
+        raise ConfigError(f"--set {text!r}: write key.sub=value, for example --set extract.keypoints=12000")
     value = _override_value(parts, value_text)
     if value is None and not value_text.strip():
         raise ConfigError(f"--set {text!r}: the value is missing; write --set {key.strip()}=VALUE")

@@ -22,14 +22,15 @@ _HEADING = """\
 
 This page is made from the settings' own descriptions: `python -m aeromatch_cli.config.page > docs/configuration.md`.
 
-A configuration is a preset's name or a YAML file. A file holds only what differs from the defaults below;
+A configuration is a preset's name or a YAML file. A file holds only what differs from a preset: the one that its key
+`preset` names, `auto` if it names none. What neither sets has the default below;
 [configs/default.yaml](../configs/default.yaml) has all of them. Paths in a file are relative to that file.
 
-    aeromatch run fusion --images IMGS --poses poses.csv --workspace WORK --set extract.keypoints=8000
+    aeromatch run fusion --images IMGS --poses poses.csv --workspace WORK --set extract.keypoints=12000
 
 | on the command line | does |
 |---|---|
-| `--set extract.keypoints=8000` | changes one setting |
+| `--set extract.keypoints=12000` | changes one setting |
 | `--set match=lightglue` | takes another strategy, with its defaults |
 | `--set filter=poselib+graph` | takes a chain of strategies |
 | `--set filter.poselib.threshold_px=2` | changes a setting of a chain's member |

@@ -204,10 +204,22 @@ class Settings(_Section):
             raise ValueError(f"each at most once, its folder has its name: {', '.join(names)}")
         return value
 
+    @field_validator("cascade")
+    @classmethod
+    def _cheapest_first(cls, value: tuple[Strategy, ...]) -> tuple[Strategy, ...]:
+        """The table of steps is in that order."""
+        order = list(STEPS)
+        return tuple(sorted(value, key=lambda step: order.index(step.name)))  # type: ignore[attr-defined]
+
     @model_validator(mode="after")
     def _keypoints_in_cascades(self) -> Settings:
         if self.cascade and self.match.reads_pixels:
             raise ValueError(f"a cascade joins keypoints, and match {self.match.name} measures points without any")
+        if self.extract.name == "learned" and any(step.name == "learned" for step in self.cascade):
+            raise ValueError(
+                "extract=learned makes what the step learned of the cascade would make again; add "
+                "--set cascade=none, or --set extract=sift"
+            )
         return self
 
 

@@ -32,6 +32,7 @@ from aeromatch_cli.report.rows import (
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, components, summarise
+from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import fingerprint, read_json, write_text
 
@@ -109,6 +110,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         error_limits_px=ERROR_LIMITS_PX,
         pairs=_worst_pairs(pairs),
         has_steps=any(row.steps for row in pairs),
+        settled=settled_words(_facts(context, "match")) if context.settings.cascade else "",
         pair_count=len(pairs),
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),

@@ -51,7 +51,8 @@ _STAGE_ORDER = (
 class PairRow:
     """One pair of pairs.csv and what became of it. NaN where unknown.
 
-    chosen_by: the rule that proposed the pair. steps, step_reasons: of a cascade, which steps the pair took, and why.
+    chosen_by: the rule that proposed the pair. steps, step_reasons: of a cascade, which steps the pair took, and why,
+    and what it lacks in the end.
     """
 
     image_id0: str
@@ -211,7 +212,14 @@ def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:
     if not context.settings.cascade or not context.workspace.steps.is_file():
         return {}
     rows = read_csv(context.workspace.steps)
-    return {(row["image_id0"], row["image_id1"]): (row["steps"], row["reasons"]) for row in rows}
+    return {
+        (row["image_id0"], row["image_id1"]): (row["steps"], "; ".join(filter(None, (row["reasons"], _lack(row)))))
+        for row in rows
+    }
+
+
+def _lack(row: Mapping[str, str]) -> str:
+    return f"in the end: {row['lacks']}" if row["lacks"] else ""
 
 
 def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:

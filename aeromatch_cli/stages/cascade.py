@@ -9,6 +9,7 @@ have found.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -41,25 +42,38 @@ _TYING_OVERLAP = 0.4
 _RARE = 0.02
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
-# A pair with fewer verified matches is never settled, however small its overlap.
+# A pair with fewer verified matches is never settled, however small its overlap; an image with fewer keypoints shows
+# nothing (covered lens, fog, water), and no step looks for more.
 _LEAST_MATCHES = 30
+# Images with fewer keypoints promise matches in proportion.
+_ENOUGH_KEYPOINTS = 2000
+# An image that no step has tied yet may show another place. So many partners, those with most matches, tell.
+_TRIED_PARTNERS = 3
+# Largest number of descriptors of features that are slow to make, unless a step's settings say another.
+_SLOW_KEYPOINTS = 4000
 
 Key = tuple[str, str]
+
+
+def _keypoints(step: Any, settings: Settings) -> int:
+    return int(step.keypoints or min(_SLOW_KEYPOINTS, getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)))
+
+
 # What a step changes of the settings.
 _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
     GuidedSearch: lambda _, settings: {
         # The step has decided: guided search, however many matches there are.
         "match": settings.match.model_copy(update={"guided": True, "guide_below_matches": EVERY_PAIR}),
     },
-    LearnedFeatures: lambda step, _: {
+    LearnedFeatures: lambda step, settings: {
         "simulate": NeighbourViews(),
-        "extract": Learned(keypoints=step.keypoints),
+        "extract": Learned(keypoints=_keypoints(step, settings)),
         "match": Bidirectional(ratio=0.9, guided=True),
     },
-    LiftedShadows: lambda step, _: {
+    LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
-        "extract": Sift(keypoints=step.keypoints),
+        "extract": Sift(keypoints=_keypoints(step, settings)),
         "match": LightGlue(guided=True),
     },
 }
@@ -67,19 +81,33 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a step has found of a pair: verified matches, the share of the image that overlaps, and the share of the
-    overlap's cells that matches lie in. Both shares NaN where poses or ground are unknown."""
+    """What steps have found of a pair.
+
+    verified: matches. overlap: share of the image that the other one shows, of the image where it is larger. coverage:
+    share of the overlap's cells that verified matches lie in; both NaN where poses or ground are unknown. keypoints: of
+    the first step, in the image that has fewer. candidates: matches before verification.
+    """
 
     verified: int
     overlap: float
     coverage: float
+    keypoints: int
+    candidates: int = 0
+
+    @property
+    def shows_nothing(self) -> bool:
+        """Whether one of the images has next to no keypoints."""
+        return self.keypoints < _LEAST_MATCHES
 
     def falls_short_of(self, step: Step) -> str:
         """Why the pair takes the step, "" where it need not."""
-        share = self.overlap if np.isfinite(self.overlap) else 1.0
-        least = max(_LEAST_MATCHES, round(step.below_matches * share * min(1.0, share / _TYING_OVERLAP)))
+        known = bool(np.isfinite(self.overlap))
+        share = self.overlap if known else 1.0
+        promised = step.below_matches * share * min(1.0, share / _TYING_OVERLAP)
+        least = max(_LEAST_MATCHES, round(promised * min(1.0, self.keypoints / _ENOUGH_KEYPOINTS)))
         if self.verified < least:
-            return f"{self.verified} verified matches of {least} that the overlap promises"
+            by = f"that an overlap of {100 * share:.0f} % promises" if known else "that are enough, overlap unknown"
+            return f"{self.verified} verified matches of {least} {by}"
         if share >= _TYING_OVERLAP and self.coverage < step.below_coverage:
             return f"verified matches in {100 * self.coverage:.0f} % of the overlap"
         return ""
@@ -117,6 +145,8 @@ def run(context: Context) -> list[StepContext]:
         # All images in the first step: what failed there is told of those, too, that are in no pair.
         ids = match.images_of_rows(own) if step.name == FIRST else step.images
         reports = [extract.run(own, ids), match.run(own), filter.run(own)]
+        for report in reports:
+            report.part = own.part
         done.append(replace(step, reports=tuple(reports)))
     return done
 
@@ -135,15 +165,31 @@ def _steps(context: Context) -> Iterator[StepContext]:
     for recipe in settings.cascade:
         found = evidence_of(steps)
         reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
-        left = {key: reason for key, reason in reasons.items() if reason}
-        if recipe.own_features and len(left) <= _RARE * len(reasons):
-            left = _untied(left, reasons)
+        left = {key: reason for key, reason in reasons.items() if reason and not found[key].shows_nothing}
+        if recipe.own_features:
+            left = _tried(left, found)
+            if len(left) <= _RARE * len(reasons):
+                left = _untied(left, reasons)
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
             known = [key for key in reasons if key not in left and set(key) <= looked_at]
             left |= {key: reasons[key] or _BOTH_KNOWN for key in known}
         steps.append(_further_step(context, recipe, left))
         yield steps[-1]
+
+
+def _tried(left: Mapping[Key, str], found: Mapping[Key, Evidence]) -> dict[Key, str]:
+    """The pairs left without most of those of images that no step has tied to another."""
+    tied = {image_id for key, evidence in found.items() if evidence.verified for image_id in key}
+    pairs_of: dict[str, list[Key]] = {}
+    for key in left:
+        for image_id in set(key) - tied:
+            pairs_of.setdefault(image_id, []).append(key)
+    dropped: set[Key] = set()
+    for pairs in pairs_of.values():
+        best = sorted(pairs, key=lambda key: (-found[key].candidates, key))
+        dropped.update(best[_TRIED_PARTNERS:])
+    return {key: reason for key, reason in left.items() if key not in dropped}
 
 
 def _untied(left: Mapping[Key, str], reasons: Mapping[Key, str]) -> dict[Key, str]:
@@ -183,35 +229,65 @@ def evidence_of(steps: Sequence[StepContext]) -> dict[Key, Evidence]:
     """What the steps have found together of those of the pairs that the last of their steps has judged."""
     # By pair and the step that has made the features: of several steps with the same ones the last counts.
     places: dict[Key, dict[str, tuple[FloatArray, FloatArray]]] = {}
+    candidates: Counter[Key] = Counter()
     judged: set[Key] = set()
+    read_first = _keypoint_reader(steps[0])
     for step in steps:
-        workspace = step.context.workspace
-        read = cache(lambda image_id, workspace=workspace: read_keypoints(workspace.features(image_id))[0])
+        read = read_first if step is steps[0] else _keypoint_reader(step)
         judged -= step.reasons.keys()
         for pair, entry in filter.verified_pairs(step.context):
             key = pair.image_id0, pair.image_id1
             if key in step.reasons:
                 judged.add(key)
+                candidates[key] = max(candidates[key], entry.matches_in)
                 found = entry.matches.indices if entry.verdict.state == "verified" else entry.matches.indices[:0]
                 both = read(key[0])[found[:, 0]], read(key[1])[found[:, 1]]
                 places.setdefault(key, {})[step.features_of] = both
     pairs = ((pair.image_id0, pair.image_id1, pair) for pair in steps[0].context.pairs)
     return {
-        (id0, id1): _evidence(steps[0].context, pair, [*places[id0, id1].values()])
+        (id0, id1): _evidence(
+            steps[0].context,
+            pair,
+            [*places[id0, id1].values()],
+            keypoints=min(len(read_first(id0)), len(read_first(id1))),
+            candidates=candidates[id0, id1],
+        )
         for id0, id1, pair in pairs
         if (id0, id1) in judged
     }
 
 
-def _evidence(context: Context, pair: Pair, found: Sequence[tuple[FloatArray, FloatArray]]) -> Evidence:
+def _keypoint_reader(step: StepContext) -> Callable[[str], FloatArray]:
+    """Places of an image's keypoints, read once."""
+    return cache(lambda image_id: read_keypoints(step.context.workspace.features(image_id))[0])
+
+
+def _evidence(
+    context: Context, pair: Pair, found: Sequence[tuple[FloatArray, FloatArray]], *, keypoints: int, candidates: int
+) -> Evidence:
     """found: verified places of either image, by step."""
     geometry = context.geometry(pair)
     points0, points1 = (np.concatenate([one[side] for one in found]) for side in range(2))
-    shared = shared_cells(geometry)
-    if shared is None or shared.share == 0.0:
-        return Evidence(len(points0), float("nan"), float("nan"))
-    if shared.cells0.mean() >= shared.cells1.mean():
-        coverage = covered_share(shared.cells0, geometry.camera0, points0)
-    else:
-        coverage = covered_share(shared.cells1, geometry.camera1, points1)
-    return Evidence(len(points0), shared.share, coverage)
+    shared, overlap, coverage = shared_cells(geometry), float("nan"), float("nan")
+    if shared is not None and shared.share > 0.0:
+        overlap = shared.share
+        if shared.cells0.mean() >= shared.cells1.mean():
+            coverage = covered_share(shared.cells0, geometry.camera0, points0)
+        else:
+            coverage = covered_share(shared.cells1, geometry.camera1, points1)
+    return Evidence(len(points0), overlap, coverage, keypoints, candidates)
+
+
+def settled_by(context: Context, steps: Sequence[StepContext]) -> dict[Key, tuple[str, str]]:
+    """Of every pair the step after which it needed nothing more, or "", and what it lacks in the end.
+
+    A pair that took a step only because its features were there is settled by one before it.
+    """
+    found, last = evidence_of(steps), context.settings.cascade[-1]
+    answer: dict[Key, tuple[str, str]] = {}
+    for pair in context.pairs:
+        key = pair.image_id0, pair.image_id1
+        lacks = found[key].falls_short_of(last) if key in found else "not matched"
+        needed = [s.name for s in steps[1:] if s.reasons.get(key, _BOTH_KNOWN) != _BOTH_KNOWN]
+        answer[key] = ("", lacks) if lacks else (needed[-1] if needed else FIRST, "")
+    return answer

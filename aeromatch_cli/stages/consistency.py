@@ -86,7 +86,7 @@ def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> d
     ]
     return {
         "verified_matches": sum(after for _, after, verified in counts if verified),
-        "dropped_matches": sum(before - after for before, after, verified in counts if verified),
+        "dropped_matches": sum(before - after for before, after, _ in counts),
         "rejected_pairs": sum(not verified for _, _, verified in counts),
     }
 

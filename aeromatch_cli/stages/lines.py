@@ -17,7 +17,7 @@ _CHECKED = {"check points": "check points", "leave one out": "each control point
 def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
     """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
     counts = (
-        f"{stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
+        f"{stage.part + stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
         f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
     )
     if stage.stage == "filter":
@@ -36,12 +36,19 @@ def _picture_lines(stage: StageReport) -> list[str]:
     if facts.get(enhance.SKIPPED):
         words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
     if "settled_by" in facts:
-        whole = max(1, sum(facts["settled_by"].values()))
-        shares = [f"{100 * count / whole:.0f} % by {name}" for name, count in facts["settled_by"].items()]
-        words.append(f"pairs settled: {', '.join(shares)}")
+        words.append(settled_words(facts))
     if "remark" in facts:
         words.append(facts["remark"])
     return [f"          {'; '.join(words)}"] if words else []
+
+
+def settled_words(facts: Mapping[str, Any]) -> str:
+    """Which steps of a cascade have given how many pairs enough matches. facts: of the stage match."""
+    by, lacking = facts["settled_by"], facts["not_settled"]
+    whole = sum(by.values()) + lacking
+    counts = ", ".join(f"{count} by {name}" for name, count in by.items())
+    lack = f"; {lacking} with fewer matches than their overlap promises" if lacking else ""
+    return f"of {whole} pairs settled: {counts}{lack}"
 
 
 def _filter_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
@@ -152,7 +159,8 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
         lines.append(f"          {facts['remark']}")
     if not facts["dropped_matches"] and not facts["rejected_pairs"]:
         return lines
-    pairs = f", {facts['rejected_pairs']} pairs as a whole" if facts["rejected_pairs"] else ""
+    rejected = facts["rejected_pairs"]
+    pairs = f", all of {rejected} {'pair' if rejected == 1 else 'pairs'} among them" if rejected else ""
     expected = facts["expected_right"]
     unlikely = "" if expected is None else " or are not likely to be right"
     right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"

@@ -223,7 +223,7 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
     facts = {
         "workspace": str(context.workspace.root),
         "stages": {
-            r.stage: {
+            r.part + r.stage: {
                 "items": r.items,
                 "done": r.done,
                 "skipped": r.skipped,

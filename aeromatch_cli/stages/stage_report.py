@@ -31,7 +31,8 @@ ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
 class StageReport:
     """What one stage did; becomes reports/<stage>.json.
 
-    items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters.
+    items = done (made now) + skipped (up to date already) + failed; items are images, pairs or exporters. part: of a
+    step of a cascade, in words.
     """
 
     stage: str
@@ -43,6 +44,7 @@ class StageReport:
     facts: dict[str, Any] = field(default_factory=dict)
     failures: list[tuple[str, str]] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
+    part: str = ""
 
     def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
         """Close the clock, write the report and gather failures.csv from all stages.

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches
 from aeromatch_cli.formats.features import features_fingerprint, read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
     MatchEntry,
@@ -190,32 +190,30 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
     report.done = sum(len(task.pairs) for task in todo)
     report.skipped = report.items - report.done
     report.failures += _failures(steps, "match")
-    if counts:  # else those on file still hold
-        report.facts = {"matches": sum(counts), "settled_by": _settled_by(context.pairs, steps)}
+    if len(counts) < len(tasks):
+        counts = [_matches_on_file(task) for task in tasks]
+    settled = cascade.settled_by(context, steps)
+    by = Counter(name for name, _ in settled.values())
+    report.facts = {
+        "matches": sum(counts),
+        "settled_by": {step.name: by[step.name] for step in steps},
+        "not_settled": by[""],
+    }
+    _write_steps(context, steps, settled)
     report.fingerprint = fingerprint(sorted(fp for task in tasks for fp in task.pairs.values()))
-    _write_steps(context, steps)
     return report.write(context.workspace)
 
 
-def _settled_by(pairs: Sequence[Pair], steps: Sequence[StepContext]) -> dict[str, int]:
-    """How many pairs each step has settled: the last one that they took."""
-    last = Counter(_last(steps, (pair.image_id0, pair.image_id1)) for pair in pairs)
-    return {step.name: last[step.name] for step in steps}
-
-
-def _last(steps: Sequence[StepContext], key: Key) -> str:
-    return [step.name for step in steps if key in step.reasons][-1]
-
-
-def _write_steps(context: Context, steps: Sequence[StepContext]) -> None:
-    """steps.csv: which steps every pair took, and why."""
+def _write_steps(context: Context, steps: Sequence[StepContext], settled: Mapping[Key, tuple[str, str]]) -> None:
+    """steps.csv: which steps every pair took, and why, which one settled it, and what it lacks in the end."""
     lines: list[tuple[Any, ...]] = []
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         taken = [step for step in steps if key in step.reasons]
         reasons = "; ".join(f"{step.name}: {step.reasons[key]}" for step in taken if step.reasons[key])
-        lines.append((*key, "+".join(step.name for step in taken), reasons))
-    write_text(context.workspace.steps, csv_text(("image_id0", "image_id1", "steps", "reasons"), lines))
+        lines.append((*key, "+".join(step.name for step in taken), reasons, *settled[key]))
+    header = "image_id0", "image_id1", "steps", "reasons", "settled_by", "lacks"
+    write_text(context.workspace.steps, csv_text(header, lines))
 
 
 def join_row(task: RowTask) -> int:
@@ -231,6 +229,10 @@ def join_row(task: RowTask) -> int:
         entries.append(MatchEntry(image_id1, own, names, joined_matches(parts, keypoints0, keypoints1)))
     write_atomically(task.workspace.matches(task.image_id0), lambda stream: write_match_row(stream, entries))
     return sum(len(entry.matches.indices) for entry in entries)
+
+
+def _matches_on_file(task: RowTask) -> int:
+    return sum(len(entry.matches.indices) for entry in read_match_row(task.workspace.matches(task.image_id0)).values())
 
 
 def _workspaces(task: RowTask) -> set[Workspace]:

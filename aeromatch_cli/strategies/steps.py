@@ -13,8 +13,11 @@ from pydantic import Field
 
 from aeromatch_cli.strategies import Strategy
 
-_KEYPOINTS: int = Field(
-    4000, ge=1, description="Largest number of descriptors per image of this step. Larger: more time and memory."
+_KEYPOINTS: int | None = Field(
+    None,
+    ge=1,
+    description="Largest number of descriptors per image of this step; null: as many as extract.keypoints, but 4000 at "
+    "most. Larger: more matches, more time and memory.",
 )
 
 
@@ -34,7 +37,8 @@ class Step(Strategy):
         600,
         ge=1,
         description="The step is taken by pairs with fewer verified matches than this times the share of the image "
-        "that overlaps; fewer still are enough where that is less than 40 %. Larger: more pairs take it, more time.",
+        "that overlaps; fewer are enough where that is less than 40 %, and in proportion where an image has fewer "
+        "than 2000 keypoints. Larger: more pairs take it, more time.",
     )
     below_coverage: float = Field(
         0.7,
@@ -58,14 +62,14 @@ class LearnedFeatures(Step):
 
     cheap_to_match: ClassVar[bool] = True
     name: Literal["learned"] = "learned"
-    keypoints: int = _KEYPOINTS
+    keypoints: int | None = _KEYPOINTS
 
 
 class LiftedShadows(Step):
     """SIFT with shadows lifted, views from the neighbours' directions, LightGlue."""
 
     name: Literal["shadow"] = "shadow"
-    keypoints: int = _KEYPOINTS
+    keypoints: int | None = _KEYPOINTS
 
 
 STEPS: Mapping[str, type[Strategy]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}

@@ -3,9 +3,11 @@
 A preset is one `aeromatch run PRESET` with the block's noisy poses (5 % of the flying height, 3 degrees) and cameras:
 orientation, pairs, features, matches, verification and consistency. Peers get every pair of the block that overlaps by
 20 % or more, those that read poses the noisy ones. All pairs with so much overlap count, whether a preset tries them or
-not. Correct: within 3 px of the exact place. Best: the preset, or peer, with most correct matches in that line. Median
-error: of the medians of pairs. Seconds: of features, each image's once, matching and verification, on --jobs cores;
-orientation, start-up and export, which peers do without, are in the seconds of the whole command alone.
+not. As by default (8,000 and 4,000), methods with SIFT may have twice the descriptors of those with networks, which
+take longer for each; a cascade has both. Correct: within 3 px of the exact place. Best: the preset, or peer, with most
+correct matches in that line. Median error: of the medians of pairs. Seconds: of features, each image's once, matching
+and verification, on --jobs cores; orientation, start-up and export, which peers do without, are in the seconds of the
+whole command alone.
 
 Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has is
 not made again: a killed run goes on there. A preset may be PRESET[key=value,key=value].
@@ -29,7 +31,7 @@ from benchmarks import options, stamps
 from benchmarks.methods.worker import measure
 from benchmarks.pages import FOLDER
 from benchmarks.peers.base import Options
-from benchmarks.peers.table import PEERS, check_method, reads_poses, split_methods
+from benchmarks.peers.table import NEED_WEIGHTS, PEERS, check_method, reads_poses, split_methods
 from benchmarks.processes import limit_threads
 from benchmarks.quality import draw_quality
 from benchmarks.scenes import NOISY_POSES, Judged, rendered_scenes, with_noisy_poses
@@ -43,15 +45,22 @@ _STAGES = ("extract", "match", "filter")
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
+def _budget(args: argparse.Namespace, network: bool) -> int:
+    """Descriptors per image: half as many by networks, as by default."""
+    return int(args.keypoints // 2 if network else args.keypoints)
+
+
 def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
     """One row for each pair of a preset's run."""
     scene = judged.scene
     given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
     name, own_settings = parse_method(preset)
-    settings = [*own_settings, f"extract.keypoints={args.keypoints}", *args.set]
-    steps = load(name, own_settings).cascade
-    settings += [f"cascade.{step.name}.keypoints={args.keypoints}" for step in steps if step.own_features]
+    whole = load(name, own_settings)
+    most = _budget(args, network=whole.extract.name != "sift")
+    settings = [f"extract.keypoints={most}"]
+    settings += [f"cascade.{s.name}.keypoints={_budget(args, True)}" for s in whole.cascade if s.own_features]
+    settings += [*own_settings, *args.set]
     run = whole_run("run", name, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
@@ -69,7 +78,8 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
 
 def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
     """One row for each pair that a peer has answered."""
-    limits = Options(args.keypoints, "image", args.jobs, args.seed, args.reference_weights)
+    most = _budget(args, network=peer in NEED_WEIGHTS)
+    limits = Options(most, "image", args.jobs, args.seed, args.reference_weights)
     noisy = with_noisy_poses(judged) if reads_poses(peer) else None
     rows: list[Row] = []
     known: set[str] = set()
@@ -178,7 +188,12 @@ def main(arguments: Sequence[str]) -> None:
     add("--peers", type=options.names, default="pycolmap-guided", help=f"comma-separated of {', '.join(PEERS)}")
     options.add_rendered(parser, scenes=",".join(PRESETS), size="800x600", images=12, flights="nadir,mixed,oblique")
     add("--seeds", type=options.positive, default=1, help="so many, from --seed on")
-    add("--keypoints", type=options.positive, default=2048, help="descriptors per image, of every step of a cascade")
+    add(
+        "--keypoints",
+        type=options.positive,
+        default=4096,
+        help="SIFT descriptors per image; networks have half as many",
+    )
     add("--set", type=options.names, default="", metavar="KEY=VALUE", help="settings of every preset, comma-separated")
     add("--jobs", type=options.positive, default=2)
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks")

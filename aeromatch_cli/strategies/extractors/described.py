@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,17 @@ from aeromatch_cli.strategies.extractors.selection import distinct, even_selecti
 _SAME_BLOB_PX = 2.0
 
 
+def keypoints_field(default: int) -> Any:
+    """The setting `keypoints` of one strategy: those that are fast to make have more."""
+    return Field(
+        default,
+        ge=1,
+        description="Number of descriptors per image over all its views; fewer only where the image has fewer. A "
+        "keypoint with two orientations counts twice, as in OpenCV and COLMAP. With enhance.keep_source "
+        "the source image and the enhanced one have this number each. Larger: more matches, more time.",
+    )
+
+
 class Described(Strategy):
     """Keypoints and descriptors of all views of one image: detect, select, describe.
 
@@ -29,13 +40,7 @@ class Described(Strategy):
     needs: ClassVar[frozenset[str]] = frozenset({"camera"})
     descriptor_length: ClassVar[int] = 128
     name: str  # a strategy's own, first in every listing
-    keypoints: int = Field(
-        4000,
-        ge=1,
-        description="Number of descriptors per image over all its views; fewer only where the image has fewer. A "
-        "keypoint with two orientations counts twice, as in OpenCV and COLMAP. With enhance.keep_source "
-        "the source image and the enhanced one have this number each. Larger: more matches, more time.",
-    )
+    keypoints: int = keypoints_field(4000)
     budget: Literal["image", "view"] = Field(
         "image", description="Whether keypoints is the number per image, over all its views, or per view."
     )

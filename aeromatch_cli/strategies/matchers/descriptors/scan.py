@@ -8,6 +8,7 @@ Source: Lowe, IJCV 2004, section 7.1 (ratio); Arandjelovic and Zisserman, CVPR 2
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -155,7 +156,8 @@ def _runs(keypoint_idx: IntArray) -> tuple[IntArray, IntArray]:
 def _product(queries: NDArray[Any], targets: NDArray[Any]) -> tuple[Multiply, NDArray[Any], NDArray[Any], type]:
     """How to compute 2 q.t - |t|^2 for a block of queries, with the squared norms and the type of the result."""
     are_bytes = queries.dtype == np.uint8 and targets.dtype == np.uint8 and queries.shape[1] <= _COMPONENTS_EXACT
-    if are_bytes and _has_integer_product():
+    # Where torch is not loaded, loading it takes longer than floating-point products, which are as exact.
+    if are_bytes and "torch" in sys.modules and _has_integer_product():
         return _integer_product(queries, targets)
     q, t = queries.astype(np.float32), targets.astype(np.float32)
     transposed = t.T
