@@ -208,7 +208,7 @@ def test_page_shows_headline_tables_and_reasons(full):
     assert ac[5:7] == ["12", "0"]
     assert ac[9:12] == ["rejected", "", "8 inliers of 12 matches"]
     assert row_with(page, "image-table", "sub/d.png")[1:] == [
-        *("full", "", "", "100", "2", "0", "0", "0", "", ""),
+        *("full", "", "", "100", "2", "0", "0", "0", "", "", ""),
         "weakly tied.",
     ]
     assert row_with(page, "stage-table", "extract")[3:7] == ["5", "4", "0", "1"]
@@ -293,6 +293,7 @@ def test_page_without_poses_features_or_verified_pairs(tmp_path):
         "1",
         "0",
         "0",
+        "",
         "",
         "",
         "",

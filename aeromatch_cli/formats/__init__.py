@@ -158,8 +158,8 @@ that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each key
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones), `settled_by` (the step after which it needed nothing more, empty where it lacks matches in the end),
-`lacks` (what it lacks in the end). Features, matches and verdicts of a step lie in its folder, laid out like this workspace; those of
-the workspace itself join them. `guided` has no features: it uses those of the first step.
+`lacks` (what it lacks in the end). Features, matches and verdicts of a step lie in its folder, laid out like this
+workspace; those of the workspace itself join them. `guided` has no features: it uses those of the first step.
 
 ### matches/<id0>.npz
 
@@ -198,9 +198,10 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`,
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
   `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `ties` (image_id ->
-  ninths of the image that hold a point of the adjusted block, and its points that three or more images see).
-- `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer matches than
-  their overlap promises). Of extract with a cascade: `images_by_step`.
+  ninths of the image that hold a point of the adjusted block, ninths that hold none though other images show them, and
+  its points that three or more images see).
+- `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
+  matches than their overlap promises). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).
 - `facts` of export: exporter -> files and counts.

@@ -69,3 +69,11 @@ def covered_share(shared: BoolArray, camera: Camera, points_px: FloatArray) -> f
     cells = cells_of(camera, points_px)
     held[cells[:, 0], cells[:, 1]] = True
     return float((held & shared).sum() / shared.sum())
+
+
+def shown_ninths(seen: BoolArray) -> BoolArray:
+    """The ninths (3, 3) of an image of which half the cells (CELLS, CELLS) and more are seen."""
+    ninth = np.arange(CELLS) * 3 // CELLS
+    parts = (ninth[:, None] == np.arange(3)).astype(np.float64)
+    counts = np.outer(parts.sum(axis=0), parts.sum(axis=0))
+    return np.asarray(parts.T @ seen @ parts >= 0.5 * counts)

@@ -84,7 +84,8 @@ class ImageRow:
     pose: "full", "position" or "none". coverage: share of the image's cells that hold a verified match. views: virtual
     views that its features come from, None where none are on file. shadow: share of the picture that the enhancement
     treated as shadow, None where it looks for none. ninths: how many of the image (3 x 3) hold a point of the adjusted
-    block, points_of_three: its points that three or more images see; None where it is not adjusted.
+    block, empty_ninths: how many hold none though other images show them, points_of_three: its points that three and
+    more images see; None where it is not adjusted.
     """
 
     image_id: str
@@ -99,6 +100,7 @@ class ImageRow:
     views: int | None = None
     shadow: float | None = None
     ninths: int | None = None
+    empty_ninths: int | None = None
     points_of_three: int | None = None
 
 
@@ -200,11 +202,14 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
                 coverage=coverage.share(image.image_id),
                 views=_fact(context.workspace.views(image.image_id), "views", len),
                 shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
-                ninths=ties.get(image.image_id, (None, None))[0],
-                points_of_three=ties.get(image.image_id, (None, None))[1],
+                **dict(zip(_TIES, ties.get(image.image_id, ()), strict=False)),
             )
         )
     return pairs, images
+
+
+# The columns of the report of consistency.
+_TIES = "ninths", "empty_ninths", "points_of_three"
 
 
 def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, Pair, Verdict
+from aeromatch_cli.data import AdjustedBlock, BoolArray, Pair, Verdict
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
+from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
@@ -25,7 +26,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
 
-VERSION = 3
+VERSION = 4
 
 
 def run(context: Context) -> StageReport:
@@ -92,8 +93,10 @@ def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> d
 
 
 def _ties(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
-    """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, and its points that three or
-    more images see: a block adjustment wants both."""
+    """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, ninths without any though
+    another image of its pairs shows them, and its points that three or more images see: a block adjustment wants points
+    everywhere, and in many images."""
+    shown = _shown_ninths(context)
     seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
     for track in adjusted.tracks.values():
         seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
@@ -102,9 +105,22 @@ def _ties(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
         image = context.image_by_id[image_id]
         places = read_keypoints(context.workspace.features(image_id))[0][track[:, 0]]
         cells = np.clip(np.floor((places + 0.5) * 3.0 / (image.width_px, image.height_px)), 0, 2).astype(int)
-        ninths = len(np.unique(cells[:, 0] + 3 * cells[:, 1]))
-        found[image_id] = [ninths, int((seen[track[:, 1]] > 2).sum())]
+        held = np.zeros((3, 3), dtype=bool)
+        held[cells[:, 1], cells[:, 0]] = True
+        empty = shown[image_id] & ~held
+        found[image_id] = [int(held.sum()), int(empty.sum()), int((seen[track[:, 1]] > 2).sum())]
     return found
+
+
+def _shown_ninths(context: Context) -> dict[str, BoolArray]:
+    """image_id -> the ninths (3, 3) that the other images of its pairs show, by poses and ground."""
+    cells = {image.image_id: np.zeros((CELLS, CELLS), dtype=bool) for image in context.block.images}
+    for pair in context.pairs:
+        shared = shared_cells(context.geometry(pair))
+        if shared is not None:
+            cells[pair.image_id0] |= shared.cells0
+            cells[pair.image_id1] |= shared.cells1
+    return {image_id: shown_ninths(seen) for image_id, seen in cells.items()}
 
 
 def final_pairs(context: Context) -> Judged:

@@ -149,11 +149,12 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     doubtful = _listed([names[i] for i in facts["doubtful"]])
     lines = [f"          too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
     if facts["ties"]:
-        whole = sum(ninths == 9 for ninths, _ in facts["ties"].values())
-        many = sorted(points for _, points in facts["ties"].values())[len(facts["ties"]) // 2]
+        ties = facts["ties"].values()
+        held, empty = (sum(row[place] for row in ties) for place in range(2))
+        many = sorted(row[2] for row in ties)[len(ties) // 2]
         lines.append(
-            f"          points in all nine ninths of {whole} of {len(facts['ties'])} images; {many} points per image "
-            "are seen by three or more (median)"
+            f"          points in {held} ninths of the images (3 x 3 each), none in {empty} that other images show; "
+            f"{many} points per image are seen by three or more (median)"
         )
     if "remark" in facts:
         lines.append(f"          {facts['remark']}")
