@@ -173,9 +173,9 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert facts["verified_matches"] == before - facts["dropped_matches"]
     assert stages["export"]["facts"]["colmap"]["verified_matches"] == facts["verified_matches"]
     assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
-    ties = facts["ties"].values()
-    assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, _, points in ties)
-    assert all(ninths + empty <= 9 for ninths, empty, _ in ties)
+    spread = facts["spread"].values()
+    assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, _, points in spread)
+    assert all(ninths + empty <= 9 for ninths, empty, _ in spread)
     assert f"{facts['verified_matches']:,}" in (done_site.work / "report" / "index.html").read_text()
     refused = done_site("run", "--set", "consistency.epipolar_px=0.3", "--set", "consistency.min_matches=100000")
     facts = refused.facts["stages"]["consistency"]["facts"]

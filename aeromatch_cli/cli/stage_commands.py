@@ -127,15 +127,18 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.config import load
             from aeromatch_cli.stages.run import execute
 
+            recipe, say = _recipe(config, name, workspace), said(quiet)
+            if config is None and recipe == DEFAULT_PRESET:
+                say(f"preset           {recipe}, no other is named")
             settings = load(
-                _recipe(config, name, workspace),
+                recipe,
                 set_ or (),
                 as_texts(block),
                 run=as_texts(run),
                 workspace=_absolute(workspace),
             )
             shown = progress_shown(quiet)
-            return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=said(quiet))
+            return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)
 

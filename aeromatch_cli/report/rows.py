@@ -184,7 +184,7 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
         taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
         pairs[place] = replace(row, steps=taken, step_reasons=reasons)
     report = context.workspace.stage_report("consistency")
-    ties = read_json(report)["facts"].get("ties", {}) if report.is_file() else {}
+    spread = read_json(report)["facts"].get("spread", {}) if report.is_file() else {}
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     images = []
     for image in context.block.images:
@@ -202,14 +202,14 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
                 coverage=coverage.share(image.image_id),
                 views=_fact(context.workspace.views(image.image_id), "views", len),
                 shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
-                **dict(zip(_TIES, ties.get(image.image_id, ()), strict=False)),
+                **dict(zip(_SPREAD, spread.get(image.image_id, ()), strict=False)),
             )
         )
     return pairs, images
 
 
 # The columns of the report of consistency.
-_TIES = "ninths", "empty_ninths", "points_of_three"
+_SPREAD = "ninths", "empty_ninths", "points_of_three"
 
 
 def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:

@@ -220,7 +220,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
         settings=settings,
         workspace=context.workspace.step(name, features_of),
         chosen=frozenset(reasons),
-        part=f"{name}: ",
+        part=f"step {name}: ",
     )
     return StepContext(name, features_of, own, reasons)
 

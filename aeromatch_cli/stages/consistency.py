@@ -26,7 +26,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
 
-VERSION = 4
+VERSION = 3
 
 
 def run(context: Context) -> StageReport:
@@ -39,7 +39,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None or not isinstance(recipe, BlockConsistency):
-        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "ties": {}}
+        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}
         if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
             report.facts["remark"] = f"not done: match {context.settings.match.name} measures points without keypoints"
         with translated_os_errors(path):
@@ -71,7 +71,7 @@ def run(context: Context) -> StageReport:
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, "ties": _ties(context, adjusted)}
+    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, "spread": _spread(context, adjusted)}
     report.facts = {**_facts(context, entries), **known}
     report.done = report.items
     return report.write(context.workspace)
@@ -92,7 +92,7 @@ def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> d
     }
 
 
-def _ties(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
+def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
     """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, ninths without any though
     another image of its pairs shows them, and its points that three or more images see: a block adjustment wants points
     everywhere, and in many images."""

@@ -148,10 +148,10 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     facts = stage.facts
     doubtful = _listed([names[i] for i in facts["doubtful"]])
     lines = [f"          too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
-    if facts["ties"]:
-        ties = facts["ties"].values()
-        held, empty = (sum(row[place] for row in ties) for place in range(2))
-        many = sorted(row[2] for row in ties)[len(ties) // 2]
+    if facts.get("spread"):
+        spread = facts["spread"].values()
+        held, empty = (sum(row[place] for row in spread) for place in range(2))
+        many = sorted(row[2] for row in spread)[len(spread) // 2]
         lines.append(
             f"          points in {held} ninths of the images (3 x 3 each), none in {empty} that other images show; "
             f"{many} points per image are seen by three or more (median)"
