@@ -197,9 +197,9 @@ are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
 - `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`,
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
-  `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread` (image_id ->
-  ninths of the image that hold a point of the adjusted block, ninths that hold none though other images show them, and
-  its points that three or more images see).
+  `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
+  (image_id -> ninths of the image that hold a point of the adjusted block, ninths that hold none though other images
+  show them, and its points that three or more images see).
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
   matches than their overlap promises). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),

@@ -1,7 +1,7 @@
 """What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
 
 Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
-`summary` and `warnings` of pairs, those of orient and adjust (page.py), `ties` and `doubtful` of consistency.
+`summary` and `warnings` of pairs, those of orient and adjust (page.py), `spread` and `doubtful` of consistency.
 """
 
 from __future__ import annotations
