@@ -13,6 +13,7 @@ from aeromatch_cli.blocks.crs import (
     WorldFrame,
     choose_crs,
     convergence_deg,
+    geographic_from_grid,
     grid_from_geographic,
     rounded_origin_m,
 )
@@ -34,6 +35,7 @@ class Observation:
     """Where and how one image was taken, as stated. Units and kinds as in `poses.PoseRow`; a height may be NaN.
 
     forward: for yaw, pitch, roll: True where the optical axis is body x (gimbal), False where it is down (nadir).
+    true_north: as in `poses.PoseRow`.
     """
 
     position: tuple[float, float, float]
@@ -43,20 +45,23 @@ class Observation:
     forward: bool
     sigma_position_m: float | None = None
     sigma_angle_deg: float | None = None
+    true_north: bool = False
 
 
 def observation_of_row(row: PoseRow, angles: AngleConvention) -> Observation | None:
-    """What a line of a pose list states; None without position. "auto" means gimbal here."""
+    """What a line of a pose list states; None without position. "auto" means what the format says, else gimbal."""
     if row.position is None:
         return None
+    stated = row.forward if row.forward is not None else True
     return Observation(
         position=row.position,
         position_kind=row.position_kind,
         attitude=row.attitude,
         attitude_kind=row.attitude_kind,
-        forward=angles != "nadir",
+        forward=stated if angles == "auto" else angles != "nadir",
         sigma_position_m=row.sigma_position_m,
         sigma_angle_deg=row.sigma_angle_deg,
+        true_north=row.true_north,
     )
 
 
@@ -123,7 +128,7 @@ def oriented(
         else choose_crs(crs, stated_crs, latitudes.tolist(), longitudes.tolist())
     )
     grid = {name: np.array(o.position) for name, o in observations.items() if o.position_kind == "grid"}
-    turns = dict.fromkeys(grid, 0.0)
+    turns = _grid_turns(code, observations, grid)
     outside: list[str] = []
     if geographic:
         xy_m = grid_from_geographic(code, latitudes, longitudes)
@@ -159,6 +164,17 @@ def oriented(
     return Located(frame, poses, angles, faults, level, level_m)
 
 
+def _grid_turns(code: str, observations: Mapping[str, Observation], grid: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Meridian convergence, degrees, of grid positions whose angles count from true north; 0 of the others."""
+    turns = dict.fromkeys(grid, 0.0)
+    names = [name for name in grid if observations[name].true_north and np.isfinite(grid[name][:2]).all()]
+    if code != LOCAL and names:
+        places = geographic_from_grid(code, np.array([grid[name][:2] for name in names]))
+        found = convergence_deg(code, places[:, 0], places[:, 1])
+        turns |= {name: float(turn) for name, turn in zip(names, found, strict=True) if np.isfinite(turn)}
+    return turns
+
+
 def _with_heights(grid: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], float, list[str]]:
     """Centres that all have a height, the one that was put in, and for which images: flights are about level."""
     level = [name for name, center_m in grid.items() if np.isnan(center_m[2])]
@@ -189,4 +205,5 @@ def _angles(observation: Observation, convergence_deg: float) -> Angles | None:
     """convergence_deg: 0 where the position was given in the grid."""
     if observation.attitude is None or observation.attitude_kind == "none":
         return None
-    return Angles(observation.attitude_kind, observation.attitude, observation.forward, convergence_deg)
+    facts = observation.attitude_kind, observation.attitude, observation.forward
+    return Angles(*facts, convergence_deg, observation.true_north)

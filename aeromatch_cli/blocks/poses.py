@@ -25,10 +25,11 @@ import difflib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
+from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 
 PositionKind = Literal["grid", "geographic"]
@@ -44,7 +45,7 @@ _SIGMAS = ("sigma_position_m", "sigma_angle_deg")
 _AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 _KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", *_SIGMAS, *_AXIS_SIGMAS)
 _ALIASES = {
-    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name"), "image"),
+    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
     **dict.fromkeys(("sde", "std_e", "sigma_x"), "sigma_x_m"),
@@ -74,7 +75,10 @@ class PoseRow:
     image: as written, with forward slashes. line: 1-based, for messages. position: x, y, z in metres or lat, lon in
     degrees and alt in metres, as `position_kind` says, with a height of NaN where the line gives none; None where it
     gives no horizontal position. attitude: three angles in degrees or a quaternion (w, x, y, z), as `attitude_kind`
-    says; None with "none". camera: "" where not given.
+    says; None with "none". camera: "" where not given. forward: of yaw, pitch, roll, whether the optical axis is body x
+    (gimbal) or down (nadir) at zero angles; None where the format leaves it open. true_north: angles and quaternions of
+    grid positions count from true north instead of grid north; those of latitudes and longitudes, too. numbered: the
+    image is named by its running number alone.
     """
 
     image: str
@@ -86,15 +90,23 @@ class PoseRow:
     camera: str = ""
     sigma_position_m: float | None = None
     sigma_angle_deg: float | None = None
+    forward: bool | None = None
+    true_north: bool = False
+    numbered: bool = False
 
 
 @dataclass(frozen=True)
 class PoseList:
-    """A pose list as read. warnings: columns that were ignored and lines without usable coordinates."""
+    """A pose list as read. warnings: columns that were ignored and lines without usable coordinates. format: what it
+    was recognised as, in words. crs: of grid positions, where the file states it. cameras: by the names that rows have.
+    """
 
     rows: tuple[PoseRow, ...]
     position_kind: PositionKind
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    format: str = "list with named columns"
+    crs: str | None = None
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
+from aeromatch_cli.blocks import pose_files
 from aeromatch_cli.blocks.agreement import agreed
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
 from aeromatch_cli.blocks.cameras import (
@@ -25,6 +26,7 @@ from aeromatch_cli.blocks.cameras import (
 )
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Located,
@@ -34,7 +36,7 @@ from aeromatch_cli.blocks.observations import (
     observation_of_row,
     oriented,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, read_poses
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.scan import ScanFailure, image_ids
 from aeromatch_cli.data import Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
@@ -60,6 +62,7 @@ class BlockInputs:
     the ground as the input states it, or None; ground_hint_source: where it came from, in words, "" for None;
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
     deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
+    recognised: what the pose file was read as, and how many images it has, "" without one.
     """
 
     images: tuple[Image, ...]
@@ -75,6 +78,7 @@ class BlockInputs:
     likely_focals: Mapping[str, float]
     warnings: tuple[str, ...]
     failures: tuple[ReadFailure, ...]
+    recognised: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +97,18 @@ class GivenLists:
     camera_file: CameraFile | None
 
 
-def read_lists(poses: str | None, cameras: str = EXIF, angles: AngleConvention = "auto") -> GivenLists:
+def read_lists(
+    poses: str | None, cameras: str = EXIF, angles: AngleConvention = "auto", pose_format: str = pose_files.AUTO
+) -> GivenLists:
     """Read the pose list and the camera file. To be called first: they are quick, and a mistake in them should not
     cost a walk over 10,000 files.
 
     poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder".
-    Raises ConfigError for a bad argument, pose list or camera file.
+    pose_format: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera file.
     """
     if angles not in get_args(AngleConvention):
         raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
-    pose_list = read_poses(Path(poses)) if poses and poses != EXIF else None
+    pose_list = pose_files.read_pose_file(Path(poses), pose_format) if poses and poses != EXIF else None
     camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
     return GivenLists(poses or "", cameras, angles, pose_list, camera_file)
 
@@ -132,7 +138,7 @@ def block_inputs(
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
     rows: dict[str, PoseRow] = {}
     if lists.pose_list is not None:
-        rows, remarks = _matched(lists.pose_list, list(headers), f"pose list {lists.poses}")
+        rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}")
         warnings += [*lists.pose_list.warnings, *remarks]
     assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
     warnings += assignment.warnings
@@ -146,11 +152,10 @@ def block_inputs(
     camera_file = lists.camera_file
     likely_focals, remarks = contradicting_exif(assignment, facts) if camera_file is not None else ({}, [])
     warnings += remarks
-    observations, remarks = _agreeing(lists, observations, facts, crs)
+    stated_crs = _stated_crs(lists, crs)
+    observations, remarks = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
     warnings += remarks
-    located = oriented(
-        observations, crs, camera_file.crs if camera_file else None, known_frame, sigma_position_m, sigma_angle_deg
-    )
+    located = oriented(observations, crs, stated_crs, known_frame, sigma_position_m, sigma_angle_deg)
     frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
@@ -172,7 +177,14 @@ def block_inputs(
         likely_focals=likely_focals,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
+        recognised=_recognised(lists, rows, headers),
     )
+
+
+def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object]) -> str:
+    if lists.pose_list is None:
+        return ""
+    return f"{lists.pose_list.format}: {len(rows)} of {len(headers)} images"
 
 
 def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: Mapping[str, str]) -> tuple[Image, ...]:
@@ -212,6 +224,9 @@ def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: 
     if lists.camera_file is not None:
         sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
         return cameras_from_file(lists.camera_file.cameras, sizes_px, columns)
+    stated = lists.pose_list.cameras if lists.pose_list is not None and lists.cameras == EXIF else {}
+    if stated:
+        return _cameras_of_poses(stated, facts, columns)
     groups = dict(columns)
     if lists.cameras == FOLDER:
         groups = {name: columns.get(name) or str(PurePosixPath(name).parent) for name in facts}
@@ -219,54 +234,20 @@ def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: 
     return cameras_from_exif(facts, groups)
 
 
-def _matched(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
-    """Image name -> its line, and remarks on lines without image and images without line.
-
-    An exact relative path comes first; then, only where exactly one image fits, the same path in another case, the
-    bare file name, and the name without suffix (Metashape's labels).
-    """
-    by_key: dict[str, list[str]] = defaultdict(list)
-    for name in names:
-        path = PurePosixPath(name)
-        for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
-            by_key[key].append(name)
-    exact = set(names)
-    rows: dict[str, PoseRow] = {row.image: row for row in pose_list.rows if row.image in exact}
-    absent: list[str] = []
-    ambiguous: list[str] = []
-    for row in pose_list.rows:
-        if row.image in exact:
-            continue
-        found = by_key.get(row.image.lower(), [])
-        if len(found) > 1:
-            ambiguous.append(row.image)
-        elif not found:
-            absent.append(row.image)
-        elif found[0] in rows:
-            raise ConfigError(
-                f"{source}, line {row.line}, column image: {row.image!r} and {rows[found[0]].image!r} (line "
-                f"{rows[found[0]].line}) both mean the image {found[0]}: keep one of the two lines"
-            )
-        else:
-            rows[found[0]] = row
-    if names and not rows:
-        raise ConfigError(
-            f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
-            f"folder holds {names[0]}; write paths relative to the images folder"
-        )
-    remarks = []
-    if absent:
-        what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
-        remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
-    if ambiguous:
-        remarks.append(
-            f"{source} gives {len(ambiguous)} names that several images have ({listed(ambiguous)}): their lines are "
-            "not used; write the path relative to the images folder"
-        )
-    unnamed = [name for name in names if name not in rows]
-    if unnamed:
-        remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
-    return rows, remarks
+def _cameras_of_poses(
+    stated: Mapping[str, Camera], facts: Mapping[str, ExifFacts], columns: Mapping[str, str]
+) -> CameraAssignment:
+    """Cameras of the pose file for the images that it gives one that fits, those of EXIF for the others."""
+    named = {name: (facts[name].width_px, facts[name].height_px) for name in facts if columns.get(name)}
+    found = cameras_from_file(stated, named, columns)
+    others = cameras_from_exif({name: fact for name, fact in facts.items() if name not in found.camera_ids}, {})
+    return CameraAssignment(
+        {**others.cameras, **found.cameras},
+        {**others.camera_ids, **found.camera_ids},
+        others.reasons,
+        (f"cameras of the pose file are used for {len(found.camera_ids)} of {len(facts)} images", *others.warnings),
+        {**others.focal_sigmas, **found.focal_sigmas},
+    )
 
 
 def _observations(
@@ -302,8 +283,22 @@ def _agreeing(
     """Those of a pose list, put right by the GPS of the images, and remarks."""
     if lists.pose_list is None:
         return observations, []
-    stated = lists.camera_file.crs if lists.camera_file is not None and crs == AUTO else None
-    return agreed(observations, facts, stated or crs, f"pose list {lists.poses}")
+    return agreed(observations, facts, crs, f"pose list {lists.poses}")
+
+
+def _stated_crs(lists: GivenLists, crs: str) -> str | None:
+    """What the pose file, else the camera file, says of the coordinates. Raises ConfigError where the user says other.
+
+    crs: what the user gave.
+    """
+    stated = lists.pose_list.crs if lists.pose_list is not None else None
+    if stated is None:
+        return lists.camera_file.crs if lists.camera_file is not None else None
+    if crs.strip().lower() not in ("", AUTO) and checked_crs(crs) != checked_crs(stated):
+        raise ConfigError(
+            f"{lists.poses} says that its coordinates are {stated[:60]}, --crs says {crs}: leave out --crs"
+        )
+    return stated
 
 
 def _angles_alone(lists: GivenLists, facts: Mapping[str, ExifFacts], known: Mapping[str, Angles]) -> dict[str, Angles]:

@@ -19,7 +19,15 @@ Images = Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Fo
 Poses = Annotated[
     str | None,
     typer.Option(
-        "--poses", metavar="FILE|exif|none", help="Pose list (CSV, TXT), or GPS and XMP angles (default exif)."
+        "--poses", metavar="FILE|exif|none", help="Pose file of any program, or GPS and XMP angles (default exif)."
+    ),
+]
+PoseFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--pose-format",
+        metavar="NAME",
+        help="Format of the pose file (default auto: by its content); see docs/input.md.",
     ),
 ]
 Cameras = Annotated[

@@ -24,6 +24,7 @@ from aeromatch_cli.cli.options import (
     Masks,
     MaxSize,
     Overwrite,
+    PoseFormat,
     Poses,
     Quiet,
     Set,
@@ -102,6 +103,7 @@ def stage_command(name: str) -> Callable[..., None]:
         config: Config = None,
         images: Images = None,
         poses: Poses = None,
+        pose_format: PoseFormat = None,
         cameras: Cameras = None,
         crs: Crs = None,
         ground: Ground = None,
@@ -120,7 +122,7 @@ def stage_command(name: str) -> Callable[..., None]:
         quiet: Quiet = False,
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
-        block |= {"masks": masks, "gcp": gcp, "max_size_px": max_size}
+        block |= {"pose_format": pose_format, "masks": masks, "gcp": gcp, "max_size_px": max_size}
         run = {"jobs": jobs, "executor": executor, "keep_images": keep_images or None}
 
         def call() -> Result:

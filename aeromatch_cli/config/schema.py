@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
+from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.consistencies import CONSISTENCIES
 from aeromatch_cli.strategies.enhancers import ENHANCERS
@@ -52,7 +53,13 @@ class BlockSettings(_Section):
     """What was flown: images, poses, cameras, ground."""
 
     images: str = Field("", description="Folder of images, searched recursively.")
-    poses: str = Field("exif", description="Pose list (CSV or TXT), `exif` for GPS and XMP angles, or `none`.")
+    poses: str = Field(
+        "exif", description="Pose file of any format in `pose_format`, `exif` for GPS and XMP angles, or `none`."
+    )
+    pose_format: Literal["auto", *POSE_FORMATS] = Field(  # type: ignore[valid-type]
+        "auto",
+        description="Format of the pose file; auto: by its content. Needed where that leaves open what angles are.",
+    )
     cameras: str = Field(
         "exif",
         description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, focal length and size); or "

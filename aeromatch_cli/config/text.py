@@ -71,7 +71,7 @@ def _settings_lines(settings: BaseModel) -> Iterator[str]:
     for key, field in sorted(fields.items(), key=lambda item: item[0] != "name"):  # stable: the rest keeps its order
         yield from _comment(field.description)
         if get_origin(field.annotation) is Literal and key != "name":
-            yield f"# One of: {', '.join(map(str, get_args(field.annotation)))}"
+            yield from _comment(f"One of: {', '.join(map(str, get_args(field.annotation)))}")
         yield f"{key}: {scalar(getattr(settings, key))}"
 
 

@@ -39,7 +39,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    gsd_before_m: what the workspace had, or None. ground_hint: the ground below relative altitudes, and its source.
+    recognised: as in `read.BlockInputs`. gsd_before_m: what the workspace had, or None. ground_hint: the ground below
+    relative altitudes, and its source.
     """
 
     block: Block
@@ -50,6 +51,7 @@ class BlockRead:
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
+    recognised: str
     gsd_before_m: float | None
     ground_hint: tuple[Ground, str] | None
 
@@ -83,6 +85,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
+        recognised=inputs.recognised,
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
         ground_hint=None
         if inputs.ground_hint_z_m is None or inputs.ground_is_stated
@@ -137,7 +140,7 @@ def _read_inputs(
 ) -> tuple[BlockInputs, dict[str, str]]:
     """Inputs, and the fingerprint of every image by image_id."""
     given, root = settings.block, Path(settings.block.images)
-    lists = read_lists("" if given.poses == "none" else given.poses, given.cameras, given.angles)
+    lists = read_lists("" if given.poses == "none" else given.poses, given.cameras, given.angles, given.pose_format)
     names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
     outcomes = dict(zip(names, executor.run(_read_header, [root / name for name in names], "read"), strict=True))
     # The origin of an earlier run is kept, unless the user now asks for another CRS.

@@ -54,7 +54,8 @@ def prepare(
         workspace.create()
     found = read_block(settings, workspace, executor)
     as_given = summarise(found.block)
-    for line in as_given.given_lines():
+    given_lines = [*([f"poses            {found.recognised}"] if found.recognised else []), *as_given.given_lines()]
+    for line in given_lines:
         say(line)
     known = [*found.warnings, *as_given.warnings]
     for warning in known:
@@ -74,7 +75,7 @@ def prepare(
     oriented_lines = orientation_lines(oriented.facts, found.block, context.block)
     said_later = [*oriented.facts.get("remarks", []), *(w for w in summary.warnings if w not in known)]
     report.facts = {
-        "summary": [*as_given.given_lines(), *oriented_lines, *summary.lines(), *_remarks(settings)],
+        "summary": [*given_lines, *oriented_lines, *summary.lines(), *_remarks(settings)],
         "block": summary.figures(),
         "warnings": [*known, *said_later],
         "images": len(found.block.images),

@@ -1,0 +1,93 @@
+"""BlocksExchange XML of Bentley (ContextCapture, iTwin) and Metashape.
+
+`Pose/Rotation` is cam_from_world in the camera axes that `CameraOrientation` names (XRightYDown unless it says
+otherwise), as M_00 to M_22 or as Omega, Phi, Kappa with M = (Rx(omega) Ry(phi) Rz(kappa))'; `Center` is in the spatial
+reference system of the block or photo group, x being the easting or longitude.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import Source, number, rotation_row
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+
+# Directions in OpenCV's camera axes.
+_DIRECTIONS = {"Right": (1.0, 0.0, 0.0), "Left": (-1.0, 0.0, 0.0), "Down": (0.0, 1.0, 0.0), "Up": (0.0, -1.0, 0.0)}
+
+
+def is_blocks_exchange(source: Source) -> bool:
+    return source.xml is not None and source.xml.tag == "BlocksExchange"
+
+
+def read_blocks_exchange(source: Source) -> PoseList:
+    """Raises ConfigError naming the photo."""
+    root = source.xml
+    systems = {srs.findtext("Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
+    rows: list[PoseRow] = []
+    found: set[tuple[str | None, PositionKind]] = set()
+    unposed = 0
+    for block in root.iter("Block"):
+        for group in block.iter("Photogroup"):
+            identifier = group.findtext("SRSId") or block.findtext("SRSId")
+            definition = systems.get(identifier, "") if identifier else ""
+            system = described_crs(str(source.path), definition) if definition else (None, "grid")
+            axes = _cam_from_axes(source, group.findtext("CameraOrientation") or "XRightYDown")
+            for photo in group.iter("Photo"):
+                path = (photo.findtext("ImagePath") or "").replace("\\", "/")
+                center = photo.find("Pose/Center")
+                if center is None:
+                    unposed += 1
+                    continue
+                found.add(system)
+                x, y, z = (_value(source, path, center, key) for key in "xyz")
+                rotation = _rotation(source, path, photo.find("Pose/Rotation"))
+                place = (y, x, z) if system[1] == "geographic" else (x, y, z)
+                cam = None if rotation is None else axes @ rotation
+                rows.append(rotation_row(_short(path), len(rows) + 1, place, cam, system[1]))
+    if len(found) > 1:
+        raise ConfigError(f"{source.path}: photo groups are in different reference systems: export them in one")
+    if not rows:
+        raise ConfigError(f"{source.path}: no photo of this BlocksExchange file has a pose")
+    crs, kind = found.pop()
+    remarks = (f"{source.path.name}: {unposed} photos have no pose there",) if unposed else ()
+    words = crs or ("degrees" if kind == "geographic" else "local frame")
+    return PoseList(tuple(rows), kind, remarks, f"BlocksExchange, {words}", crs)
+
+
+def _short(path: str) -> str:
+    """The path without a drive or a root, which say nothing of the folder of images."""
+    return path.rsplit("/", 1)[-1] if re.match(r"([A-Za-z]:)?/", path) else path
+
+
+def _value(source: Source, photo: str, element: Any, key: str) -> float:
+    return number(f"{source.path}, photo {photo}, {key}", element.findtext(key) or "")
+
+
+def _rotation(source: Source, photo: str, element: Any) -> FloatArray | None:
+    """M; None where the photo has no rotation."""
+    if element is None:
+        return None
+    if element.find("M_00") is not None:
+        return np.array([[_value(source, photo, element, f"M_{i}{j}") for j in range(3)] for i in range(3)])
+    if element.find("Omega") is not None:
+        omega, phi, kappa = (_value(source, photo, element, key) for key in ("Omega", "Phi", "Kappa"))
+        return (rotation_x(omega) @ rotation_y(phi) @ rotation_z(kappa)).T
+    raise ConfigError(
+        f"{source.path}, photo {photo}: the rotation is neither a matrix nor Omega, Phi, Kappa: export one of these"
+    )
+
+
+def _cam_from_axes(source: Source, orientation: str) -> FloatArray:
+    match = re.fullmatch(r"X(Right|Left|Up|Down)Y(Right|Left|Up|Down)", orientation.strip())
+    if match is None:
+        raise ConfigError(f"{source.path}: CameraOrientation {orientation!r} is unknown, it is such as XRightYDown")
+    x, y = (np.array(_DIRECTIONS[word]) for word in match.groups())
+    return np.column_stack([x, y, np.cross(x, y)])

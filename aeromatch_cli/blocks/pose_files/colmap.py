@@ -1,0 +1,119 @@
+"""COLMAP: images.txt, images.bin, or the folder that has one of them; cameras.txt or cameras.bin beside.
+
+`IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME` and a line of points, which may be empty. The quaternion is
+cam_from_world (Hamilton, scalar first) in OpenCV's axes; the projection centre is -R't. The world has no CRS.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from aeromatch_cli.blocks.camera_files import read_camera_file
+from aeromatch_cli.blocks.pose_files.source import Source, numbers, rotation_row
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.data import Camera
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import MODELS, from_colmap
+from aeromatch_cli.geometry.rotations import from_quaternion
+
+_FLOAT = r"[-+0-9.eE]+"
+_IMAGE = re.compile(rf"\d+[ ,]+(?:{_FLOAT}[ ,]+){{7}}\d+[ ,]+\S.*[A-Za-z_./].*")
+_NAMES = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID")
+# COLMAP's numbers of the models that are known here, and how many parameters all of them have.
+_MODEL_IDS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
+_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
+
+
+def is_model(source: Source) -> bool:
+    if source.is_folder:
+        return source.beside("images.txt", "images.bin") is not None
+    if source.name == "images.bin":
+        return True
+    first = next((line for _, line in source.records()), "")
+    return bool(_IMAGE.fullmatch(first))
+
+
+def read_model(source: Source) -> PoseList:
+    """Raises ConfigError with file and line, or byte."""
+    images = (source.beside("images.bin", "images.txt") or source) if source.is_folder else source
+    binary = images.name.endswith(".bin")
+    cameras = _cameras(images)
+    rows = tuple(_binary_rows(images, cameras) if binary else _text_rows(images, cameras))
+    if not rows:
+        raise ConfigError(f"{images.path}: the model has no image")
+    known = f", {len(cameras)} cameras" if cameras else ""
+    return PoseList(rows, "grid", (), f"COLMAP {images.path.name}{known}", None, cameras)
+
+
+def _text_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow]:
+    points = False  # whether the next line holds the points of the image before
+    for line, text in enumerate(source.lines, start=1):
+        if text.lstrip().startswith("#"):
+            continue
+        if points:
+            points = False
+            if not _IMAGE.fullmatch(text.strip()):
+                continue
+        elif not text.strip():
+            continue
+        fields = re.split(r"\s*,\s*|\s+", text.strip(), maxsplit=9)
+        values = numbers(source.at(line), fields, _NAMES)
+        if len(fields) < 10:
+            raise ConfigError(f"{source.at(line)}: no NAME behind CAMERA_ID")
+        yield _row(source, line, values[1:8], fields[8], fields[9], cameras)
+        points = True
+
+
+def _row(
+    source: Source, line: int, pose: list[float] | tuple[float, ...], camera: str, name: str, cameras: dict[str, Camera]
+) -> PoseRow:
+    try:
+        rotation = from_quaternion(*pose[:4])
+    except ValueError as error:
+        raise ConfigError(f"{source.at(line)}, column QW: {error}") from error
+    center = -rotation.T @ np.array(pose[4:7])
+    return rotation_row(name, line, center, rotation, camera=camera if camera in cameras else "")
+
+
+def _binary_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow]:
+    raw, place = source.raw, 8
+    try:
+        (count,) = struct.unpack_from("<Q", raw, 0)
+        for row in range(1, count + 1):
+            _, *pose, camera = struct.unpack_from("<i7di", raw, place)
+            place += 4 + 56 + 4
+            end = raw.index(b"\0", place)
+            name = raw[place:end].decode("utf-8")
+            (points,) = struct.unpack_from("<Q", raw, end + 1)
+            place = end + 9 + 24 * points
+            yield _row(source, row, pose, str(camera), name, cameras)
+    except (struct.error, ValueError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{source.path}, byte {place}: not COLMAP's images.bin ({error})") from error
+
+
+def _cameras(images: Source) -> dict[str, Camera]:
+    """Those beside the images whose model is known here."""
+    found = images.beside("cameras.bin" if images.name.endswith(".bin") else "cameras.txt")
+    if found is None:
+        return {}
+    if found.name.endswith(".txt"):
+        return dict(read_camera_file(found.path).cameras)
+    cameras: dict[str, Camera] = {}
+    raw, place = found.raw, 8
+    try:
+        (count,) = struct.unpack_from("<Q", raw, 0)
+        for _ in range(count):
+            identifier, model, width, height = struct.unpack_from("<iiQQ", raw, place)
+            place += 24
+            parameters = struct.unpack_from(f"<{_PARAMETERS[model]}d", raw, place)
+            place += 8 * _PARAMETERS[model]
+            if model in _MODEL_IDS:
+                name = _MODEL_IDS[model]
+                cameras[str(identifier)] = from_colmap(name, width, height, parameters[: len(MODELS[name])])
+    except (struct.error, KeyError) as error:
+        raise ConfigError(f"{found.path}, byte {place}: not COLMAP's cameras.bin ({error!r})") from error
+    return cameras

@@ -1,0 +1,208 @@
+"""Agisoft Metashape: the reference file (CSV) and cameras.xml.
+
+Reference: `# CoordinateSystem: WKT`, then `#Label,...`; columns go by their names. x is the easting or longitude. Yaw,
+pitch, roll are zero straight down, yaw from true north; omega, phi, kappa (and phi, omega, kappa) count in the grid.
+Estimated columns (`_est`) stand before those that were given.
+
+cameras.xml: a camera's `transform` takes camera axes (OpenCV's) to the chunk; the chunk's (or component's) takes these
+to geocentric coordinates. `sensor/calibration`: f, cx and cy from the image's centre in pixels; p1 and p2 are exchanged
+against OpenCV's.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
+from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import from_colmap
+from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
+from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+
+_ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
+# Geocentric coordinates of a place on the ground, and of nothing else.
+_EARTH_M = (6.2e6, 6.6e6)
+
+
+def is_reference(source: Source) -> bool:
+    return any(re.match(r"#\s*(coordinatesystem\s*:|label\b)", line, re.IGNORECASE) for line in source.lines[:3])
+
+
+def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
+    """estimated: take the columns `_est` where a line has them. Raises ConfigError with line and column."""
+    crs: str | None = None
+    kind: PositionKind | None = None
+    system = ""
+    columns: list[str] = []
+    rows: list[PoseRow] = []
+    used_estimated = disabled = 0
+    separator, angles = ",", _ANGLES[0]
+    for line, text in enumerate(source.lines, start=1):
+        stripped = text.strip()
+        stated = re.match(r"#\s*coordinatesystem\s*:\s*(.*)", stripped, re.IGNORECASE)
+        if stated:
+            crs, kind = described_crs(source.at(line), stated[1])
+            system = f", {crs or ('WGS84' if kind == 'geographic' else 'local')}"
+        elif not columns and re.match(r"#?\s*label\b", stripped, re.IGNORECASE):
+            separator = max(",;\t", key=stripped.count)
+            columns = [_column(cell) for cell in stripped.lstrip("#").split(separator)]
+            kind = kind or ("geographic" if "longitude" in stripped.lower() else "grid")
+            angles = _angle_columns(columns)
+        elif stripped and not stripped.startswith("#"):
+            if not columns:
+                raise ConfigError(f"{source.at(line)}: no line that names the columns (#Label,...) stands before")
+            cells = next(csv.reader([text], delimiter=separator))
+            record = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
+            if record.get("enable", "1").lower() in ("0", "false"):
+                disabled += 1
+            row, from_estimate = _row(source, line, record, angles, kind == "geographic", separator, estimated)
+            rows.append(row)
+            used_estimated += from_estimate
+    words = ["estimated"] if used_estimated else []
+    words += ["/".join(angles)] if any(row.attitude for row in rows) else ["positions"]
+    remarks = (f"{source.path.name}: {disabled} cameras are not enabled there; they are used",) if disabled else ()
+    return PoseList(tuple(rows), kind or "grid", remarks, f"Metashape reference, {', '.join(words)}{system}", crs)
+
+
+def _column(cell: str) -> str:
+    """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names."""
+    name = cell.strip().strip('"').lower()
+    name = re.sub(r"^([xyz])/[a-z]+", r"\1", name)
+    name = re.sub(r"[\s_]*\((m|deg|pix)\)$", "", name)
+    return re.sub(r"\s+", "_", name)
+
+
+def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
+    places = {name: columns.index(name) for three in _ANGLES for name in three if name in columns}
+    if "yaw" in places:
+        return _ANGLES[0]
+    if {"omega", "phi"} <= places.keys():
+        return _ANGLES[1] if places["omega"] < places["phi"] else _ANGLES[2]
+    return _ANGLES[0]
+
+
+def _row(
+    source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], geographic: bool,
+    separator: str, estimated: bool,
+) -> tuple[PoseRow, bool]:  # fmt: skip
+    def value(name: str) -> float:
+        cell = record.get(name, "")
+        return number(source.at(line, name), cell, decimal_comma=separator != ",") if cell else math.nan
+
+    def triple(names: Sequence[str]) -> tuple[tuple[float, ...], bool]:
+        own = tuple(value(f"{name}_est") for name in names)
+        use = estimated and all(math.isfinite(v) for v in own)
+        return (own if use else tuple(value(name) for name in names)), use
+
+    (x, y, z), from_estimate = triple(("x", "y", "z"))
+    attitude, _ = triple(angles)
+    whole = all(math.isfinite(v) for v in attitude)
+    sigmas = [v for name in ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y") if (v := value(name)) > 0.0]
+    kind: PositionKind = "geographic" if geographic else "grid"
+    row = PoseRow(
+        image=image_name(record.get("label", "")), line=line,
+        position=((y, x, z) if geographic else (x, y, z)) if math.isfinite(x + y) else None, position_kind=kind,
+        attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
+        forward=False, true_north=angles[0] == "yaw",
+        sigma_position_m=None if from_estimate else max(sigmas, default=None),
+    )  # fmt: skip
+    if whole and angles == _ANGLES[1]:
+        return PoseRow(**{**vars(row), "attitude_kind": "omega_phi_kappa", "forward": None}), from_estimate
+    if whole and angles == _ANGLES[2]:
+        phi, omega, kappa = attitude
+        photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
+        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, kind)
+        facts = {"attitude": turned.attitude, "attitude_kind": "quaternion", "forward": None}
+        return PoseRow(**{**vars(row), **facts}), from_estimate
+    return row, from_estimate
+
+
+def is_cameras_xml(source: Source) -> bool:
+    return source.xml is not None and source.xml.tag == "document" and source.xml.find(".//camera") is not None
+
+
+def read_cameras_xml(source: Source) -> PoseList:
+    """Raises ConfigError naming the camera."""
+    rows: list[PoseRow] = []
+    cameras: dict[str, Camera] = {}
+    unaligned = 0
+    georeferenced: set[bool] = set()
+    for chunk in source.xml.iter("chunk"):
+        cameras |= {f"sensor{key}": c for s in chunk.iter("sensor") if (key := s.get("id")) and (c := _sensor(s))}
+        whole = _similarity(source, chunk.find("transform"))
+        parts = {c.get("id"): _similarity(source, c.find("transform")) for c in chunk.iter("component")}
+        for camera in chunk.iter("camera"):
+            label, transform = camera.get("label", ""), camera.find("transform")
+            if transform is None or not (transform.text or "").strip():
+                unaligned += 1
+                continue
+            matrix = _numbers(source, f"camera {label!r}", transform.text, 16).reshape(4, 4)
+            turn, shift, scale = parts.get(camera.get("component_id")) or whole or (np.eye(3), np.zeros(3), 1.0)
+            center = scale * turn @ matrix[:3, 3] + shift
+            world_from_camera = turn @ matrix[:3, :3]
+            earth = _EARTH_M[0] < float(np.linalg.norm(center)) < _EARTH_M[1]
+            georeferenced.add(earth)
+            rotation = world_from_camera.T
+            if earth:
+                center = geodetic(center[None])[0]
+                rotation = rotation @ enu_from_geocentric(*center[:2]).T
+            sensor = f"sensor{camera.get('sensor_id')}"
+            rows.append(
+                rotation_row(
+                    label, len(rows) + 1, center, rotation, "geographic" if earth else "grid", true_north=earth,
+                    camera=sensor if sensor in cameras else "",
+                )
+            )  # fmt: skip
+    if len(georeferenced) > 1:
+        raise ConfigError(f"{source.path}: some chunks are georeferenced and some are not: export one alone")
+    if not rows:
+        raise ConfigError(
+            f"{source.path}: no camera of this Metashape file is aligned: align the photos, or export the reference"
+        )
+    remarks = (f"{source.path.name}: {unaligned} cameras are not aligned there",) if unaligned else ()
+    kind: PositionKind = "geographic" if georeferenced == {True} else "grid"
+    words = "georeferenced" if kind == "geographic" else "not georeferenced"
+    return PoseList(tuple(rows), kind, remarks, f"Metashape cameras.xml, {words}", None, cameras)
+
+
+def _numbers(source: Source, what: str, text: str | None, count: int) -> FloatArray:
+    values = [number(f"{source.path}, {what}", cell) for cell in (text or "").split()]
+    if len(values) != count:
+        raise ConfigError(f"{source.path}, {what}: {len(values)} numbers instead of {count}")
+    return np.array(values)
+
+
+def _similarity(source: Source, element: Any) -> tuple[FloatArray, FloatArray, float] | None:
+    if element is None or element.find("rotation") is None:
+        return None
+    turn = _numbers(source, "rotation of the chunk", element.findtext("rotation"), 9).reshape(3, 3)
+    shift = _numbers(source, "translation of the chunk", element.findtext("translation"), 3)
+    scale = _numbers(source, "scale of the chunk", element.findtext("scale") or "1", 1)
+    return turn, shift, float(scale[0])
+
+
+def _sensor(sensor: Any) -> Camera | None:
+    """The adjusted calibration of a frame camera; None for other types and without one."""
+    found = [c for c in sensor.findall("calibration") if c.get("class") == "adjusted"] or sensor.findall("calibration")
+    if not found or found[0].get("type", "frame") != "frame":
+        return None
+    try:
+        facts = {child.tag: float(child.text) for child in found[0] if child.tag != "resolution" and child.text}
+        size = found[0].find("resolution")
+        size = sensor.find("resolution") if size is None else size
+        width, height = int(size.get("width")), int(size.get("height"))
+        f = facts["f"]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+    middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
+    lens = [facts.get(key, 0.0) for key in ("k1", "k2", "p2", "p1")]
+    return from_colmap("OPENCV", width, height, (f + facts.get("b1", 0.0), f, *middle, *lens))

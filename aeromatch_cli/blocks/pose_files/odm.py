@@ -1,0 +1,108 @@
+"""OpenDroneMap: geo.txt, and the shots.geojson that ODM and WebODM export.
+
+geo.txt (opendm/geo.py): the CRS in the first line, then `name x y [z] [yaw pitch roll] [h_acc v_acc] ...`; x is the
+easting or longitude in every CRS; angles where the line has seven fields and more, accuracies from nine on; yaw, pitch,
+roll are zero for a camera that looks straight down with the image's top to the north.
+
+shots.geojson (opendm/shots.py): Point [lon, lat, alt]; `rotation` is the angle-axis vector of cam_from_world relative
+to the grid of the UTM zone.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.rotations import rotation_z
+
+_CRS = re.compile(r"(EPSG:\d+|.*\+proj=.*|WGS84\s+UTM\s+\d{1,2}\s*[NS])", re.IGNORECASE)
+_WITH_ANGLES, _WITH_ACCURACIES = 7, 9
+# Angles of all lines that are positive and below this, in degrees, may be standard deviations.
+_LIKE_SIGMAS = 1.0
+
+
+def is_geo_txt(source: Source) -> bool:
+    first = next((line for line in source.lines if line.strip()), "")
+    return bool(_CRS.fullmatch(first.strip()))
+
+
+def read_geo_txt(source: Source) -> PoseList:
+    """Raises ConfigError with file, line and column."""
+    records = list(source.records())
+    head, text = records[0]
+    crs, kind = described_crs(source.at(head), text)
+    rows: list[PoseRow] = []
+    for line, record in records[1:]:
+        fields = record.split()
+        if len(fields) < 3:
+            raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
+        values = [_value(source.at(line, f"{column}"), cell) for column, cell in enumerate(fields[1:9], start=2)]
+        x, y, z = [*values, np.nan, np.nan][:3]
+        angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
+        sigmas = values[6:8] if len(fields) >= _WITH_ACCURACIES else []
+        place = (y, x, z) if kind == "geographic" else (x, y, z)
+        whole = bool(np.isfinite(angles).all())
+        rows.append(
+            PoseRow(
+                image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
+                position_kind=kind, attitude=tuple(angles) if whole else None,
+                attitude_kind="yaw_pitch_roll" if whole else "none", forward=False, true_north=True,
+                sigma_position_m=max((s for s in sigmas if s > 0), default=None),
+            )
+        )  # fmt: skip
+    given = [row.attitude for row in rows if row.attitude is not None]
+    words = "yaw, pitch, roll" if given else "positions"
+    remarks: tuple[str, ...] = ()
+    if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
+        remarks = (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
+    return PoseList(tuple(rows), kind, remarks, f"ODM geo.txt, {text}, {words}", crs)
+
+
+def _value(where: str, cell: str) -> float:
+    return float("nan") if cell.lower() == "nan" else number(where, cell)
+
+
+def is_shots(source: Source) -> bool:
+    features = source.tree.get("features") if isinstance(source.tree, dict) else None
+    return bool(features) and isinstance(features, list) and "filename" in _properties(features[0])
+
+
+def read_shots(source: Source) -> PoseList:
+    """Raises ConfigError naming the shot."""
+    rows = []
+    for count, feature in enumerate(source.tree["features"], start=1):
+        where = f"{source.path}, shot {count}"
+        facts = _properties(feature)
+        try:
+            longitude, latitude, height = (float(v) for v in feature["geometry"]["coordinates"][:3])
+            rotation = rotation_of_vector(facts["rotation"]) if "rotation" in facts else None
+            name = str(facts["filename"])
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ConfigError(f"{where}: not a shot with filename and coordinates ({error!r})") from error
+        if rotation is not None:
+            place = np.array([latitude]), np.array([longitude])
+            # From the zone's grid to true north.
+            rotation = rotation @ rotation_z(float(convergence_deg(utm_crs(*place), *place)[0]))
+        center = latitude, longitude, height
+        rows.append(rotation_row(name, count, center, rotation, "geographic", true_north=True))
+    return PoseList(tuple(rows), "geographic", (), "ODM shots.geojson")
+
+
+def _properties(feature: Any) -> dict[str, Any]:
+    facts = feature.get("properties") if isinstance(feature, dict) else None
+    return facts if isinstance(facts, dict) else {}
+
+
+def rotation_of_vector(vector: Any) -> FloatArray:
+    """(3, 3) of an angle-axis vector in radians. Raises ValueError or TypeError where it is none."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.array([float(v) for v in vector]).reshape(3)).as_matrix())

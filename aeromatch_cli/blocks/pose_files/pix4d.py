@@ -1,0 +1,130 @@
+"""Pix4D: geolocation without header, and the calibrated camera parameters.
+
+Geolocation: `name,c1,c2,z[,a1,a2,a3][,accuracy_horizontal,accuracy_vertical]`. In degrees latitude stands first
+(Pix4D's default); numbers beyond 180 are a grid's. Pix4Dmapper's angles are omega, phi, kappa, Pix4Dmatic's yaw, pitch,
+roll from straight down: nothing in the file tells them, so of flights that look down the column that turns most does.
+
+*_calibrated_camera_parameters.txt: eight lines of header, then for every image its name and size, K, radial and
+tangential distortion, t (the projection centre less the project's offset) and R (cam_from_world in OpenCV's axes). The
+offset lies beside in *_offset.xyz.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from aeromatch_cli.blocks.pose_files.source import (
+    Source,
+    cells_of,
+    image_name,
+    is_number,
+    number,
+    numbers,
+    rotation_row,
+)
+from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
+from aeromatch_cli.errors import ConfigError
+
+_IMAGE = re.compile(r".+\.(jpe?g|tiff?|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
+_COUNTS = (4, 6, 7, 9)
+_LINES_OF_IMAGE = 10
+
+
+def is_geolocation(source: Source) -> bool:
+    record = next((line for _, line in source.records()), "")
+    if "," not in record and ";" not in record:
+        return False
+    cells = cells_of(record)
+    return len(cells) in _COUNTS and bool(_IMAGE.fullmatch(cells[0])) and all(map(is_number, cells[1:]))
+
+
+def read_geolocation(source: Source, angles: str = "") -> PoseList:
+    """angles: "opk" or "ypr", "" to go by the numbers. Raises ConfigError with line and column."""
+    table: list[tuple[int, str, list[float]]] = []
+    for line, record in source.records():
+        cells = cells_of(record)
+        if len(cells) not in _COUNTS:
+            raise ConfigError(f"{source.at(line)}: {len(cells)} values, a line of Pix4D's geolocation has 4, 6, 7 or 9")
+        comma = ";" in record or "\t" in record
+        values = [
+            number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
+        ]
+        table.append((line, cells[0], values))
+    places = np.array([values[:2] for _, _, values in table])
+    kind: PositionKind = "geographic" if np.abs(places).max() <= 180.0 else "grid"
+    exchanged = kind == "geographic" and bool((np.abs(places[:, 0]) > 90.0).any())
+    attitudes = np.array([values[3:6] for _, _, values in table if len(values) >= 6])
+    chosen = angles or _likely_angles(attitudes)
+    form: AttitudeKind = "omega_phi_kappa" if chosen == "opk" else "yaw_pitch_roll"
+    rows = tuple(_row(line, name, values, kind, exchanged, form) for line, name, values in table)
+    remarks = []
+    words = "positions"
+    if len(attitudes):
+        words = "omega, phi, kappa" if chosen == "opk" else "yaw, pitch, roll"
+        other = "pix4d-ypr" if chosen == "opk" else "pix4d-opk"
+        if not angles:
+            remarks.append(
+                f"{source.path.name}: the angles are read as {words}; --pose-format {other} reads them otherwise"
+            )
+    if exchanged:
+        remarks.append(f"{source.path.name}: longitude stands before latitude, as numbers beyond 90 show")
+    where = "latitude, longitude" if kind == "geographic" else "grid"
+    return PoseList(rows, kind, tuple(remarks), f"Pix4D geolocation, {where}, {words}")
+
+
+def _likely_angles(attitudes: np.ndarray) -> str:
+    """Of images that look down, the heading turns: the last of omega, phi, kappa, the first of yaw, pitch, roll."""
+    if not len(attitudes):
+        return "ypr"
+    turned = np.median(np.abs(attitudes), axis=0) + np.std(attitudes, axis=0)
+    return "opk" if turned[2] > turned[0] else "ypr"
+
+
+def _row(
+    line: int, name: str, values: Sequence[float], kind: PositionKind, exchanged: bool, form: AttitudeKind
+) -> PoseRow:
+    first, second, height = values[:3]
+    angles = tuple(values[3:6]) if len(values) >= 6 else None
+    sigmas = values[6:8] if len(values) == 8 else values[3:5] if len(values) == 5 else []
+    return PoseRow(
+        image=image_name(name), line=line, position=(second, first, height) if exchanged else (first, second, height),
+        position_kind=kind, attitude=angles, attitude_kind=form if angles else "none",
+        forward=False if angles and form == "yaw_pitch_roll" else None,
+        true_north=bool(angles) and form == "yaw_pitch_roll",
+        sigma_position_m=max((s for s in sigmas if s > 0.0), default=None),
+    )  # fmt: skip
+
+
+read_as_opk, read_as_ypr = partial(read_geolocation, angles="opk"), partial(read_geolocation, angles="ypr")
+
+
+def is_camera_parameters(source: Source) -> bool:
+    return any("camera position t" in line.lower() or "fileName imageWidth" in line for line in source.lines[:8])
+
+
+def read_camera_parameters(source: Source) -> PoseList:
+    """Raises ConfigError with file and line."""
+    offset, remarks = np.zeros(3), []
+    beside = next(iter(sorted(source.path.parent.glob("*_offset.xyz"))), None)
+    if beside is not None:
+        offset = np.array(numbers(str(beside), Source(beside).text.split(), ("x", "y", "z")))
+    else:
+        remarks.append(f"{source.path.name}: no *_offset.xyz beside it: positions count from the project's offset")
+    records = [(line, text) for line, text in source.records() if line > 8]
+    rows = []
+    for start in range(0, len(records), _LINES_OF_IMAGE):
+        part = records[start : start + _LINES_OF_IMAGE]
+        line, head = part[0]
+        name = head.rsplit(maxsplit=2)[0]
+        if len(part) < _LINES_OF_IMAGE or not _IMAGE.fullmatch(name):
+            raise ConfigError(f"{source.at(line)}: an image has ten lines here, beginning with name, width and height")
+        center = numbers(source.at(part[6][0]), part[6][1].split(), ("t1", "t2", "t3"))
+        matrix = [numbers(source.at(n), text.split(), ("r1", "r2", "r3")) for n, text in part[7:10]]
+        rows.append(rotation_row(name, line, offset + center, np.array(matrix)))
+    if not rows:
+        raise ConfigError(f"{source.path}: no image follows the eight lines of the header")
+    return PoseList(tuple(rows), "grid", tuple(remarks), "Pix4D calibrated camera parameters")

@@ -1,0 +1,173 @@
+"""A file or folder of poses as it lies on the disk, and what all readers need: text, numbers with their place, rows."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.blocks.poses import PoseRow, PositionKind
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.rotations import to_quaternion
+
+# A file that is longer is no list of poses; a reconstruction with its points may be large.
+_LARGEST_BYTES = 2_000_000_000
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+
+
+@dataclass(frozen=True)
+class Source:
+    """What --poses names. Its content is read when a reader asks for it."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name.lower()
+
+    @cached_property
+    def is_folder(self) -> bool:
+        return self.path.is_dir()
+
+    @cached_property
+    def raw(self) -> bytes:
+        """Empty for a folder. Raises ConfigError where the file cannot be read."""
+        if self.is_folder:
+            return b""
+        try:
+            if self.path.stat().st_size > _LARGEST_BYTES:
+                raise ConfigError(f"pose file {self.path} is larger than {_LARGEST_BYTES // 10**9} GB")
+            return self.path.read_bytes()
+        except OSError as error:
+            raise ConfigError(
+                f"pose list {self.path} cannot be read ({error.strerror}): give a pose file, or exif, with --poses"
+            ) from error
+
+    @cached_property
+    def text(self) -> str:
+        """Empty where the file is no text (UTF-8, UTF-16 with its mark, else Latin-1)."""
+        if b"\0" in self.raw[:4096] and self.raw[:2] not in _UTF16:
+            return ""
+        encoding = "utf-16" if self.raw[:2] in _UTF16 else "utf-8-sig"
+        try:
+            return self.raw.decode(encoding)
+        except UnicodeDecodeError:
+            return self.raw.decode("latin-1")
+
+    @cached_property
+    def lines(self) -> list[str]:
+        return self.text.splitlines()
+
+    @cached_property
+    def tree(self) -> Any:
+        """JSON content, None where it is none."""
+        import json
+
+        if self.text.lstrip()[:1] not in ("{", "["):
+            return None
+        try:
+            return json.loads(self.text)
+        except (ValueError, RecursionError):
+            return None
+
+    @cached_property
+    def xml(self) -> Any:
+        """Root element, None where the file is no XML. Entities are refused."""
+        from xml.etree.ElementTree import ParseError
+
+        from defusedxml import DefusedXmlException
+        from defusedxml.ElementTree import fromstring
+
+        if self.text.lstrip()[:1] != "<":
+            return None
+        try:
+            return fromstring(self.text.encode("utf-8") if "encoding" not in self.text[:100] else self.raw)
+        except (ParseError, DefusedXmlException, ValueError):
+            return None
+
+    def records(self, comment: str = "#") -> Iterator[tuple[int, str]]:
+        """Lines with their numbers, without empty ones and comments."""
+        for number, line in enumerate(self.lines, start=1):
+            if line.strip() and not line.lstrip().startswith(comment):
+                yield number, line.strip()
+
+    def beside(self, *names: str) -> Source | None:
+        """The first of these files that lies in the same folder (or in the folder itself)."""
+        folder = self.path if self.is_folder else self.path.parent
+        return next((Source(folder / name) for name in names if (folder / name).is_file()), None)
+
+    def at(self, line: int, column: str = "") -> str:
+        """A place for messages."""
+        return f"{self.path}, line {line}" + (f", column {column}" if column else "")
+
+
+def cells_of(line: str) -> list[str]:
+    """Values of a line without header: semicolons and tabs before commas before blanks."""
+    for separator in (";", "\t", ","):
+        if separator in line:
+            return [cell.strip().strip('"') for cell in line.split(separator)]
+    return line.split()
+
+
+def number(where: str, cell: str, *, decimal_comma: bool = False) -> float:
+    """Raises ConfigError where the cell is no finite number."""
+    text = cell.replace(",", ".") if decimal_comma and cell.count(",") == 1 and "." not in cell else cell
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {cell!r} is not a number") from error
+    if not math.isfinite(value):
+        raise ConfigError(f"{where}: {cell!r} is not a finite number")
+    return value
+
+
+def is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def numbers(where: str, cells: Sequence[str], names: Sequence[str]) -> list[float]:
+    """One number for each name. Raises ConfigError naming the column."""
+    if len(cells) < len(names):
+        raise ConfigError(f"{where}: {len(cells)} values, {len(names)} are needed: {', '.join(names)}")
+    return [number(f"{where}, column {name}", cell) for cell, name in zip(cells, names, strict=False)]
+
+
+def image_name(text: str) -> str:
+    """As pose lists write it: forward slashes, no leading ./"""
+    return re.sub(r"^(\./)+", "", text.strip().strip('"').replace("\\", "/"))
+
+
+def rotation_row(
+    image: str,
+    line: int,
+    center: Sequence[float] | FloatArray,
+    rotation: FloatArray | None,
+    kind: PositionKind = "grid",
+    *,
+    true_north: bool = False,
+    camera: str = "",
+    sigma_position_m: float | None = None,
+) -> PoseRow:
+    """A row of a projection centre and a matrix cam_from_world (3, 3), relative to the grid or to true north."""
+    x, y, z = (float(value) for value in center)
+    attitude = None
+    if rotation is not None:
+        if not np.isfinite(rotation).all() or abs(float(np.linalg.det(rotation)) - 1.0) > 0.01:
+            raise ConfigError(f"{image}, line {line}: the rotation is none (its determinant is not 1)")
+        attitude = to_quaternion(rotation)
+    return PoseRow(
+        image=image_name(image), line=line, position=(x, y, z), position_kind=kind, attitude=attitude,
+        attitude_kind="none" if attitude is None else "quaternion", camera=camera, sigma_position_m=sigma_position_m,
+        true_north=true_north,
+    )  # fmt: skip

@@ -1,0 +1,155 @@
+"""Every format of poses by name: how it is recognised and read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from aeromatch_cli.blocks.pose_files import (
+    blocks_exchange,
+    colmap,
+    dji,
+    metashape,
+    micmac,
+    odm,
+    opensfm,
+    pix4d,
+    scenes,
+    tables,
+)
+from aeromatch_cli.blocks.pose_files.source import Source
+from aeromatch_cli.blocks.poses import PoseList, read_poses
+from aeromatch_cli.errors import ConfigError
+
+AUTO = "auto"
+
+
+@dataclass(frozen=True)
+class PoseFormat:
+    """title: in words. read: raises ConfigError with file, line and column. recognises: None where only its name asks
+    for it."""
+
+    title: str
+    read: Callable[[Source], PoseList]
+    recognises: Callable[[Source], bool] | None = None
+
+
+def _named_columns(source: Source) -> PoseList:
+    return read_poses(source.path)
+
+
+# In the order in which they are tried: those that nothing else looks like first.
+POSE_FORMATS: Mapping[str, PoseFormat] = {
+    "colmap": PoseFormat("COLMAP images.txt, images.bin or their folder", colmap.read_model, colmap.is_model),
+    "micmac": PoseFormat("MicMac folder Ori-* or Orientation-*.xml", micmac.read_ori, micmac.is_ori),
+    "micmac-txt": PoseFormat("MicMac text for OriConvert", micmac.read_ori_txt, micmac.is_ori_txt),
+    "blocks-exchange": PoseFormat(
+        "BlocksExchange XML (Bentley, Metashape)", blocks_exchange.read_blocks_exchange,
+        blocks_exchange.is_blocks_exchange,
+    ),
+    "metashape-xml": PoseFormat("Metashape cameras.xml", metashape.read_cameras_xml, metashape.is_cameras_xml),
+    "metashape": PoseFormat(
+        "Metashape reference, estimated poses before given ones", metashape.read_reference, metashape.is_reference
+    ),
+    "metashape-given": PoseFormat(
+        "Metashape reference, given poses", partial(metashape.read_reference, estimated=False)
+    ),
+    "opensfm": PoseFormat("OpenSfM reconstruction.json", opensfm.read_reconstruction, opensfm.is_reconstruction),
+    "odm-shots": PoseFormat("ODM and WebODM shots.geojson", odm.read_shots, odm.is_shots),
+    "transforms": PoseFormat("NeRF transforms.json", scenes.read_transforms, scenes.is_transforms),
+    "opensfm-exif": PoseFormat("OpenSfM exif_overrides.json", opensfm.read_overrides, opensfm.is_overrides),
+    "odm": PoseFormat("ODM geo.txt", odm.read_geo_txt, odm.is_geo_txt),
+    "dji-mrk": PoseFormat("DJI *_Timestamp.MRK", dji.read_mrk, dji.is_mrk),
+    "bundler": PoseFormat("Bundler .out with list.txt", scenes.read_bundler, scenes.is_bundler),
+    "nvm": PoseFormat("VisualSFM .nvm", scenes.read_nvm, scenes.is_nvm),
+    "inpho": PoseFormat("Inpho project .prj", tables.read_inpho, tables.is_inpho),
+    "pix4d-cameras": PoseFormat(
+        "Pix4D *_calibrated_camera_parameters.txt", pix4d.read_camera_parameters, pix4d.is_camera_parameters
+    ),
+    "patb": PoseFormat("PATB orientations", tables.read_patb, tables.is_patb),
+    "pix4d": PoseFormat("Pix4D geolocation without header", pix4d.read_geolocation, pix4d.is_geolocation),
+    "pix4d-opk": PoseFormat("the same with omega, phi, kappa", pix4d.read_as_opk),
+    "pix4d-ypr": PoseFormat("the same with yaw, pitch, roll", pix4d.read_as_ypr),
+    "table": PoseFormat(
+        "name x y z and three angles without header (BINGO, ORIMA, OriExport)", tables.read_plain_table,
+        tables.is_plain_table,
+    ),
+    "opk": PoseFormat("the same with omega, phi, kappa in degrees", tables.read_opk),
+    "opk-gon": PoseFormat("the same in gon", tables.read_opk_gon),
+    "pok": PoseFormat("the same with phi, omega, kappa in degrees", tables.read_pok),
+    "pok-gon": PoseFormat("the same in gon", tables.read_pok_gon),
+    "columns": PoseFormat("list whose first line names the columns", _named_columns),
+}  # fmt: skip
+
+# What other programs write that holds no poses to read, by the end of its name: what it is and what to do.
+_OTHERS: Mapping[str, str] = {
+    ".psx": "a Metashape project: export its reference (CSV) or cameras (XML)",
+    ".psz": "a Metashape project: export its reference (CSV) or cameras (XML)",
+    ".p4d": "a Pix4D project: give *_calibrated_external_camera_parameters.txt of its folder 1_initial/params",
+    ".opf": "a Pix4D project (OPF): export the calibrated external camera parameters as text",
+    ".pos": "an RTKLIB solution, antenna positions by time: export the position of every image as CSV",
+    ".obs": "raw GNSS observations: process them, and export the position of every image as CSV",
+    ".bin": "binary, and not COLMAP's images.bin",
+    ".sbet": "an SBET trajectory: export the orientation of every exposure as text",
+    ".out": "no Bundler file, which begins with `# Bundle file`",
+    ".xlsx": "an Excel workbook: save the sheet as CSV",
+    ".xls": "an Excel workbook: save the sheet as CSV",
+    ".ods": "a spreadsheet: save it as CSV",
+    ".kml": "KML: export the positions as CSV",
+    ".kmz": "KML: export the positions as CSV",
+    ".gpx": "a GPX track: export the position of every image as CSV",
+    ".shp": "a shapefile: export its table as CSV",
+    ".gpkg": "a GeoPackage: export its table as CSV",
+    ".db": "a database: export a COLMAP model from it (images.txt)",
+    ".zip": "an archive: unpack it and give the pose file in it",
+    "pmatrix.txt": "Pix4D's projection matrices: give *_calibrated_external_camera_parameters.txt beside it",
+    "cameras.txt": "COLMAP's cameras, which is for --cameras: images.txt beside it has the poses",
+    "cameras.json": "OpenSfM's camera models: reconstruction.json has the poses",
+    "reference_lla.json": "the reference of an OpenSfM block: reconstruction.json has the poses",
+    "gcp_list.txt": "ground control points, which are for --gcp",
+}
+
+
+def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
+    """Poses of any format. pose_format: a key of POSE_FORMATS, or "auto" to go by the content.
+
+    Raises ConfigError where the file cannot be read, is of no known format, or is malformed.
+    """
+    source = Source(path)
+    if pose_format != AUTO:
+        if pose_format not in POSE_FORMATS:
+            raise ConfigError(f"pose format {pose_format!r} is unknown: use one of auto, {', '.join(POSE_FORMATS)}")
+        return _checked(source, POSE_FORMATS[pose_format].read(source))
+    if source.path.suffix.lower() not in (".zip", ".xlsx") and (source.is_folder or source.raw):
+        for known in POSE_FORMATS.values():
+            if known.recognises is not None and known.recognises(source):
+                return _checked(source, known.read(source))
+    if source.is_folder:
+        raise ConfigError(f"pose list {path} is a folder: give a file, a COLMAP model or MicMac's Ori-* folder")
+    other = next((words for end, words in _OTHERS.items() if source.name.endswith(end)), "")
+    if other:
+        raise ConfigError(f"pose list {path} looks like {other}")
+    if source.tree is not None or source.xml is not None:
+        kind = "JSON" if source.tree is not None else "XML"
+        raise ConfigError(
+            f"pose list {path} is {kind} of a kind that is not read: docs/input.md lists those that are; a CSV whose "
+            "first line names the columns always is"
+        )
+    return read_poses(path)
+
+
+def _checked(source: Source, found: PoseList) -> PoseList:
+    """Raises ConfigError for an empty list and for two lines with one name."""
+    if not found.rows:
+        raise ConfigError(f"{source.path}: no image in this {found.format}")
+    lines: dict[str, int] = {}
+    for row in found.rows:
+        if row.image in lines:
+            raise ConfigError(
+                f"{source.path}, line {row.line}, column image: {row.image!r} stands in line {lines[row.image]} "
+                "already: keep one of the two lines"
+            )
+        lines[row.image] = row.line
+    return found

@@ -1,0 +1,190 @@
+"""Tables of photogrammetric programs: lines without header (BINGO, ORIMA, MicMac's OriExport), PATB, Inpho's project.
+
+Lines without header are `name x y z a1 a2 a3`. Nothing in them says what the angles are; omega, phi, kappa in degrees
+are taken unless one is beyond 360, which only gon are, and --pose-format opk-gon, pok or pok-gon say otherwise.
+
+PATB (three records of fixed width): number, x, y, z; a11 to a22; a23 to a33. Programs write the matrix in one direction
+or the other: the one is taken by which the flight goes along a side of the images.
+
+Inpho: $PHOTO ... $END with $PHOTO_FILE and $EXT_ORI: `focal x y z` and a matrix photo_from_world.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import PureWindowsPath
+
+import numpy as np
+
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import (
+    Source,
+    cells_of,
+    image_name,
+    is_number,
+    number,
+    numbers,
+    rotation_row,
+)
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
+from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+
+_NAMES = ("name", "x", "y", "z", "a1", "a2", "a3")
+_GON_DEG = 0.9
+_FULL_DEG = 360.0
+
+
+def is_plain_table(source: Source) -> bool:
+    records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
+    tables = [cells_of(record) for record in records]
+    return bool(tables) and all(
+        (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
+        or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
+        for cells in tables
+    )
+
+
+def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseList:
+    """order: "opk" or "pok". unit: "deg" or "gon". "" for what is usual. Raises ConfigError with line and column."""
+    table = []
+    for line, record in source.records():
+        cells = cells_of(record)
+        if len(cells) != len(_NAMES):
+            raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {', '.join(_NAMES)}")
+        comma = ";" in record or "\t" in record
+        values = [
+            number(source.at(line, name), cell, decimal_comma=comma)
+            for name, cell in zip(_NAMES[1:], cells[1:], strict=True)
+        ]
+        table.append((line, cells[0], values))
+    angles = np.array([values[3:] for _, _, values in table])
+    gon = unit == "gon" or (not unit and bool(len(angles)) and float(np.abs(angles).max()) > _FULL_DEG)
+    angles = angles * (_GON_DEG if gon else 1.0)
+    rows = []
+    for (line, name, values), (first, second, kappa) in zip(table, angles, strict=True):
+        numbered = is_number(name)
+        if order == "pok":
+            photo = rotation_y(first) @ rotation_x(second) @ rotation_z(kappa)
+            row = rotation_row(name, line, values[:3], CAM_FROM_PHOTO @ photo.T)
+        else:
+            row = PoseRow(
+                image=image_name(name), line=line, position=(values[0], values[1], values[2]), position_kind="grid",
+                attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
+            )  # fmt: skip
+        rows.append(PoseRow(**{**vars(row), "numbered": numbered}))
+    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {'gon' if gon else 'degrees'}"
+    remarks: tuple[str, ...] = ()
+    if not (order or unit):
+        remarks = (
+            f"{source.path.name}: no header says what the angles are; they are read as {words}; --pose-format opk, "
+            "opk-gon, pok or pok-gon reads them otherwise",
+        )
+    return PoseList(tuple(rows), "grid", remarks, f"table without header, {words}")
+
+
+read_opk, read_opk_gon = (
+    partial(read_plain_table, order="opk", unit="deg"),
+    partial(read_plain_table, order="opk", unit="gon"),
+)
+read_pok, read_pok_gon = (
+    partial(read_plain_table, order="pok", unit="deg"),
+    partial(read_plain_table, order="pok", unit="gon"),
+)
+
+
+def is_patb(source: Source) -> bool:
+    counts = [len(record.split()) for _, (_, record) in zip(range(6), source.records(), strict=False)]
+    return len(counts) >= 3 and counts[:3] == [4, 5, 4] and counts[3:] == [4, 5, 4][: len(counts) - 3]
+
+
+def read_patb(source: Source) -> PoseList:
+    """Raises ConfigError with line and column."""
+    records = list(source.records())
+    if len(records) % 3:
+        raise ConfigError(
+            f"{source.path}: {len(records)} lines, a photo has three (number and centre, two of the matrix)"
+        )
+    names, lines, centers, matrices = [], [], [], []
+    for start in range(0, len(records), 3):
+        parts = [(line, record.split()) for line, record in records[start : start + 3]]
+        for (line, cells), count in zip(parts, (4, 5, 4), strict=True):
+            if len(cells) != count:
+                raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {count}")
+        (line, first), (line1, second), (line2, third) = parts
+        names.append(first[0])
+        lines.append(line)
+        centers.append(numbers(source.at(line), first[1:], ("x", "y", "z")))
+        matrix = numbers(source.at(line1), second, ("a11", "a12", "a13", "a21", "a22"))
+        matrices.append(matrix + numbers(source.at(line2), third, ("a23", "a31", "a32", "a33")))
+    places, photos = np.array(centers), np.array(matrices).reshape(-1, 3, 3)
+    transposed = _along_track(places, photos.transpose(0, 2, 1)) > _along_track(places, photos)
+    world_from_photo = photos.transpose(0, 2, 1) if transposed else photos
+    rows = [
+        PoseRow(**{**vars(rotation_row(name, line, place, CAM_FROM_PHOTO @ matrix.T)), "numbered": is_number(name)})
+        for name, line, place, matrix in zip(names, lines, places, world_from_photo, strict=True)
+    ]
+    words = "matrix from ground to photo" if transposed else "matrix from photo to ground"
+    return PoseList(tuple(rows), "grid", (), f"PATB, {words}")
+
+
+def _along_track(centers_m: FloatArray, world_from_photo: FloatArray) -> float:
+    """How well steps from photo to photo go along a side of the images: 1 for all, 0.5 and less for none."""
+    steps = np.diff(centers_m, axis=0)
+    lengths = np.linalg.norm(steps[:, :2], axis=1)
+    far = lengths > 1e-6
+    if not far.any():
+        return 0.0
+    towards = np.einsum("nij,ni->nj", world_from_photo[:-1][far], steps[far] / lengths[far, None])
+    return float(np.median(np.abs(towards[:, :2]).max(axis=1)))
+
+
+def is_inpho(source: Source) -> bool:
+    return "$PHOTO_FILE" in source.text and "$EXT_ORI" in source.text
+
+
+def read_inpho(source: Source) -> PoseList:
+    """Raises ConfigError with file and line."""
+    turns = dict(_mounts(source.lines))
+    crs: str | None = None
+    kind: PositionKind = "grid"
+    stated = re.search(r"\$COORDINATE_SYSTEM\s*:\s*(\S.*)", source.text)
+    if stated and stated[1].strip().upper().startswith(("PROJCS", "PROJCRS", "EPSG", "GEOGCS", "GEOGCRS", "COMPD")):
+        crs, kind = described_crs(str(source.path), stated[1])
+    rows: list[PoseRow] = []
+    name, camera = "", ""
+    lines = list(source.records("%"))
+    for place, (line, text) in enumerate(lines):
+        key, _, value = (part.strip() for part in text.partition(":"))
+        if key == "$PHOTO_FILE":
+            name = PureWindowsPath(value.strip('"')).name
+        elif key == "$PHOTO_NUM" and not name:
+            name = value
+        elif key == "$CAMERA_ID":
+            camera = value
+        elif key == "$EXT_ORI":
+            following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
+            center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
+            photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])
+            at = (center[1], center[0], center[2]) if kind == "geographic" else center
+            rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, kind))
+        elif key == "$END":
+            name = ""
+    if not rows:
+        raise ConfigError(f"{source.path}: no photo of this Inpho project has $EXT_ORI: export it after orientation")
+    return PoseList(tuple(rows), kind, (), f"Inpho project, {crs or 'its coordinate system is not stated'}", crs)
+
+
+def _mounts(lines: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """Camera -> $CAMERA_MOUNT_ROTATION in degrees."""
+    camera = ""
+    for text in lines:
+        key, _, value = (part.strip() for part in text.partition(":"))
+        if key == "$CAMERA_ID":
+            camera = value
+        elif key == "$CAMERA_MOUNT_ROTATION" and is_number(value):
+            yield camera, float(value)
