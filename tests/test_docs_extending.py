@@ -18,6 +18,7 @@ from make_features import described
 from read_pages import ROOT, text_of
 from test_export_colmap import make_truth
 
+from aeromatch_cli.blocks.pose_files.source import Source
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.data import Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
@@ -84,19 +85,20 @@ def test_the_pose_format_is_read(made: dict[str, Any], tmp_path: Path) -> None:
     point = {"type": "Point", "coordinates": [13.4, 52.5, 142.0]}
     angles = {"yaw": 350.0, "pitch": -90.0, "roll": 0.0}
     features = [
-        {"type": "Feature", "geometry": point, "properties": {"filename": "a.jpg", **angles}},
-        {"type": "Feature", "geometry": point, "properties": {"filename": "b.jpg"}},
+        {"type": "Feature", "geometry": point, "properties": {"image": "a.jpg", **angles}},
+        {"type": "Feature", "geometry": point, "properties": {"image": "b.jpg"}},
     ]
     path = tmp_path / "shots.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
-    read = made["geojson_poses"].read_geojson
-    first, second = read(path).rows
+    reader = made["geojson_poses"]
+    assert reader.is_geojson(Source(path))
+    first, second = reader.read_geojson(Source(path)).rows
     assert (first.image, first.position, first.position_kind) == ("a.jpg", (52.5, 13.4, 142.0), "geographic")
     assert (first.attitude, first.attitude_kind) == ((350.0, -90.0, 0.0), "yaw_pitch_roll")
     assert (second.attitude, second.attitude_kind) == (None, "none")
     path.write_text('{"features": [{"properties": {}}]}', encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"shots\.geojson, feature 1: needs properties\.filename"):
-        read(path)
+    with pytest.raises(ConfigError, match=r"shots\.geojson, feature 1: needs properties\.image"):
+        reader.read_geojson(Source(path))
 
 
 def test_the_exporter_writes_every_verified_match(made: dict[str, Any], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
 from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.formats.features import read_keypoints
@@ -64,8 +65,14 @@ def _contents(
     pairs: Iterable[PairContents],
     adjusted: AdjustedBlock | None,
 ) -> ExportContents:
-    given = context.given.poses
-    return ExportContents(context.block, keypoints_px, pairs, context.guessed_cameras, given, adjusted)
+    block, given = context.block, context.given.poses
+
+    def geographic(world_m: FloatArray) -> FloatArray:
+        places_m = world_m + np.array(block.origin_m)
+        return np.column_stack([geographic_from_grid(block.crs, places_m[:, :2]), places_m[:, 2]])
+
+    known = None if block.crs == LOCAL else geographic
+    return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known)
 
 
 def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:

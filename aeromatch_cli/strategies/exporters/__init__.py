@@ -9,9 +9,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.blocks_exchange import BlocksExchange
+from aeromatch_cli.strategies.exporters.bundler import Bundler
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents
+from aeromatch_cli.strategies.exporters.geojson import GeoJson
+from aeromatch_cli.strategies.exporters.micmac import MicMac
+from aeromatch_cli.strategies.exporters.openmvg import OpenMvg
+from aeromatch_cli.strategies.exporters.opensfm import OpenSfm
+from aeromatch_cli.strategies.exporters.tracks import Tracks
 
-EXPORTERS: Mapping[str, type[Strategy]] = {"colmap": Colmap}
+EXPORTERS: Mapping[str, type[Strategy]] = {
+    "colmap": Colmap,
+    "opensfm": OpenSfm,
+    "micmac": MicMac,
+    "openmvg": OpenMvg,
+    "bundler": Bundler,
+    "blocks-exchange": BlocksExchange,
+    "geojson": GeoJson,
+    "tracks": Tracks,
+}
 
 __all__ = ["EXPORTERS", "Colmap", "ExportContents", "ExportSummary", "PairContents"]

@@ -35,7 +35,8 @@ class ExportContents:
     image without features. pairs: each pair at most once, in the order of pairs.csv; only iterated once.
     guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
     positions: image_id -> position as it was given, with its standard deviation; None: those of the block. adjusted:
-    the block after bundle adjustment, or None.
+    the block after bundle adjustment, or None. geographic: world (N, 3) -> WGS84 latitude, longitude in degrees and
+    height (N, 3); None in a local frame.
     """
 
     block: Block
@@ -44,6 +45,7 @@ class ExportContents:
     guessed_cameras: frozenset[str] = frozenset()
     positions: Mapping[str, Pose] | None = None
     adjusted: AdjustedBlock | None = None
+    geographic: Callable[[FloatArray], FloatArray] | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,85 @@
+"""GeoJSON for maps (QGIS and others): camera positions, footprints, and pairs with their matches.
+
+RFC 7946: longitude and latitude, WGS84, rings counter-clockwise. A local block has none: its files hold metres of the
+block's own frame, which a map shows in a project without CRS.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+
+# Images with fewer verified matches hang loosely on the block.
+_WEAK_MATCHES = 50
+
+
+class GeoJson(Strategy):
+    """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches."""
+
+    version: ClassVar[int] = 1
+    name: Literal["geojson"] = "geojson"
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written."""
+        solution = Solution.of(contents)
+        names = {image.image_id: image.name for image in solution.images}
+        positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
+        positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
+        with whole_folder(folder) as partial:
+            found = matched(contents)
+            ties: Counter[str] = Counter()
+            links = []
+            for id0, id1, rows in found.pairs:
+                ties.update({id0: len(rows), id1: len(rows)})
+                if id0 in positions and id1 in positions:
+                    line = _places(contents, np.array([positions[id0], positions[id1]]))[:, :2].tolist()
+                    facts = {"image0": names[id0], "image1": names[id1], "matches": len(rows)}
+                    links.append(_feature("LineString", line, facts))
+            cameras = [
+                _feature(
+                    "Point", _places(contents, center_m[None])[0].tolist(),
+                    {"image": names[i], "matches": ties[i], "weak": ties[i] < _WEAK_MATCHES,
+                     "oriented": i in solution.poses},
+                )
+                for i, center_m in sorted(positions.items())
+            ]  # fmt: skip
+            areas = [
+                _feature("Polygon", [_ring(contents, footprint.polygon_m)], {"image": names[i], "matches": ties[i]})
+                for i, footprint in sorted(block_footprints(contents.block).items())
+            ]
+            for name, features in (("cameras", cameras), ("footprints", areas), ("pairs", links)):
+                write(partial / f"{name}.geojson", json.dumps({"type": "FeatureCollection", "features": features}))
+            count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
+            return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
+
+
+def _places(contents: ExportContents, world_m: FloatArray) -> FloatArray:
+    """(N, 3) longitude, latitude, height; in a local frame x, y, z."""
+    if contents.geographic is None:
+        return np.asarray(np.round(world_m, 4))
+    latitude, longitude, height = contents.geographic(world_m).T
+    return np.column_stack([np.round(longitude, 9), np.round(latitude, 9), np.round(height, 4)])
+
+
+def _ring(contents: ExportContents, polygon_m: FloatArray) -> list[list[float]]:
+    """Closed and counter-clockwise."""
+    x, y = polygon_m[:, 0], polygon_m[:, 1]
+    turned = float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) < 0.0
+    corners = polygon_m[::-1] if turned else polygon_m
+    flat = _places(contents, np.column_stack([corners[:, :2], np.zeros(len(corners))]))[:, :2].tolist()
+    return [*flat, flat[0]]
+
+
+def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}

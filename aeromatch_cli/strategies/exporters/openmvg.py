@@ -1,0 +1,102 @@
+"""openMVG and, with the same kinds of file, AliceVision: sfm_data.json, features, matches.
+
+Text: `<image>.feat` x y scale orientation; `matches.f.txt` with I J, the number of matches, and index pairs
+(src/openMVG/matching/indMatch_utils.cpp). Rotations are cam_from_world, pixels count from the middle of the first one.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from aeromatch_cli.data import Camera
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+
+# cereal's marks: a plain view, a new object, a new kind of object.
+_PLAIN, _NEW, _NEW_KIND = 1073741824, 2147483648, 2147483649
+_SCALE = "1 0"
+
+
+class OpenMvg(Strategy):
+    """Writes sfm_data.json (views, intrinsics, poses) and matches/ (features, matches.f.txt, image_describer.json)."""
+
+    version: ClassVar[int] = 1
+    name: Literal["openmvg"] = "openmvg"
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written, or two images have one name without suffix."""
+        solution = Solution.of(contents)
+        stems = [PurePosixPath(image.name).stem for image in solution.images]
+        if len(set(stems)) < len(stems):
+            twice = next(stem for stem in stems if stems.count(stem) > 1)
+            raise WorkspaceError(
+                f"openMVG names features by file names, and several images are called {twice}: rename them"
+            )
+        numbers = {image.image_id: number for number, image in enumerate(solution.images)}
+        with whole_folder(folder) as partial:
+            found = matched(contents)
+            keypoints = 0
+            for image, stem in zip(solution.images, stems, strict=True):
+                places = np.asarray(contents.keypoints_px(image.image_id), np.float64).reshape(-1, 2)
+                keypoints += len(places)
+                write(partial / "matches" / f"{stem}.feat", "".join(f"{x:.4f} {y:.4f} {_SCALE}\n" for x, y in places))
+            blocks = (
+                f"{numbers[id0]} {numbers[id1]}\n{len(rows)}\n" + "".join(f"{i} {j}\n" for i, j in rows)
+                for id0, id1, rows in found.pairs
+            )
+            write(partial / "matches" / "matches.f.txt", "".join(blocks))
+            write(
+                partial / "matches" / "image_describer.json",
+                json.dumps({"regions_type": _kind("SIFT_Regions")}, indent=1),
+            )
+            write(partial / "sfm_data.json", json.dumps(_sfm_data(solution), indent=1))
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+
+
+def _kind(name: str) -> dict[str, Any]:
+    return {"polymorphic_id": _NEW_KIND, "polymorphic_name": name, "ptr_wrapper": {"valid": 1, "data": {}}}
+
+
+def _sfm_data(solution: Solution) -> dict[str, Any]:
+    cameras = {camera_id: number for number, camera_id in enumerate(sorted(solution.cameras))}
+    views, poses = [], []
+    for number, image in enumerate(solution.images):
+        posed, path = image.image_id in solution.poses, PurePosixPath(image.name)
+        data = {
+            "local_path": str(path.parent).removeprefix("."), "filename": path.name,
+            "width": image.width_px, "height": image.height_px, "id_view": number,
+            "id_intrinsic": cameras[image.camera_id], "id_pose": number,
+        }  # fmt: skip
+        views.append(
+            {"key": number, "value": {"polymorphic_id": _PLAIN, "ptr_wrapper": {"id": _NEW + number + 1, "data": data}}}
+        )
+        if posed:
+            rotation, center_m = solution.poses[image.image_id]
+            poses.append({"key": number, "value": {"rotation": rotation.tolist(), "center": center_m.tolist()}})
+    intrinsics = [
+        {"key": number, "value": _intrinsic(solution.cameras[camera_id], first=not number)}
+        for camera_id, number in cameras.items()
+    ]
+    return {
+        "sfm_data_version": "0.3", "root_path": "images", "views": views, "intrinsics": intrinsics, "extrinsics": poses,
+        "structure": [], "control_points": [],
+    }  # fmt: skip
+
+
+def _intrinsic(camera: Camera, *, first: bool) -> dict[str, Any]:
+    """Brown's model; its name stands at the first camera alone, as cereal writes it."""
+    values = parameters(camera)
+    data = {
+        "width": camera.width_px, "height": camera.height_px, "focal_length": values["fx"],
+        "principal_point": [values["cx"], values["cy"]],
+        "disto_t2": [values["k1"], values["k2"], 0.0, values["p1"], values["p2"]],
+    }  # fmt: skip
+    mark = {"polymorphic_id": _NEW_KIND, "polymorphic_name": "pinhole_brown_t2"} if first else {"polymorphic_id": 1}
+    return {**mark, "ptr_wrapper": {"id": _NEW_KIND, "data": data}}

@@ -1,0 +1,140 @@
+"""OpenSfM and ODM: features, matches, tracks and metadata of a project, for create_tracks and reconstruct.
+
+Pixels (opensfm/features.py): u = (x + 0.5 - w / 2) / max(w, h) of x from the centre of the first pixel; the same for
+v. tracks.csv is version 2 (src/map/src/tracks_manager.cc). Matches are pickled under numpy 1's module names, which
+both OpenSfM and ODM's fork load. GPS positions are those that were given.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import pickle
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from aeromatch_cli.data import Camera, FloatArray, Image
+from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+
+_TRACKS_HEAD = "OPENSFM_TRACKS_VERSION_v2\n"
+_FEATURES_VERSION = 3
+# The size of a keypoint is not handed on; nothing after matching reads it.
+_SIZE_PX = 4.0
+_GREY = 128
+_CONFIG = "# Features, matches and tracks are those of aeromatch.\nmin_track_length: 2\n"
+
+
+class OpenSfm(Strategy):
+    """Writes features, matches, tracks.csv, exif, camera_models.json, reference_lla.json and config.yaml of an OpenSfM
+    project; put the images beside them as `images`."""
+
+    version: ClassVar[int] = 1
+    name: Literal["opensfm"] = "opensfm"
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written."""
+        solution = Solution.of(contents)
+        with whole_folder(folder) as partial:
+            found = matched(contents)
+            places = {i.image_id: _normalised(contents, i) for i in solution.images}
+            for image in solution.images:
+                _write_features(partial / "features" / f"{image.name}.features.npz", places[image.image_id], image)
+            _write_matches(partial / "matches", found, {i.image_id: i.name for i in solution.images})
+            write(partial / "tracks.csv", _tracks_text(found, solution, places))
+            write(partial / "image_list.txt", "".join(f"images/{image.name}\n" for image in solution.images))
+            write(partial / "config.yaml", _CONFIG)
+            _write_metadata(partial, contents, solution)
+            keypoints = sum(map(len, places.values()))
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+
+
+def _normalised(contents: ExportContents, image: Image) -> FloatArray:
+    places = np.asarray(contents.keypoints_px(image.image_id), np.float64).reshape(-1, 2)
+    size = np.array([image.width_px, image.height_px])
+    return np.asarray((places + 0.5 - size / 2.0) / size.max())
+
+
+def _write_features(path: Path, places: FloatArray, image: Image) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    size = np.full(len(places), _SIZE_PX / max(image.width_px, image.height_px))
+    points = np.column_stack([places, size, np.zeros(len(places))]).astype(np.float32)
+    np.savez_compressed(
+        path, points=points, descriptors=np.zeros((len(places), 1), np.uint8),
+        colors=np.full((len(places), 3), _GREY, np.uint8), segmentations=np.zeros(0), instances=np.zeros(0),
+        segmentation_labels=np.zeros(0), OPENSFM_FEATURES_VERSION=_FEATURES_VERSION,
+    )  # fmt: skip
+
+
+def _write_matches(folder: Path, found: Matched, names: dict[str, str]) -> None:
+    of_image: dict[str, dict[str, Any]] = {image_id: {} for image_id in names}
+    for id0, id1, rows in found.pairs:
+        of_image[id0][names[id1]] = np.ascontiguousarray(rows, np.int32)
+    for image_id, matches in of_image.items():
+        # Protocol 2 names modules in plain text, so that they can be those of numpy 1.
+        raw = pickle.dumps(matches, protocol=2).replace(b"numpy._core.", b"numpy.core.")
+        path = folder / f"{names[image_id]}_matches.pkl.gz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(gzip.compress(raw, mtime=0))
+
+
+def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArray]) -> str:
+    lines = [_TRACKS_HEAD]
+    longer = [max(image.width_px, image.height_px) for image in solution.images]
+    for track, image_idx, keypoint in zip(found.track, found.image_idx, found.keypoint, strict=True):
+        image = solution.images[image_idx]
+        x, y = places[image.image_id][keypoint]
+        scale = _SIZE_PX / longer[image_idx]
+        colour = f"{_GREY}\t{_GREY}\t{_GREY}"
+        lines.append(f"{image.name}\t{track}\t{keypoint}\t{x:.9g}\t{y:.9g}\t{scale:.9g}\t{colour}\t-1\t-1\n")
+    return "".join(lines)
+
+
+def _write_metadata(partial: Path, contents: ExportContents, solution: Solution) -> None:
+    models = {camera_id: camera_model(camera) for camera_id, camera in solution.cameras.items()}
+    keys = {camera_id: f"v2 aeromatch {camera_id} {m['width']} {m['height']} brown" for camera_id, m in models.items()}
+    write(partial / "camera_models.json", _json({keys[camera_id]: model for camera_id, model in models.items()}))
+    given = contents.block.poses if contents.positions is None else contents.positions
+    gps: dict[str, dict[str, float]] = {}
+    if contents.geographic is not None and given:
+        ids = sorted(given)
+        for image_id, (latitude, longitude, height) in zip(
+            ids, contents.geographic(np.array([given[i].center_m for i in ids])).tolist(), strict=True
+        ):
+            sigma = given[image_id].sigma_position_m
+            gps[image_id] = {"latitude": latitude, "longitude": longitude, "altitude": height, "dop": float(sigma)}
+    for image in solution.images:
+        model = models[image.camera_id]
+        exif = {
+            "make": "aeromatch", "model": image.camera_id, "width": image.width_px, "height": image.height_px,
+            "projection_type": "brown", "focal_ratio": model["focal_x"], "orientation": 1, "capture_time": 0.0,
+            "camera": keys[image.camera_id], "skey": "", "gps": gps.get(image.image_id, {}),
+        }  # fmt: skip
+        write(partial / "exif" / f"{image.name}.exif", _json(exif))
+    means = (
+        [float(np.mean([place[key] for place in gps.values()])) for key in ("latitude", "longitude")]
+        if gps
+        else [0.0] * 2
+    )
+    write(partial / "reference_lla.json", _json({"latitude": means[0], "longitude": means[1], "altitude": 0.0}))
+
+
+def camera_model(camera: Camera) -> dict[str, Any]:
+    """OpenSfM's `brown`: lengths as shares of the longer side, the principal point from the middle of the image."""
+    values, longer = parameters(camera), max(camera.width_px, camera.height_px)
+    middle = camera.width_px / 2.0 - COLMAP_OFFSET_PX, camera.height_px / 2.0 - COLMAP_OFFSET_PX
+    return {
+        "projection_type": "brown", "width": camera.width_px, "height": camera.height_px,
+        "focal_x": values["fx"] / longer, "focal_y": values["fy"] / longer, "c_x": (values["cx"] - middle[0]) / longer,
+        "c_y": (values["cy"] - middle[1]) / longer, "k1": values["k1"], "k2": values["k2"], "k3": 0.0,
+        "p1": values["p1"], "p2": values["p2"],
+    }  # fmt: skip
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, indent=1) + "\n"

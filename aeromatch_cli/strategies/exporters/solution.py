@@ -1,0 +1,132 @@
+"""What several exporters write in their own ways: oriented images, tracks of verified matches, whole text files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from aeromatch_cli.data import Camera, FloatArray, Image, IntArray
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Cameras and poses after adjustment, else as the block has them.
+
+    images: all, sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> ((3, 3) cam_from_world, (3,)
+    centre in the world); images without attitude are absent.
+    """
+
+    images: tuple[Image, ...]
+    cameras: Mapping[str, Camera]
+    poses: Mapping[str, tuple[FloatArray, FloatArray]]
+
+    @classmethod
+    def of(cls, contents: ExportContents) -> Solution:
+        block, adjusted = contents.block, contents.adjusted
+        if adjusted is not None:
+            poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items()}
+            return cls(block.images, adjusted.cameras, poses)
+        given = {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
+        return cls(block.images, block.cameras, given)
+
+    def camera(self, image: Image) -> Camera:
+        return self.cameras[image.camera_id]
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Verified pairs and what follows from all of them, in memory.
+
+    pairs: (image_id0, image_id1, (V, 2) keypoint indices). image_ids: sorted. track, image_idx, keypoint: (N,) of every
+    observation, sorted by track, then image; tracks are numbered from 0. points_m: (T, 3), NaN where none is known.
+    counts: of the summary.
+    """
+
+    pairs: Sequence[tuple[str, str, IntArray]]
+    image_ids: Sequence[str]
+    track: IntArray
+    image_idx: IntArray
+    keypoint: IntArray
+    points_m: FloatArray
+    counts: Mapping[str, int]
+
+    @property
+    def starts(self) -> IntArray:
+        """(T + 1,): the observations of track t are starts[t] to starts[t + 1]."""
+        return np.asarray(np.searchsorted(self.track, np.arange(len(self.points_m) + 1)))
+
+
+def matched(contents: ExportContents, *, adjusted_tracks: bool = False) -> Matched:
+    """Tracks of all verified matches; two keypoints of one image in a track contradict each other and end it.
+
+    adjusted_tracks: those of the adjusted block instead, where there is one, with their points.
+    """
+    ids = [image.image_id for image in contents.block.images]
+    place = {image_id: number for number, image_id in enumerate(ids)}
+    pairs, counts = [], dict.fromkeys(("matched_pairs", "matches", "verified_pairs", "verified_matches"), 0)
+    for item in contents.pairs:
+        counts["matched_pairs"] += len(item.matches) > 0
+        counts["matches"] += len(item.matches)
+        counts["verified_pairs"] += len(item.verified) > 0
+        counts["verified_matches"] += len(item.verified)
+        if len(item.verified):
+            pairs.append((item.pair.image_id0, item.pair.image_id1, np.asarray(item.verified, np.int64)))
+    if adjusted_tracks and contents.adjusted is not None:
+        found = contents.adjusted.tracks
+        rows = [np.column_stack([np.full(len(t), place[i]), t]) for i, t in found.items()]
+        table = np.concatenate([np.zeros((0, 3), np.int64), *rows])
+        order = np.lexsort((table[:, 1], table[:, 0], table[:, 2]))
+        image_idx, keypoint, track = table[order].T
+        return Matched(pairs, ids, track, image_idx, keypoint, contents.adjusted.points_m, counts)
+    image_idx, keypoint, track = _joined(pairs, place)
+    points = np.full((int(track.max(initial=-1)) + 1, 3), np.nan)
+    return Matched(pairs, ids, track, image_idx, keypoint, points, counts)
+
+
+def _joined(
+    pairs: Sequence[tuple[str, str, IntArray]], place: Mapping[str, int]
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Image, keypoint and track of every observation, by connected components of the matches."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not pairs:
+        return (np.zeros(0, np.int64),) * 3
+    ends = [
+        np.concatenate(
+            [np.column_stack([np.full(len(rows), place[names[side]]), rows[:, side]]) for *names, rows in pairs]
+        )
+        for side in range(2)
+    ]
+    nodes, inverse = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
+    first, second = np.split(inverse.ravel(), 2)
+    edges = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(len(nodes),) * 2)
+    _, label = connected_components(edges, directed=False)
+    # A track that sees one image twice is none.
+    seen, times = np.unique(np.column_stack([label, nodes[:, 0]]), axis=0, return_counts=True)
+    bad = np.unique(seen[times > 1, 0])
+    good = ~np.isin(label, bad)
+    _, track = np.unique(label[good], return_inverse=True)
+    order = np.lexsort((nodes[good, 0], track))
+    return nodes[good, 0][order], nodes[good, 1][order], track[order]
+
+
+def summary_of(
+    folder: Path, partial: Path, contents: ExportContents, posed: int, keypoints: int, counts: Mapping[str, int]
+) -> ExportSummary:
+    """partial: the scratch folder that holds the files now."""
+    names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
+    return ExportSummary(
+        files=tuple(folder / name for name in names), images=len(contents.block.images), posed_images=posed,
+        keypoints=keypoints, **counts,
+    )  # fmt: skip
+
+
+def write(path: Path, text: str) -> None:
+    """With the folders above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
