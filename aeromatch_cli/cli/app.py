@@ -12,6 +12,8 @@ from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
 from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, synth
+from aeromatch_cli.cli.look_commands import EXAMPLES as LOOK_EXAMPLES
+from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.output import ARGUMENTS, as_epilog
 from aeromatch_cli.cli.stage_commands import STAGES, stage_command
 from aeromatch_cli.errors import ConfigError
@@ -46,7 +48,6 @@ class _Commands(TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -63,6 +64,8 @@ app.add_typer(weights_app, name="weights")
 
 for _name, (_help, _examples) in STAGES.items():
     app.command(_name, help=_help, epilog=as_epilog(_examples))(stage_command(_name))
+for _name, _look in LOOK.items():
+    app.command(_name, epilog=as_epilog(LOOK_EXAMPLES[_name]))(_look)
 app.command(epilog=as_epilog(EXAMPLES["evaluate"]))(evaluate)
 app.command(epilog=as_epilog(EXAMPLES["synth"]))(synth)
 for _name, (_help, _command) in WEIGHTS.items():

@@ -33,7 +33,7 @@ T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
 COVERAGE_CELLS = 16
 NOT_JUDGED = "not judged"
-_STAGE_ORDER = (
+STAGE_ORDER = (
     "orient",
     "pairs",
     "enhance",
@@ -277,7 +277,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         report = read_json(path)
         groups.setdefault((str(report["stage"]), sharded), []).append(report)
 
-    order = {name: place for place, name in enumerate(_STAGE_ORDER)}
+    order = {name: place for place, name in enumerate(STAGE_ORDER)}
     rows = []
     for name, sharded in sorted(groups, key=lambda key: (order.get(key[0], len(order)), key)):
         # The report stage is running now: what is on file of it is about an earlier page.

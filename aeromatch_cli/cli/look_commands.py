@@ -1,0 +1,151 @@
+"""The commands that look: at a workspace, at two, at settings and what can be chosen; and `init`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aeromatch_cli import DEFAULT_PRESET
+from aeromatch_cli.cli.options import Config, Images, Json, Quiet, Set
+from aeromatch_cli.cli.output import guarded
+from aeromatch_cli.errors import ConfigError
+
+if TYPE_CHECKING:
+    from aeromatch_cli.stages.run import Result
+
+EXAMPLES: Mapping[str, Sequence[str]] = {
+    "show": (
+        "aeromatch show WORK",
+        "aeromatch show WORK DJI_0001.JPG DJI_0002.JPG --rejected",
+    ),
+    "compare": ("aeromatch compare WORK1 WORK2",),
+    "config": ("aeromatch config", "aeromatch config fusion --set extract.keypoints=12000"),
+    "list": ("aeromatch list", "aeromatch list match"),
+    "init": ("aeromatch init --images IMGS", "aeromatch init block.yaml --images IMGS"),
+}
+
+
+def show(
+    context: typer.Context,
+    path: Annotated[Path, typer.Argument(metavar="WORK|FILE", help="Workspace, or a .npz, .json or .csv file of one.")],
+    images: Annotated[
+        list[str] | None, typer.Argument(metavar="[IMAGE [IMAGE]]", help="One image, or the two of a pair.")
+    ] = None,
+    rejected: Annotated[bool, typer.Option("--rejected", help="Draw the matches that were dropped, too.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.png", help="Picture (default: in the folder WORK/show).")
+    ] = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Show a workspace, an image, a pair or a file, in words and as a picture."""
+
+    def call() -> Result:
+        from aeromatch_cli.report.show import show as shown
+        from aeromatch_cli.stages.run import Result
+
+        names = images or []
+        if len(names) > 2:
+            raise ConfigError(f"{len(names)} images: name one, or the two of a pair")
+        if out is not None and out.suffix.lower() != ".png":
+            raise ConfigError(f"--out {out}: the picture is a PNG, name it FILE.png")
+        found = shown(path, names, out, rejected=rejected)
+        return Result(tuple(found.lines), found.facts)
+
+    guarded(call, "show", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+def compare(
+    context: typer.Context,
+    first: Annotated[Path, typer.Argument(metavar="WORK1", help="Workspace.")],
+    second: Annotated[Path, typer.Argument(metavar="WORK2", help="Another workspace of the same block.")],
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare two workspaces: settings, pairs, matches, time."""
+
+    def call() -> Result:
+        from aeromatch_cli.report.compare import compare as compared
+        from aeromatch_cli.stages.run import Result
+
+        lines, facts = compared(first, second)
+        return Result(tuple(lines), facts)
+
+    guarded(call, "compare", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+def config(
+    context: typer.Context,
+    source: Config = None,
+    set_: Set = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Print all settings of a preset or YAML file."""
+
+    def call() -> Result:
+        from aeromatch_cli.config import load
+        from aeromatch_cli.config.overview import whole_settings
+        from aeromatch_cli.stages.run import Result
+
+        tree = load(source or DEFAULT_PRESET, set_ or ()).model_dump(mode="json")
+        return Result(tuple(whole_settings(tree).splitlines()), {"settings": tree})
+
+    guarded(call, "config", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+def list_(
+    context: typer.Context,
+    family: Annotated[
+        str, typer.Argument(metavar="[FAMILY]", help="presets, or a family of strategies such as match.")
+    ] = "",
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """List presets and strategies, one line each."""
+
+    def call() -> Result:
+        from aeromatch_cli.config.overview import listing
+        from aeromatch_cli.stages.run import Result
+
+        lines = listing(family)
+        return Result(tuple(lines), {"lines": lines})
+
+    guarded(call, "list", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+def init(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(metavar="[FILE]", help="Settings file to write.")] = Path("aeromatch.yaml"),
+    images: Images = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write a commented settings file for a folder of images."""
+
+    def call() -> Result:
+        from aeromatch_cli.config.overview import first_settings
+        from aeromatch_cli.stages.run import Result
+        from aeromatch_cli.workspace import write_text
+
+        if images is None:
+            raise ConfigError("no images: give --images DIR")
+        if out.exists():
+            raise ConfigError(f"{out} exists and is not replaced: give another name, or delete it")
+        text, found = first_settings(images, out.absolute().parent)
+        write_text(out, text)
+        return Result((*found, f"written to {out}: aeromatch run {out}"), {"file": str(out), "found": found})
+
+    guarded(call, "init", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+LOOK: Mapping[str, Callable[..., None]] = {
+    "show": show,
+    "compare": compare,
+    "config": config,
+    "list": list_,
+    "init": init,
+}

@@ -1,0 +1,159 @@
+"""What can be chosen: presets, families of strategies, and a first settings file for a folder of images."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli import DEFAULT_PRESET
+from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
+from aeromatch_cli.blocks.pose_files import POSE_FORMATS
+from aeromatch_cli.blocks.pose_files.source import Source
+from aeromatch_cli.blocks.scan import scan_images
+from aeromatch_cli.config.faults import nearest
+from aeromatch_cli.config.load import differences_of_preset, preset_names
+from aeromatch_cli.config.schema import FAMILIES, Settings
+from aeromatch_cli.config.text import first_sentence
+from aeromatch_cli.errors import ConfigError, InputError
+
+_PRESETS = "presets"
+# So many headers tell what the others hold.
+_LOOKED_AT = 20
+# Files that may hold poses, by suffix: others are not opened.
+_POSE_SUFFIXES = (".csv", ".txt", ".json", ".geojson", ".xml", ".mrk", ".prj", ".ori", ".nvm", ".out", ".bin")
+_LARGEST_BYTES = 50_000_000
+
+
+def listing(family: str = "") -> list[str]:
+    """Presets with their purpose and every family with its strategies; of one family alone where it is named.
+
+    Raises ConfigError where there is no such family.
+    """
+    if family and family not in (_PRESETS, *FAMILIES):
+        hint = nearest(family, (_PRESETS, *FAMILIES), otherwise="")
+        raise ConfigError(f"no family is called {family!r}: there are {', '.join((_PRESETS, *FAMILIES))}{hint}")
+    lines: list[str] = []
+    if family in ("", _PRESETS):
+        lines += ["presets: aeromatch run PRESET", *_table(_purposes())]
+    for name, table in FAMILIES.items():
+        if family in ("", name):
+            chosen = _chosen(name)
+            title = f"{name}: --set {name}={next(iter(table))}"
+            marked = {key + (" *" if key in chosen else ""): first_sentence(table[key]) for key in table}
+            lines += ["", title, *_table(marked)]
+    return [*lines, "", f"* default (preset {DEFAULT_PRESET} adds a cascade)"] if not family else lines
+
+
+def _purposes() -> dict[str, str]:
+    names = [name for name in preset_names() if name != "default"]
+    order = sorted(names, key=lambda name: (name != DEFAULT_PRESET, name))
+    return {name: differences_of_preset(name)[0] for name in order}
+
+
+def _chosen(family: str) -> set[str]:
+    value = getattr(Settings(), family)
+    return {one.name for one in (value if isinstance(value, tuple) else (value,))}
+
+
+def _table(rows: Mapping[str, str]) -> list[str]:
+    width = max(map(len, rows), default=0)
+    return [f"  {name:<{width}}  {words}" for name, words in rows.items()]
+
+
+def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
+    """A YAML settings file for these images, commented, and what was seen, in words. folder: where it will lie.
+
+    Raises InputError where the folder holds no image.
+    """
+    names, _ = scan_images(images, [])
+    if not names:
+        raise InputError(f"no image (jpg, jpeg, png, tif, tiff) in {images}: check --images")
+    looked = [exif_or_reason(images / name) for name in names[:: max(1, len(names) // _LOOKED_AT)][:_LOOKED_AT]]
+    facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
+    found = [f"{len(names)} images", *_seen(facts)]
+    poses = list(_pose_files(images))
+    found += [f"pose file {path}: {title}" for path, title in poses]
+    text = _settings_text(_below(images, folder), facts, [(_below(p, folder), title) for p, title in poses], found)
+    return text, found
+
+
+def _below(path: Path, folder: Path) -> str:
+    try:
+        return path.resolve().relative_to(folder.resolve()).as_posix()
+    except ValueError:
+        return str(path.resolve())
+
+
+def _seen(facts: list[ExifFacts]) -> Iterator[str]:
+    """Cameras, positions and angles of the headers that were looked at."""
+    cameras = Counter(
+        f"{' '.join(filter(None, (fact.make, fact.model))) or 'camera unknown'} {fact.width_px} x {fact.height_px}"
+        for fact in facts
+    )
+    for camera, _ in cameras.most_common(5):
+        yield f"camera {camera}"
+    positions, angles = sum(f.latitude_deg is not None for f in facts), sum(f.angles is not None for f in facts)
+    if facts:
+        yield f"GPS position in {positions} of {len(facts)} headers, angles in {angles}"
+
+
+def _pose_files(images: Path) -> Iterator[tuple[Path, str]]:
+    """Files in the folder and beside it that a reader knows."""
+    for folder in dict.fromkeys((images, images.parent)):
+        for path in sorted(folder.iterdir()):
+            if not path.is_file() or path.suffix.lower() not in _POSE_SUFFIXES or path.stat().st_size > _LARGEST_BYTES:
+                continue
+            source = Source(path)
+            for known in POSE_FORMATS.values():
+                if known.recognises is not None and known.recognises(source):
+                    yield path, known.title
+                    break
+
+
+def _settings_text(images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], found: list[str]) -> str:
+    located = any(fact.latitude_deg is not None for fact in facts)
+    chosen = poses[0][0] if poses else "exif" if located else "none"
+    others = "".join(f"  # poses: {_scalar(path)}  # {title}\n" for path, title in poses[1:])
+    seen = "".join(f"#   {line}\n" for line in found)
+    return f"""# Settings of aeromatch for one block: aeromatch run FILE. Paths are relative to this file.
+{seen}
+# Every setting: aeromatch config, docs/configuration.md. Presets and strategies: aeromatch list.
+preset: {DEFAULT_PRESET}
+workspace: work
+
+block:
+  images: {_scalar(images)}
+  # A pose file of any program, exif (GPS and angles of the images), or none.
+  poses: {_scalar(chosen)}
+{others}  # exif, folder (one camera per folder), or a file: COLMAP's cameras.txt, YAML, JSON.
+  cameras: exif
+  # auto: the UTM zone of the positions, or what the pose file states.
+  crs: auto
+  # Metres, a DEM file, or auto: the terrain that the pictures show.
+  ground: auto
+  # Folder of masks in COLMAP's naming, or one mask for all images.
+  # masks: masks
+  # Ground control points (ODM's gcp_list.txt).
+  # gcp: gcp_list.txt
+
+# More keypoints: more matches, more time.
+# extract: {{keypoints: 12000}}
+
+export: colmap
+# export: colmap+opensfm+geojson
+"""
+
+
+def _scalar(text: str) -> str:
+    import yaml
+
+    return yaml.safe_dump(text, default_flow_style=True, allow_unicode=True).splitlines()[0].strip()
+
+
+def whole_settings(tree: Mapping[str, Any]) -> str:
+    """A tree of settings as YAML."""
+    import yaml
+
+    return yaml.safe_dump(dict(tree), sort_keys=False, width=100, allow_unicode=True)

@@ -1,0 +1,253 @@
+"""What a workspace, one of its images, a pair or a file holds, in words; pictures of images and pairs."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.config import load
+from aeromatch_cli.data import Camera, FloatArray, Image, Pair, Pose
+from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
+from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
+from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
+from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.report.pictures import image_picture, pair_picture, write_picture
+from aeromatch_cli.report.rows import STAGE_ORDER
+from aeromatch_cli.stages.consistency import FinalEntries
+from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.workspace import Workspace, read_json
+
+# Partners that are listed one by one.
+_LISTED = 30
+
+
+@dataclass(frozen=True)
+class Shown:
+    """lines: in words. facts: the same for machines. picture: the PNG that was written, None for none."""
+
+    lines: list[str]
+    facts: dict[str, Any]
+    picture: Path | None = None
+
+
+class _Work:
+    """A workspace's tables, each read once."""
+
+    def __init__(self, root: Path) -> None:
+        self.workspace = Workspace(root)
+        if not self.workspace.images.is_file():
+            raise InputError(
+                f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace"
+            )
+        self.workspace.check_version()
+
+    @cached_property
+    def images(self) -> dict[str, Image]:
+        return {image.image_id: image for image in read_images(self.workspace.images)}
+
+    @cached_property
+    def poses(self) -> dict[str, Pose]:
+        return read_poses(self.workspace.poses)
+
+    @cached_property
+    def cameras(self) -> dict[str, Camera]:
+        return read_cameras(self.workspace.cameras)
+
+    @cached_property
+    def pairs(self) -> list[Pair]:
+        return read_pairs(self.workspace.pairs) if self.workspace.pairs.is_file() else []
+
+    @cached_property
+    def folder(self) -> Path:
+        """Of the images."""
+        return Path(load(str(self.workspace.config)).block.images)
+
+    def image(self, text: str) -> Image:
+        """By name, file name, stem or id. Raises ConfigError where none or several fit."""
+        wanted = text.replace("\\", "/").lower()
+        fitting = [
+            image
+            for image in self.images.values()
+            if wanted in {image.image_id.lower(), image.name.lower(), Path(image.name).name.lower(),
+                          Path(image.name).stem.lower()}
+        ]  # fmt: skip
+        exact = [image for image in fitting if image.name == text]
+        if len(exact or fitting) != 1:
+            several = ", ".join(image.name for image in fitting[:3])
+            what = f"fits several images ({several})" if fitting else "is none of the images"
+            example = next(iter(self.images.values())).name if self.images else "none"
+            raise ConfigError(f"{text!r} {what} of {self.workspace.root}: give a name such as {example}")
+        return (exact or fitting)[0]
+
+    def keypoints_px(self, image_id: str) -> FloatArray:
+        path = self.workspace.features(image_id)
+        return read_keypoints(path)[0] if path.is_file() else np.zeros((0, 2), np.float32)
+
+    def final(self, pair: Pair) -> VerifiedEntry | None:
+        found = read_verified_row(self.workspace.verified(pair.image_id0)).get(pair.image_id1)
+        return None if found is None else FinalEntries(self.workspace)(pair.image_id0, found)
+
+
+def show(path: Path, names: Sequence[str], out: Path | None = None, *, rejected: bool = False) -> Shown:
+    """A file, or a workspace with up to two of its images. rejected: draw the matches that were dropped, too.
+
+    Raises ConfigError or InputError where there is no such thing.
+    """
+    if path.is_file():
+        if names:
+            raise ConfigError(f"{path} is a file: images are named behind a workspace")
+        return Shown(list(_file_lines(path)), {"file": str(path)})
+    work = _Work(path)
+    if not names:
+        return _workspace(work)
+    if len(names) == 1:
+        return _image(work, work.image(names[0]), out)
+    first, second = sorted((work.image(name) for name in names), key=lambda image: image.image_id)
+    if first.image_id == second.image_id:
+        raise ConfigError(f"both names mean the image {first.name}: a pair has two")
+    return _pair(work, first, second, out, rejected=rejected)
+
+
+def _workspace(work: _Work) -> Shown:
+    workspace, lines = work.workspace, []
+    attitudes = sum(pose.world_rotation is not None for pose in work.poses.values())
+    lines.append(f"images      {len(work.images)}, {len(work.poses)} with position, {attitudes} with attitude")
+    block = read_json(workspace.block)
+    lines.append(f"world       {block['crs']}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
+    lines.append(f"pairs       {len(work.pairs)}")
+    stages: dict[str, Any] = {}
+    for stage in STAGE_ORDER:
+        path = workspace.stage_report(stage)
+        if path.is_file():
+            found = stages[stage] = read_json(path)
+            lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {found['seconds']:.1f} s")
+            if stage == "filter":
+                states = ", ".join(f"{count} {state}" for state, count in found["facts"].get("pairs", {}).items())
+                lines.append(f"            {states}; {found['facts'].get('verified_matches', 0)} verified matches")
+    lines += [f"export      {folder}" for folder in sorted(workspace.export("x").parent.glob("[!.]*"))]
+    if workspace.report.is_file():
+        lines.append(f"report      {workspace.report}")
+    lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")
+    return Shown(lines, {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)})
+
+
+def _image(work: _Work, image: Image, out: Path | None) -> Shown:
+    workspace, image_id = work.workspace, image.image_id
+    camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
+    lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
+    lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in camera.params)}")
+    lines += [f"pose        {words}" for words in _pose_words(pose, read_json(workspace.block)["origin_m"])]
+    keypoints = work.keypoints_px(image_id)
+    rows = []
+    matched = np.zeros(len(keypoints), dtype=bool)
+    for pair in work.pairs:
+        if image_id not in (pair.image_id0, pair.image_id1):
+            continue
+        other = work.images[pair.image_id1 if pair.image_id0 == image_id else pair.image_id0]
+        found = work.final(pair)
+        count = len(found.matches.indices) if found is not None and found.verdict.state == "verified" else 0
+        if count and found is not None:
+            own = found.matches.indices[:, 0 if pair.image_id0 == image_id else 1]
+            matched[own[own >= 0]] = True
+        rows.append((count, other.name, found.verdict.state if found is not None else "not judged", pair.overlap))
+    lines.append(f"keypoints   {len(keypoints)}, {int(matched.sum())} of them in verified matches")
+    lines.append(f"partners    {len(rows)}, {sum(count > 0 for count, *_ in rows)} of them verified")
+    for count, name, state, overlap in sorted(rows, key=lambda row: (-row[0], row[1]))[:_LISTED]:
+        share = "overlap unknown" if np.isnan(overlap) else f"overlap {100 * overlap:.0f} %"
+        lines.append(f"            {name}: {count} matches, {state}, {share}")
+    for what, path in (("enhanced", workspace.enhanced(image_id, ".png")), ("views", workspace.views(image_id))):
+        if path.exists():
+            lines.append(f"{what:<11} {path}")
+    target = out or workspace.root / "show" / f"{image_id}.png"
+    write_picture(target, image_picture(read_pixels(work.folder / image.name, colour=True), keypoints, matched))
+    lines.append(f"picture     {target}: keypoints in verified matches green, others red")
+    return Shown(lines, {"image": image.name, "keypoints": len(keypoints), "picture": str(target)}, target)
+
+
+def _pose_words(pose: Pose | None, origin_m: Sequence[float]) -> Iterator[str]:
+    if pose is None:
+        yield "unknown"
+        return
+    x, y, z = np.array(pose.center_m) + np.array(origin_m)
+    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} m, standard deviation {pose.sigma_position_m:.3g} m"
+    if pose.world_rotation is not None:
+        angles = ", ".join(f"{v:.4f}" for v in to_omega_phi_kappa(pose.world_rotation))
+        yield f"omega, phi, kappa {angles} degrees, {tilt_deg(pose.world_rotation):.1f} from straight down"
+
+
+def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, rejected: bool) -> Shown:
+    workspace, ids = work.workspace, (image0.image_id, image1.image_id)
+    pair = next((p for p in work.pairs if (p.image_id0, p.image_id1) == ids), None)
+    if pair is None:
+        raise InputError(
+            f"{image0.name} and {image1.name} are not paired in {workspace.root}: pairs.csv lists the pairs"
+        )
+    lines = [f"pair        {image0.name} and {image1.name}, paired by {pair.reason}"]
+    if not np.isnan(pair.overlap):
+        lines.append(f"overlap     {100 * pair.overlap:.0f} %, view angle {pair.view_angle_deg:.1f} degrees")
+    found, raw = work.final(pair), read_match_row(workspace.matches(ids[0])).get(ids[1])
+    if found is None or raw is None:
+        raise InputError(f"{image0.name} and {image1.name} have no matches on file: run aeromatch match and filter")
+    verdict = found.verdict
+    kept = found.matches if verdict.state == "verified" else None
+    count = 0 if kept is None else len(kept.indices)
+    lines.append(f"matches     {len(raw.matches.indices)} by {raw.strategy}, {count} verified: {verdict.state}")
+    if verdict.reason:
+        lines.append(f"            {verdict.reason}")
+    lines += [f"dropped     {number} by {name}" for name, number in verdict.rejected.items() if number]
+    errors = verdict.errors_px
+    if errors is not None and len(errors):
+        low, middle, high = np.nanpercentile(errors, [5, 50, 95])
+        lines.append(f"errors      median {middle:.2f} px, 90 % between {low:.2f} and {high:.2f} px")
+    if workspace.steps.is_file():
+        row = next((r for r in read_csv(workspace.steps) if (r["image_id0"], r["image_id1"]) == ids), None)
+        if row is not None:
+            lines.append(f"steps       {row['steps']}{': ' + row['reasons'] if row['reasons'] else ''}")
+    sides = [work.keypoints_px(i) for i in ids]
+    points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
+    dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
+    pixels = [read_pixels(work.folder / image.name, colour=True) for image in (image0, image1)]
+    target = out or workspace.root / "show" / f"{ids[0]}--{ids[1]}.png"
+    write_picture(target, pair_picture(pixels, points, errors, dropped))
+    lines.append(f"picture     {target}: green to yellow by error{', dropped ones red' if dropped is not None else ''}")
+    facts = {"pair": [image0.name, image1.name], "verified": count, "picture": str(target)}
+    return Shown(lines, facts, target)
+
+
+def _file_lines(path: Path) -> Iterator[str]:
+    """Arrays of an .npz, keys of a .json, columns of a .csv."""
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                for name in archive.files:
+                    array = archive[name]
+                    yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
+        except (OSError, ValueError, EOFError) as error:
+            raise BrokenFileError(str(path), str(error)) from error
+    elif suffix == ".json":
+        yield from json.dumps(read_json(path), indent=2, ensure_ascii=False).splitlines()
+    elif suffix == ".csv":
+        rows = read_csv(path)
+        yield f"{len(rows)} rows"
+        for name in rows[0] if rows else ():
+            values = Counter(row[name] for row in rows)
+            often = ", ".join(f"{value or 'empty'} ({count})" for value, count in values.most_common(3))
+            yield f"{name:<20} {len(values)} different: {often}"
+    else:
+        raise ConfigError(f"{path}: show reads .npz, .json and .csv files of a workspace, and workspaces")
+
+
+def _range(array: Any) -> str:
+    if array.dtype.kind not in "fiu" or not array.size:
+        return f", {', '.join(map(str, array.ravel()[:3]))}" if array.size and array.dtype.kind == "U" else ""
+    return f", {np.nanmin(array):.6g} to {np.nanmax(array):.6g}"

@@ -1,0 +1,145 @@
+"""Commands that look: show, compare, config, list, init."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import IMAGES, Site, invoke
+from PIL import Image
+
+from aeromatch_cli.config import load, preset_names
+from aeromatch_cli.config.schema import FAMILIES
+from aeromatch_cli.report.pictures import image_picture, pair_picture
+
+GRAY = np.full((60, 80, 3), 128, np.uint8)
+
+
+def test_keypoints_are_drawn_where_they_lie() -> None:
+    """Matched ones green, others red, in a picture as large as the image."""
+    picture = image_picture(GRAY, np.array([[10.0, 20.0], [70.0, 50.0]]), np.array([True, False]))
+    assert picture.shape == (60, 80, 3)
+    green, red = picture[20, 10].astype(int), picture[50, 70].astype(int)
+    assert green[1] - green[0] > 100
+    assert red[0] - red[1] > 100
+    assert (picture[5, 40] == 128).all()
+
+
+def test_matches_are_drawn_from_image_to_image_by_their_error() -> None:
+    points = np.array([[10.0, 10.0], [10.0, 30.0]]), np.array([[60.0, 10.0], [60.0, 30.0]])
+    dropped = np.array([[10.0, 50.0]]), np.array([[60.0, 50.0]])
+    picture = pair_picture((GRAY, GRAY[:, :70]), points, np.array([0.0, 5.0]), dropped)
+    assert picture.shape == (60, 80 + 8 + 70, 3)
+    colours = [picture[y, 75].astype(int) for y in (10, 30, 50)]
+    assert colours[0][1] > colours[0][0] + 100  # green
+    assert min(colours[1][:2]) > 200 > colours[1][2] + 100  # yellow
+    assert colours[2][0] > colours[2][1] + 100  # red
+    assert (picture[5, 84] == 255).all()  # between the images
+
+
+@pytest.mark.slow
+def test_show_says_what_a_workspace_an_image_and_a_pair_hold(done_site: Site) -> None:
+    work, names = done_site.work, done_site.names()
+    whole = invoke("show", work)
+    assert whole.code == 0
+    assert f"images      {IMAGES}, {IMAGES} with position" in whole.stdout
+    assert "verified matches" in whole.stdout
+    with (work / "pairs.csv").open(newline="") as stream:
+        partners = [row for row in csv.DictReader(stream) if "suburb_0001_jpg" in row.values()]
+    image = invoke("show", work, names[0], "--json")
+    assert f"partners    {len(partners)}, " in image.stdout
+    assert 0 < image.facts["keypoints"] <= 400
+    with Image.open(image.facts["picture"]) as picture:
+        assert picture.size == (320, 240)
+    pair = invoke("show", work, names[1], Path(names[0]).stem, "--rejected", "--out", work / "p.png", "--json")
+    assert pair.facts["pair"] == names[:2]
+    assert pair.facts["verified"] > 30
+    assert "steps" not in pair.stdout
+    with Image.open(work / "p.png") as picture:
+        assert picture.size == (320 + 8 + 320, 240)
+
+
+@pytest.mark.slow
+def test_show_reads_files(done_site: Site) -> None:
+    rows = invoke("show", done_site.work / "images.csv").stdout
+    assert f"{IMAGES} rows" in rows
+    arrays = invoke("show", done_site.work / "verified" / "suburb_0001_jpg.npz").stdout
+    assert "errors_px" in arrays
+    assert "float32" in arrays
+    facts = invoke("show", done_site.work / "block.json").stdout
+    assert '"crs": "local"' in facts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("nothing",), 2, "'nothing' is none of the images"),
+        (("suburb_0001.jpg", "suburb_0001"), 2, "both names mean the image suburb_0001.jpg"),
+        (("a", "b", "c"), 2, "3 images: name one, or the two of a pair"),
+        (("suburb_0001.jpg", "--out", "x.jpg"), 2, "name it FILE.png"),
+    ],
+)
+def test_show_refuses_what_is_not_there(done_site: Site, arguments: tuple[str, ...], code: int, words: str) -> None:
+    outcome = invoke("show", done_site.work, *arguments)
+    assert (outcome.code, words in outcome.stderr) == (code, True), outcome.stderr
+
+
+def test_a_folder_that_is_no_workspace(tmp_path: Path) -> None:
+    for command in (("show", tmp_path), ("compare", tmp_path, tmp_path)):
+        outcome = invoke(*command)
+        assert outcome.code == 3
+        assert "is no workspace of aeromatch (images.csv is missing)" in outcome.stderr
+
+
+@pytest.mark.slow
+def test_compare_names_what_differs(done_site: Site) -> None:
+    other = done_site.another_workspace("other")
+    assert invoke("run", "baseline", *done_site.options("--set", "match.ratio=0.5", "--workspace", other)).code == 0
+    outcome = invoke("compare", done_site.work, other, "--json")
+    assert outcome.facts["settings"] == ["match.ratio: 0.8 and 0.5"]
+    first, second = outcome.facts["matches"]
+    assert 0 < second < first
+    assert f"matches     {first:,} and {second:,} ({100 * (second / first - 1):+.1f} %)" in outcome.stdout
+
+
+def test_config_prints_settings_that_load_again(tmp_path: Path) -> None:
+    outcome = invoke("config", "fusion", "--set", "extract.keypoints=123")
+    tree = yaml.safe_load(outcome.stdout)
+    assert tree["extract"]["keypoints"] == 123
+    path = tmp_path / "a.yaml"
+    path.write_text(outcome.stdout)
+    assert load(str(path)).match == load("fusion").match
+
+
+def test_list_has_every_preset_and_strategy() -> None:
+    lines = invoke("list").stdout.splitlines()
+    found = {line.split()[0] for line in lines if line.startswith("  ")}
+    assert set(preset_names()) - {"default"} <= found
+    assert {name for table in FAMILIES.values() for name in table} <= found
+    assert "  nearest *" in "\n".join(lines)
+    assert invoke("list", "matcher").code == 2
+
+
+def test_init_writes_settings_for_what_it_sees(tmp_path: Path) -> None:
+    images = tmp_path / "photos"
+    images.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        Image.new("RGB", (40, 30)).save(images / name)
+    (tmp_path / "geo.txt").write_text("EPSG:32633\na.jpg 500000 4600000 100\nb.jpg 500010 4600000 100\n")
+    path = tmp_path / "block.yaml"
+    outcome = invoke("init", path, "--images", images)
+    assert outcome.code == 0, outcome.stderr
+    assert "2 images" in outcome.stdout
+    assert "ODM geo.txt" in outcome.stdout
+    settings = load(str(path))
+    assert settings.block.images == str(images)
+    assert settings.block.poses == str(tmp_path / "geo.txt")
+    assert [step.name for step in settings.cascade] == [step.name for step in load("auto").cascade]
+    again = invoke("init", path, "--images", images)
+    assert again.code == 2
+    assert "exists and is not replaced" in again.stderr
+    assert invoke("init", tmp_path / "c.yaml", "--images", tmp_path / "none").code in (2, 3)
