@@ -45,7 +45,7 @@ class Progress(Protocol):
 
     def start(self, label: str, total: int) -> None: ...
 
-    def advance(self) -> None: ...
+    def advance(self, count: int = 1) -> None: ...
 
     def stop(self) -> None: ...
 
@@ -54,9 +54,9 @@ class SilentProgress:
     """Draws nothing."""
 
     def start(self, label: str, total: int) -> None:
-        """A stage of `total` tasks begins."""
+        """A stage of `total` items begins."""
 
-    def advance(self) -> None:
+    def advance(self, count: int = 1) -> None:
         """One task is finished."""
 
     def stop(self) -> None:
@@ -163,6 +163,7 @@ class Executor:
         self.jobs = 1 if kind == "serial" else jobs or available_cores()
         self.progress = progress or SilentProgress()
         self._tried = 0
+        self._sizes: Sequence[int] | None = None
         self._pool: ProcessPoolExecutor | None = None
         self._client: Any = None
 
@@ -189,12 +190,17 @@ class Executor:
             self._client.close()
             self._client = None
 
-    def run(self, function: Callable[[T], R], tasks: Sequence[T], label: str) -> list[Outcome[R]]:
-        """Outcomes in task order. Raises WorkspaceError when results can no longer be saved."""
+    def run(
+        self, function: Callable[[T], R], tasks: Sequence[T], label: str, sizes: Sequence[int] | None = None
+    ) -> list[Outcome[R]]:
+        """Outcomes in task order. sizes: how many items each task counts in what is shown of the advance, by default 1.
+
+        Raises WorkspaceError when results can no longer be saved.
+        """
         started = time.monotonic()
         record.info("%s: %d to do", label, len(tasks))
-        self._tried = 0
-        self.progress.start(label, len(tasks))
+        self._tried, self._sizes = 0, sizes
+        self.progress.start(label, len(tasks) if sizes is None else sum(sizes))
         try:
             if self.kind == "dask":
                 return self._run_dask(function, tasks)
@@ -218,16 +224,17 @@ class Executor:
             self.progress.stop()
             record.info("%s: %.1f s", label, time.monotonic() - started)
 
-    def _advance(self) -> None:
+    def _advance(self, index: int) -> None:
+        """The task at `index` is done."""
         self._tried += 1
-        self.progress.advance()
+        self.progress.advance(1 if self._sizes is None else self._sizes[index])
 
     def _run_serial(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
         outcomes = []
         with _one_thread():
-            for task in tasks:
+            for index, task in enumerate(tasks):
                 outcomes.append(guarded(function, task))
-                self._advance()
+                self._advance(index)
         return outcomes
 
     def _run_processes(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
@@ -243,7 +250,7 @@ class Executor:
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
                     outcomes[index] = Outcome(None, "its worker process died (out of memory, or a crash in a library)")
-                    self._advance()
+                    self._advance(index)
         return [outcomes[index] for index in range(len(tasks))]
 
     def _drain(
@@ -264,9 +271,9 @@ class Executor:
                     return []
                 finished, _ = wait(flying, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    outcomes[flying[future]] = future.result()
-                    del flying[future]
-                    self._advance()
+                    index = flying.pop(future)
+                    outcomes[index] = future.result()
+                    self._advance(index)
         except BrokenProcessPool:
             self._pool = None
             return sorted(flying.values())
@@ -306,8 +313,9 @@ class Executor:
             self._client = Client(address, **local)
             self._client.run(single_threaded)
         futures = self._client.map(guarded, [function] * len(tasks), tasks, pure=False)
-        for _ in as_completed(futures):
-            self._advance()
+        places = {future.key: index for index, future in enumerate(futures)}
+        for future in as_completed(futures):
+            self._advance(places[future.key])
         return list(self._client.gather(futures))
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from aeromatch_cli import __version__
 from aeromatch_cli.cli import app, output
-from aeromatch_cli.cli.progress import LineProgress
+from aeromatch_cli.cli.progress import RUN_STAGES, LineProgress
 from aeromatch_cli.cli.stage_commands import STAGES
 from aeromatch_cli.stages.shard import Shard
 
@@ -321,3 +321,33 @@ def test_help_of_synth_names_every_scene_and_flight() -> None:
 
     assert commands._SCENES.split(", ") == list(PRESETS)
     assert commands._FLIGHTS.split(", ") == list(FLIGHTS)
+
+
+def test_progress_says_which_stage_of_how_many(capsys):
+    progress = LineProgress(RUN_STAGES)
+    for label, total, counts in (("step first: match", 10, [7, 3]), ("first pass: match", 1, [1]), ("read", 1, [1])):
+        progress.start(label, total)
+        for count in counts:
+            progress.advance(count)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.rpartition(",")[0] for line in lines] == [
+        "4/9 step first: match: 70 % (7/10)",
+        "4/9 step first: match: 100 % (10/10)",
+        "1/9 first pass: match: 100 % (1/1)",
+        "read: 100 % (1/1)",
+    ]
+
+
+def test_options_are_taken_from_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("AEROMATCH_IMAGES", str(tmp_path / "nothing"))
+    monkeypatch.setenv("AEROMATCH_QUIET", "1")
+    outcome = invoke("check")
+    assert outcome.code in (2, 3)
+    assert str(tmp_path / "nothing") in outcome.stderr
+    assert outcome.stdout == ""
+
+
+def test_a_key_without_its_section_is_told_where_it_belongs():
+    outcome = invoke("config", "--set", "keypoints=8000")
+    assert outcome.code == 2
+    assert "did you mean 'orient.keypoints', 'extract.keypoints' or 'cascade.learned.keypoints'?" in outcome.stderr

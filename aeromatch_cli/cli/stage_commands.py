@@ -32,7 +32,7 @@ from aeromatch_cli.cli.options import (
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
-from aeromatch_cli.cli.progress import progress_shown
+from aeromatch_cli.cli.progress import RUN_STAGES, progress_shown
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
@@ -139,7 +139,7 @@ def stage_command(name: str) -> Callable[..., None]:
                 run=as_texts(run),
                 workspace=_absolute(workspace),
             )
-            shown = progress_shown(quiet)
+            shown = progress_shown(quiet, RUN_STAGES if name == "run" else ())
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)

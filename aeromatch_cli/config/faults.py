@@ -15,6 +15,8 @@ Families = Mapping[str, Mapping[str, type[BaseModel]]]
 
 _LONGEST_VALUE = 60
 _LARGEST_WRITTEN = 1e15
+# Of places where a key may belong, so many are named.
+_MOST_PLACES = 3
 # pydantic's fault types, in the words of someone who writes YAML.
 _PHRASES = {
     "model_type": "must hold settings (key: value)",
@@ -50,6 +52,9 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
         owners = [name for name, strategy in family.items() if names[-1] in strategy.model_fields]
         if owners and len(names) > 1:
             return f"{place}: unknown key here, it belongs to {' and '.join(owners)}{nearest(names[-1], siblings)}"
+        elsewhere = _places(names[-1], root, families) if len(names) == 1 else []
+        if elsewhere:
+            return f"{place}: unknown key; did you mean {_either(elsewhere)}?"
         return f"{place}: unknown key{nearest(names[-1], siblings)}"
     if kind == "union_tag_invalid" or (kind == "literal_error" and family and location[-1] == "name"):
         name = str(fault["ctx"]["tag"] if kind == "union_tag_invalid" else fault["input"])
@@ -100,6 +105,30 @@ def nearest(word: str, known: Sequence[str], *, otherwise: str | None = None) ->
     if otherwise is not None:
         return otherwise
     return f"; valid here: {', '.join(known)}" if known else ""
+
+
+def _places(key: str, root: type[BaseModel], families: Families) -> list[str]:
+    """Where settings of this name stand: sections first, then the default strategies', then those of others."""
+    defaults = root()
+    found: dict[str, int] = {}
+    for section in root.model_fields:
+        value = getattr(defaults, section)
+        if section not in families:
+            if isinstance(value, BaseModel) and key in type(value).model_fields:
+                found[f"{section}.{key}"] = 0
+            continue
+        chained = isinstance(value, tuple)
+        chosen = {type(one) for one in (value if chained else (value,))}
+        for name, strategy in families[section].items():
+            if key in strategy.model_fields:
+                place = f"{section}.{name}.{key}" if chained else f"{section}.{key}"
+                found[place] = min(found.get(place, 2), 1 if strategy in chosen else 2)
+    return [place for place, _ in sorted(found.items(), key=lambda item: item[1])][:_MOST_PLACES]
+
+
+def _either(words: Sequence[str]) -> str:
+    quoted = [repr(word) for word in words]
+    return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} or {quoted[-1]}"
 
 
 def _whole_number(value: Any) -> str:

@@ -169,7 +169,9 @@ def run(context: Context) -> StageReport:
     on_file = {task.image_id0: row_fingerprints(context.workspace.verified(task.image_id0)) for task in tasks}
     todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
-    results = run_stage(context, report, run_task, todo, [task.image_id0 for task in todo])
+    results = run_stage(
+        context, report, run_task, todo, [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
+    )
     report.failures.extend(failure for result in results for failure in result.failures)
     report.failures.extend(unexplained(context, missing, "match"))
     report.done = sum(result.done for result in results)

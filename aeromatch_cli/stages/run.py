@@ -27,6 +27,7 @@ from aeromatch_cli.stages import (
     simulate,
     union,
 )
+from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
@@ -213,6 +214,8 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
     names = {image.image_id: image.name for image in context.block.images}
     for stage in reports:
         lines += stage_lines(stage, names, part=context.shard is not None)
+    if command == "run" and context.shard is None:
+        lines += closing_lines(reports, names)
     lines.append(f"workspace {context.workspace.root}")
     if command in ("run", "report") and context.shard is None:
         lines.append(f"report    {context.workspace.report}")

@@ -154,9 +154,14 @@ def run_stage(
     function: Callable[[T], R],
     tasks: Sequence[T],
     names: Sequence[str],
+    sizes: Sequence[int] | None = None,
 ) -> list[R]:
-    """Run tasks, put failures into the report under their names, return the values of the rest."""
-    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, context.part + report.stage) if tasks else []
+    """Run tasks, put failures into the report under their names, return the values of the rest.
+
+    sizes: how many items each task counts while it is shown how far the stage is.
+    """
+    label = context.part + report.stage
+    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, label, sizes) if tasks else []
     values = []
     for name, outcome in zip(names, outcomes, strict=True):
         if outcome.value is None:

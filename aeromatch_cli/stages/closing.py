@@ -1,0 +1,88 @@
+"""What a run comes to, in words: whether the block is sound, where it is weak, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from aeromatch_cli.stages.filter import WEAK_MATCHES
+from aeromatch_cli.stages.stage_report import StageReport
+
+_NAMED = 5
+# Images with fewer points that three images see hold a block adjustment loosely.
+_FEW_POINTS = 20
+
+
+def closing_lines(reports: Sequence[StageReport], names: Mapping[str, str]) -> list[str]:
+    """Of the reports of a whole run, filter to consistency. names: of the files, by image_id."""
+    facts = {report.stage: report.facts for report in reports if not report.part}
+    if "filter" not in facts or "adjust" not in facts:
+        return []
+    faults, weak = _faults(facts, names), _weak(facts, names)
+    count = len(names)
+    if faults:
+        return _said(
+            [f"not sound: {faults[0][0]}", *(words for words, _ in faults[1:])],
+            [*(remedy for _, remedy in faults), *weak],
+        )
+    whole = f"sound: all {count} images are connected and oriented" if count > 2 else "both images are connected"
+    return _said([whole], weak)
+
+
+def _said(first: Sequence[str], then: Sequence[str]) -> list[str]:
+    lines = ["; ".join(first), *then]
+    return [f"{'result' if not row else '':<9} {line}" for row, line in enumerate(lines)]
+
+
+def _faults(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What is wrong with the block as a whole, and what helps."""
+    found = []
+    groups = facts["filter"]["components"]
+    if len(groups) > 1:
+        sizes = ", ".join(map(str, groups[:_NAMED])) + (", ..." if len(groups) > _NAMED else "")
+        found.append(
+            (
+                f"{len(groups)} groups of images ({sizes}) that no verified pair connects",
+                "more overlap between them helps; --set pairs=exhaustive finds pairs that positions hide",
+            )
+        )
+    outside = list(facts["adjust"].get("outside", {}))
+    if outside:
+        one = names.get(outside[0], outside[0])
+        found.append(
+            (
+                f"not oriented: {_listed(outside, names)}",
+                f"the lines of adjust say why; `aeromatch show WORK {one}` shows what it has; images of other places "
+                "may be left out",
+            )
+        )
+    parts = facts["adjust"].get("groups", ())
+    if len(parts) > 1 and len(groups) == 1:
+        found.append(
+            (
+                f"{len(parts)} parts whose scale and place nothing ties to each other",
+                "positions (--poses) place each of them",
+            )
+        )
+    return found
+
+
+def _weak(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
+    """Images that hang loosely on a block."""
+    lines = []
+    tied = facts["filter"]["weakly_tied"]
+    if tied:
+        lines.append(f"weak: {_listed(tied, names)}, with fewer than {WEAK_MATCHES} verified matches")
+    spread = facts.get("consistency", {}).get("spread", {})
+    loose = [i for i, (_, _, points) in spread.items() if points < _FEW_POINTS and i not in tied]
+    if loose and len(spread) > 2:
+        lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
+    empty = [i for i, (_, ninths, _) in spread.items() if ninths]
+    if empty:
+        lines.append(f"parts without a point though other images show them: {_listed(empty, names)}")
+    return lines
+
+
+def _listed(ids: Sequence[str], names: Mapping[str, str]) -> str:
+    shown = ", ".join(names.get(i, i) for i in ids[:_NAMED])
+    return shown + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")
