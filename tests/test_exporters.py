@@ -271,3 +271,56 @@ def test_tracks_are_a_table(contents, truth: Truth, tmp_path: Path) -> None:
     np.testing.assert_allclose([float(first["x_px"]), float(first["y_px"])], keypoint, atol=1e-4)
     point = truth_of(truth, image.image_id, [int(first["keypoint"])])[0]
     np.testing.assert_allclose([float(first[k]) for k in ("x_m", "y_m", "z_m")], point + ORIGIN_M, atol=1e-3)
+
+
+def test_hloc_reads_keypoints_and_matches(contents, truth: Truth, tmp_path: Path) -> None:
+    """As hloc does: the group of a pair is named by both images, -1 stands for no match."""
+    import h5py
+
+    EXPORTERS["hloc"]()(contents(), tmp_path / "h")  # type: ignore[operator]
+    with h5py.File(tmp_path / "h" / "features.h5") as stream:
+        np.testing.assert_array_equal(stream["flight/0.jpg"]["keypoints"][:], truth.keypoints_px["img0"])
+        assert stream["flight/0.jpg"]["image_size"][:].tolist() == [1000, 750]
+    with h5py.File(tmp_path / "h" / "matches.h5") as stream:
+        partner = stream["flight-0.jpg/flight-1.jpg"]["matches0"][:]
+    rows = np.flatnonzero(partner >= 0)
+    verified = truth.pairs[0].verified
+    np.testing.assert_array_equal(np.column_stack([rows, partner[rows]]), verified[np.argsort(verified[:, 0])])
+    name, *values = (tmp_path / "h" / "poses.txt").read_text().splitlines()[1].split()
+    rotation = from_quaternion(*map(float, values[:4]))
+    pose = truth.block.poses["img1"]
+    assert name == "flight/1.jpg"
+    np.testing.assert_allclose(-rotation.T @ [float(v) for v in values[4:]], pose.center_m, atol=1e-9)
+
+
+def test_alicevision_writes_rotations_by_columns_and_views_by_number(contents, truth: Truth, tmp_path: Path) -> None:
+    EXPORTERS["alicevision"]()(contents(), tmp_path / "a")  # type: ignore[operator]
+    data = json.loads((tmp_path / "a" / "cameras.sfm").read_text())
+    pose = next(one for one in data["poses"] if one["poseId"] == "2")["pose"]["transform"]
+    found = np.array([float(v) for v in pose["rotation"]]).reshape(3, 3, order="F")
+    np.testing.assert_allclose(found, truth.block.poses["img1"].world_rotation, atol=1e-12)
+    camera, intrinsic = truth.block.cameras["a"], data["intrinsics"][0]
+    assert float(intrinsic["focalLength"]) * 1000 / 36 == pytest.approx(camera.params[0])
+    assert float(intrinsic["principalPoint"][0]) + 499.5 == pytest.approx(camera.params[2])
+    tokens = (tmp_path / "a" / "matches" / "0.matches.txt").read_text().split()
+    assert tokens[:5] == ["1", "2", "1", "sift", str(len(truth.pairs[0].verified))]
+    places = np.loadtxt(tmp_path / "a" / "features" / "2.sift.feat")[:, :2]
+    np.testing.assert_allclose(places, truth.keypoints_px["img1"], atol=1e-4)
+
+
+def test_a_geopackage_has_three_layers_in_the_blocks_crs(contents, truth: Truth, tmp_path: Path) -> None:
+    import pyogrio
+    from shapely import from_wkb
+
+    EXPORTERS["geopackage"]()(contents(), tmp_path / "g")  # type: ignore[operator]
+    path = tmp_path / "g" / "block.gpkg"
+    layers = dict(pyogrio.list_layers(path).tolist())
+    assert layers["cameras"] == "Point Z"
+    assert set(layers) >= {"cameras", "pairs"}
+    meta, _, geometry, fields = pyogrio.raw.read(path, layer="cameras")
+    assert meta["crs"] == CRS
+    point = from_wkb(geometry[0])
+    np.testing.assert_allclose([point.x, point.y, point.z], truth.block.poses["img0"].center_m + ORIGIN_M)
+    assert fields[list(meta["fields"]).index("image")][0] == "flight/0.jpg"
+    _, _, lines, fields = pyogrio.raw.read(path, layer="pairs")
+    assert len(lines) == len(truth.pairs)

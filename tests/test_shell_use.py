@@ -32,7 +32,8 @@ def shell(site: Site, tmp_path: Path) -> dict[str, str]:
     script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m aeromatch_cli.cli "$@"\n')
     script.chmod(0o755)
     return os.environ | {
-        "PATH": f"{folder}:{os.environ['PATH']}", "AEROMATCH_JOBS": "1", "AEROMATCH_CAMERAS": str(site.root / "block.json"),
+        "PATH": f"{folder}:{os.environ['PATH']}", "AEROMATCH_JOBS": "1",
+        "AEROMATCH_CAMERAS": str(site.root / "block.json"),
     }  # fmt: skip
 
 

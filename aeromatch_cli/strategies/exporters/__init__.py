@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.alicevision import AliceVision
 from aeromatch_cli.strategies.exporters.blocks_exchange import BlocksExchange
 from aeromatch_cli.strategies.exporters.bundler import Bundler
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents
 from aeromatch_cli.strategies.exporters.geojson import GeoJson
+from aeromatch_cli.strategies.exporters.geopackage import GeoPackage
+from aeromatch_cli.strategies.exporters.hloc import Hloc
 from aeromatch_cli.strategies.exporters.micmac import MicMac
 from aeromatch_cli.strategies.exporters.openmvg import OpenMvg
 from aeromatch_cli.strategies.exporters.opensfm import OpenSfm
@@ -26,7 +29,10 @@ EXPORTERS: Mapping[str, type[Strategy]] = {
     "openmvg": OpenMvg,
     "bundler": Bundler,
     "blocks-exchange": BlocksExchange,
+    "alicevision": AliceVision,
+    "hloc": Hloc,
     "geojson": GeoJson,
+    "geopackage": GeoPackage,
     "tracks": Tracks,
 }
 

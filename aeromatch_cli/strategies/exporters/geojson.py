@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -17,10 +19,30 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
 
 # Images with fewer verified matches hang loosely on the block.
-_WEAK_MATCHES = 50
+WEAK_MATCHES = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """positions: image_id -> centre in the world. ties: image_id -> verified matches. lines: pairs of placed images,
+    with their matches."""
+
+    positions: Mapping[str, FloatArray]
+    ties: Counter[str]
+    lines: Sequence[tuple[tuple[str, str], int]]
+
+    @classmethod
+    def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
+        positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
+        positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
+        ties: Counter[str] = Counter()
+        for id0, id1, rows in found.pairs:
+            ties.update({id0: len(rows), id1: len(rows)})
+        placed = [((a, b), len(rows)) for a, b, rows in found.pairs if a in positions and b in positions]
+        return cls(positions, ties, placed)
 
 
 class GeoJson(Strategy):
@@ -33,22 +55,21 @@ class GeoJson(Strategy):
         """Replace `folder`. WorkspaceError where it cannot be written."""
         solution = Solution.of(contents)
         names = {image.image_id: image.name for image in solution.images}
-        positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
-        positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
         with whole_folder(folder) as partial:
             found = matched(contents)
-            ties: Counter[str] = Counter()
-            links = []
-            for id0, id1, rows in found.pairs:
-                ties.update({id0: len(rows), id1: len(rows)})
-                if id0 in positions and id1 in positions:
-                    line = _places(contents, np.array([positions[id0], positions[id1]]))[:, :2].tolist()
-                    facts = {"image0": names[id0], "image1": names[id1], "matches": len(rows)}
-                    links.append(_feature("LineString", line, facts))
+            graph = Links.of(contents, solution, found)
+            ties, positions = graph.ties, graph.positions
+            links = [
+                _feature(
+                    "LineString", _places(contents, np.array([positions[a], positions[b]]))[:, :2].tolist(),
+                    {"image0": names[a], "image1": names[b], "matches": count},
+                )
+                for (a, b), count in graph.lines
+            ]  # fmt: skip
             cameras = [
                 _feature(
                     "Point", _places(contents, center_m[None])[0].tolist(),
-                    {"image": names[i], "matches": ties[i], "weak": ties[i] < _WEAK_MATCHES,
+                    {"image": names[i], "matches": ties[i], "weak": ties[i] < WEAK_MATCHES,
                      "oriented": i in solution.poses},
                 )
                 for i, center_m in sorted(positions.items())

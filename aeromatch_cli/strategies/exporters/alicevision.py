@@ -1,0 +1,91 @@
+"""AliceVision and Meshroom: cameras.sfm, features and matches.
+
+<viewId>.sift.feat: x y scale orientation; matches.txt: the two view ids, the number of kinds of descriptor, for each
+its name and count, and index pairs (src/aliceVision/matching/io.cpp). cameras.sfm: rotations column by column, numbers
+as text, the principal point from the middle of the image (version 1.2.1).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from aeromatch_cli.data import Camera
+from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+
+_VERSION = ["1", "2", "1"]
+
+
+class AliceVision(Strategy):
+    """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat and matches/0.matches.txt."""
+
+    version: ClassVar[int] = 1
+    name: Literal["alicevision"] = "alicevision"
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written."""
+        solution = Solution.of(contents)
+        views = {image.image_id: number for number, image in enumerate(solution.images, start=1)}
+        with whole_folder(folder) as partial:
+            found = matched(contents)
+            keypoints = 0
+            for image_id, view in views.items():
+                places = np.asarray(contents.keypoints_px(image_id), np.float64).reshape(-1, 2)
+                keypoints += len(places)
+                write(partial / "features" / f"{view}.sift.feat", "".join(f"{x:.4f} {y:.4f} 1 0\n" for x, y in places))
+            blocks = (
+                f"{views[id0]} {views[id1]}\n1\nsift {len(rows)}\n" + "".join(f"{i} {j}\n" for i, j in rows)
+                for id0, id1, rows in found.pairs
+            )
+            write(partial / "matches" / "0.matches.txt", "".join(blocks))
+            write(partial / "cameras.sfm", json.dumps(_sfm(solution, views), indent=1))
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+
+
+def _sfm(solution: Solution, views: dict[str, int]) -> dict[str, Any]:
+    numbers = {camera_id: str(number) for number, camera_id in enumerate(sorted(solution.cameras), start=1)}
+    poses = []
+    for image_id, (rotation, center_m) in solution.poses.items():
+        transform = {"rotation": _texts(rotation.T), "center": _texts(center_m)}
+        poses.append({"poseId": str(views[image_id]), "pose": {"transform": transform, "locked": "0"}})
+    return {
+        "version": _VERSION,
+        "featuresFolders": ["features"],
+        "matchesFolders": ["matches"],
+        "views": [
+            {
+                "viewId": str(views[image.image_id]), "poseId": str(views[image.image_id]),
+                "intrinsicId": numbers[image.camera_id], "path": image.name, "width": str(image.width_px),
+                "height": str(image.height_px),
+            }
+            for image in solution.images
+        ],
+        "intrinsics": [
+            {"intrinsicId": number, **_intrinsic(solution.cameras[camera_id])} for camera_id, number in numbers.items()
+        ],
+        "poses": poses,
+    }  # fmt: skip
+
+
+def _intrinsic(camera: Camera) -> dict[str, Any]:
+    """Brown's model by a focal length in millimetres of a sensor 36 mm wide."""
+    values, sensor_mm = parameters(camera), 36.0
+    middle = (camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0
+    return {
+        "width": str(camera.width_px), "height": str(camera.height_px), "sensorWidth": f"{sensor_mm}",
+        "sensorHeight": f"{sensor_mm * camera.height_px / camera.width_px:.15g}", "type": "brown",
+        "focalLength": f"{values['fx'] * sensor_mm / camera.width_px:.15g}",
+        "pixelRatio": f"{values['fy'] / values['fx']:.15g}",
+        "principalPoint": _texts([values["cx"] - middle[0], values["cy"] - middle[1]]),
+        "distortionParams": _texts([values["k1"], values["k2"], 0.0, values["p1"], values["p2"]]), "locked": "0",
+    }  # fmt: skip
+
+
+def _texts(values: Any) -> list[str]:
+    return [f"{value:.15g}" for value in np.asarray(values, np.float64).ravel()]

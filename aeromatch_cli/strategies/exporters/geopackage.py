@@ -1,0 +1,83 @@
+"""GeoPackage in the block's CRS: layers cameras, footprints and pairs, which QGIS and others open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.geojson import WEAK_MATCHES, Links
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of
+
+_LOCAL = "local"
+# In place of the hour of writing, so that the same block gives the same file.
+_MADE = "2000-01-01T00:00:00.000Z"
+
+
+class GeoPackage(Strategy):
+    """Writes block.gpkg: camera positions, footprints and pairs with their verified matches; needs pyogrio."""
+
+    version: ClassVar[int] = 1
+    name: Literal["geopackage"] = "geopackage"
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without pyogrio."""
+        write_layer = _writer()
+        from shapely import LineString, Point, Polygon
+
+        solution, block = Solution.of(contents), contents.block
+        names = {image.image_id: image.name for image in solution.images}
+        origin_m = np.array(block.origin_m)
+        crs = None if block.crs == _LOCAL else block.crs
+        with whole_folder(folder) as partial:
+            found = matched(contents)
+            links = Links.of(contents, solution, found)
+            path = partial / "block.gpkg"
+            ids = sorted(links.positions)
+            write_layer(
+                path, "cameras", [Point(links.positions[i] + origin_m) for i in ids], "Point Z", crs,
+                {"image": [names[i] for i in ids], "matches": [links.ties[i] for i in ids],
+                 "weak": [links.ties[i] < WEAK_MATCHES for i in ids]},
+            )  # fmt: skip
+            areas = sorted(block_footprints(block).items())
+            write_layer(
+                path, "footprints", [Polygon(f.polygon_m[:, :2] + origin_m[:2]) for _, f in areas], "Polygon", crs,
+                {"image": [names[i] for i, _ in areas], "matches": [links.ties[i] for i, _ in areas]},
+            )  # fmt: skip
+            write_layer(
+                path, "pairs",
+                [LineString([(links.positions[i] + origin_m)[:2] for i in ends]) for ends, _ in links.lines],
+                "LineString", crs,
+                {"image0": [names[a] for (a, _), _ in links.lines], "image1": [names[b] for (_, b), _ in links.lines],
+                 "matches": [count for _, count in links.lines]},
+            )  # fmt: skip
+            count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
+            return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
+
+
+def _writer() -> Any:
+    try:
+        from pyogrio import raw, set_gdal_config_options
+    except ImportError:
+        raise ConfigError("export=geopackage needs pyogrio: pip install 'aeromatch[gis]'") from None
+    from shapely import to_wkb
+
+    set_gdal_config_options({"OGR_CURRENT_DATE": _MADE})
+
+    def write_layer(
+        path: Path, layer: str, geometries: list[Any], kind: str, crs: str | None, fields: dict[str, list[Any]]
+    ) -> None:
+        if not geometries:  # without ground there are no footprints
+            return
+        columns = [np.array(values, dtype=object if isinstance(values[0], str) else None) for values in fields.values()]
+        raw.write(
+            str(path), np.array([to_wkb(one) for one in geometries], dtype=object), columns, list(fields), layer=layer,
+            driver="GPKG", geometry_type=kind, crs=crs, append=path.exists(),
+        )  # fmt: skip
+
+    return write_layer
