@@ -8,6 +8,7 @@ from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_bands, write_image
 from PIL.TiffImagePlugin import IFDRational
 
 from aeromatch_cli.blocks.exif import exif_or_reason, read_exif
+from aeromatch_cli.blocks.xmp import CameraAngles
 from aeromatch_cli.errors import ItemError
 
 
@@ -166,3 +167,60 @@ def test_corrupt_files_are_item_errors(tmp_path: Path, content: bytes) -> None:
     reason = exif_or_reason(path)
     assert isinstance(reason, str)
     assert "bad.jpg" not in reason  # it is recorded beside the name
+
+
+_RDF = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    "<rdf:Description {spaces}>{body}</rdf:Description></rdf:RDF></x:xmpmeta>"
+)
+_SKYDIO = 'xmlns:drone-skydio="https://www.skydio.com/drone-skydio/1.0/"'
+_SKYDIO_BODY = (
+    '<drone-skydio:CameraOrientationFLU rdf:parseType="Resource"><drone-skydio:Yaw>1</drone-skydio:Yaw>'
+    "<drone-skydio:Pitch>2</drone-skydio:Pitch><drone-skydio:Roll>3</drone-skydio:Roll>"
+    "</drone-skydio:CameraOrientationFLU>"
+    "<drone-skydio:CameraOrientationNED {ned}"
+    "<drone-skydio:Latitude>47.5</drone-skydio:Latitude><drone-skydio:Longitude>8.5</drone-skydio:Longitude>"
+    "<drone-skydio:AbsoluteAltitude>480.5</drone-skydio:AbsoluteAltitude>"
+)
+_AS_ELEMENTS = (
+    'rdf:parseType="Resource"><drone-skydio:Yaw>30.5</drone-skydio:Yaw><drone-skydio:Pitch>-88</drone-skydio:Pitch>'
+    "<drone-skydio:Roll>0.5</drone-skydio:Roll></drone-skydio:CameraOrientationNED>"
+)
+_AS_ATTRIBUTES = 'drone-skydio:Yaw="30.5" drone-skydio:Pitch="-88" drone-skydio:Roll="0.5"/>'
+
+
+@pytest.mark.parametrize("ned", [_AS_ELEMENTS, _AS_ATTRIBUTES])
+def test_skydios_orientation_is_the_one_against_north_east_down(tmp_path: Path, ned: str) -> None:
+    xmp = _RDF.format(spaces=_SKYDIO, body=_SKYDIO_BODY.replace("{ned}", ned))
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp))
+    assert facts.angles == CameraAngles(30.5, -88.0, 0.5, "gimbal")
+    assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (47.5, 8.5, 480.5)
+
+
+def test_parrots_camera_angles_count_from_level(tmp_path: Path) -> None:
+    space = 'xmlns:drone-parrot="http://www.parrot.com/drone-parrot/1.0/"'
+    body = "".join(
+        f"<drone-parrot:Camera{name}Degree>{value}</drone-parrot:Camera{name}Degree>"
+        for name, value in (("Yaw", "-12.5"), ("Pitch", "-90.0"), ("Roll", "0.0"))
+    )
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
+    assert facts.angles == CameraAngles(-12.5, -90.0, 0.0, "gimbal")
+
+
+def test_sensefly_states_accuracies(tmp_path: Path) -> None:
+    body = "".join(
+        f"<Camera:{name}>{value}</Camera:{name}>"
+        for name, value in {
+            "Yaw": 10, "Pitch": 2, "Roll": -1, "GPSXYAccuracy": 0.03, "GPSZAccuracy": 0.05, "IMUYawAccuracy": 5,
+            "IMUPitchAccuracy": 1, "IMURollAccuracy": 1,
+        }.items()
+    )  # fmt: skip
+    space = 'xmlns:Camera="http://ns.sensefly.com/Camera/1.0/"'
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
+    assert facts.angles == CameraAngles(10.0, 2.0, -1.0, "nadir")
+    assert (facts.sigma_position_m, facts.sigma_angle_deg) == (0.05, 5.0)
+
+
+def test_a_positioning_error_in_the_gps_tags_is_a_standard_deviation(tmp_path: Path) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0) | {31: 2.5}))
+    assert facts.sigma_position_m == 2.5

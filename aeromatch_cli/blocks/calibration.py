@@ -9,7 +9,7 @@ Source: DJI, Phantom 4 RTK and Zenmuse P1 user manuals.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -50,11 +50,23 @@ def calibrated_camera(xmp: Mapping[str, str], width_px: int, height_px: int) -> 
 
 
 def position_sigma_m(xmp: Mapping[str, str]) -> float | None:
-    """Standard deviation of a coordinate by the RTK receiver, the largest of the three; None where XMP states none."""
-    stated = [_numbers(xmp.get(f"drone-dji:RtkStd{name}", "")) for name in ("Lon", "Lat", "Hgt")]
-    if not all(len(one) == 1 and one[0] > 0.0 for one in stated):
-        return None
-    return max(_LEAST_SIGMA_M, *(one[0] for one in stated))
+    """Standard deviation of a coordinate, the largest of those stated by the RTK receiver (DJI) or as GPSXYAccuracy and
+    GPSZAccuracy (senseFly, Pix4D); None where XMP states none."""
+    rtk = _positive(xmp, [f"drone-dji:RtkStd{name}" for name in ("Lon", "Lat", "Hgt")])
+    stated = rtk or _positive(xmp, ["Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"])
+    return max(_LEAST_SIGMA_M, *stated) if stated else None
+
+
+def angle_sigma_deg(xmp: Mapping[str, str]) -> float | None:
+    """Standard deviation of an angle, the largest of IMUYawAccuracy, IMUPitchAccuracy, IMURollAccuracy; None where XMP
+    does not state all."""
+    return max(_positive(xmp, [f"Camera:IMU{name}Accuracy" for name in ("Yaw", "Pitch", "Roll")]), default=None)
+
+
+def _positive(xmp: Mapping[str, str], names: Sequence[str]) -> list[float]:
+    """All of these numbers; none where one is missing or not positive."""
+    found = [_numbers(xmp.get(name, "")) for name in names]
+    return [one[0] for one in found] if all(len(one) == 1 and one[0] > 0.0 for one in found) else []
 
 
 def _of_dewarp(values: tuple[float, ...], width_px: int, height_px: int, dewarped: bool) -> Camera:

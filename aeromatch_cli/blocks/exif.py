@@ -1,8 +1,6 @@
 """What an image file says of itself in its header: EXIF, GPS and XMP. Pixels are never decoded.
 
-Angles come from the camera's tags, never the aircraft's: DJI's Gimbal*Degree (not Flight*Degree; convention
-`gimbal`), else Camera:Yaw/Pitch/Roll of the Pix4D namespace (Parrot, senseFly, MicaSense; convention `nadir`: the
-image top points north at zero angles). Yaw is against true north in both.
+What XMP says is read by `xmp` and `calibration`.
 """
 
 from __future__ import annotations
@@ -10,14 +8,15 @@ from __future__ import annotations
 import math
 import struct
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.xmp import ALTITUDES, LATITUDES, LONGITUDES, CameraAngles, xmp_angles, xmp_properties
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import tiff
@@ -28,19 +27,10 @@ _DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL = 36867, 37520, 37521
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
+_POSITIONING_ERROR = 31  # GPSHPositioningError, metres
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
-
-
-@dataclass(frozen=True)
-class CameraAngles:
-    """Attitude of the camera, degrees; yaw against true north. convention: "gimbal" or "nadir"."""
-
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float
-    convention: str
 
 
 @dataclass(frozen=True)
@@ -51,8 +41,9 @@ class ExifFacts:
     focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: by an RTK receiver,
-    standard deviation of each coordinate. notes: what was found and could not be used.
+    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: standard deviation
+    of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles. notes: what was found
+    and could not be used.
     """
 
     width_px: int
@@ -72,6 +63,7 @@ class ExifFacts:
     angles: CameraAngles | None = None
     calibrated: Camera | None = None
     sigma_position_m: float | None = None
+    sigma_angle_deg: float | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -95,7 +87,7 @@ def read_exif(path: Path) -> ExifFacts:
     width_px, height_px = header.size_px
     if width_px < 1 or height_px < 1:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
-    tags, exif, xmp = header.main, header.exif, _xmp(header.xmp, notes)
+    tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     orientation = _number(tags.get(_ORIENTATION)) or 1.0
@@ -114,9 +106,10 @@ def read_exif(path: Path) -> ExifFacts:
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
         relative_altitude_m=_number(xmp.get("drone-dji:RelativeAltitude")),
-        angles=_angles(xmp),
+        angles=xmp_angles(xmp),
         calibrated=calibrated_camera(xmp, width_px, height_px),
-        sigma_position_m=position_sigma_m(xmp),
+        sigma_position_m=position_sigma_m(xmp) or _positive(header.gps.get(_POSITIONING_ERROR)),
+        sigma_angle_deg=angle_sigma_deg(xmp),
         notes=tuple(notes),
     )
 
@@ -198,53 +191,6 @@ def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]
     return tables
 
 
-def _xmp(packet: Any, notes: list[str]) -> dict[str, str]:
-    """XMP properties as "prefix:Name" -> text, with DJI's and Pix4D's namespaces under their usual prefixes."""
-    from xml.etree.ElementTree import ParseError
-
-    from defusedxml import DefusedXmlException
-    from defusedxml.ElementTree import fromstring
-
-    if isinstance(packet, str):
-        packet = packet.encode()
-    if not isinstance(packet, bytes) or not packet.strip(b"\0 \r\n\t"):
-        return {}
-    try:
-        root = fromstring(packet.strip(b"\0 \r\n\t"))
-    except (ParseError, DefusedXmlException, ValueError):
-        notes.append("XMP block is malformed")
-        return {}
-    properties: dict[str, str] = {}
-    for element in root.iter():
-        pairs = [*element.attrib.items(), (element.tag, element.text or "")]
-        for name, value in pairs:
-            namespace, _, local = name.rpartition("}")
-            prefix = _prefix(namespace)
-            if prefix and value.strip():
-                properties.setdefault(f"{prefix}:{local}", value.strip())
-    return properties
-
-
-def _prefix(namespace: str) -> str:
-    lowered = namespace.lower()
-    if "drone-dji" in lowered:
-        return "drone-dji"
-    if "/camera/" in lowered and "adobe" not in lowered:
-        return "Camera"
-    return "tiff" if "/tiff/" in lowered else ""
-
-
-def _angles(xmp: Mapping[str, str]) -> CameraAngles | None:
-    for names, convention in (
-        (("drone-dji:GimbalYawDegree", "drone-dji:GimbalPitchDegree", "drone-dji:GimbalRollDegree"), "gimbal"),
-        (("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), "nadir"),
-    ):
-        yaw, pitch, roll = (_number(xmp.get(name)) for name in names)
-        if yaw is not None and pitch is not None and roll is not None:
-            return CameraAngles(yaw, pitch, roll, convention)
-    return None
-
-
 def _position(
     gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
 ) -> tuple[float | None, float | None, float | None]:
@@ -253,10 +199,7 @@ def _position(
     if latitude is None or longitude is None:
         if gps.get(2) is not None or gps.get(4) is not None:
             notes.append("GPS position is incomplete or out of range")
-        latitude = _number(xmp.get("drone-dji:GpsLatitude", xmp.get("drone-dji:Latitude")))
-        # DJI's firmware spelt the tag "GpsLongtitude" for years.
-        named = ("drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude")
-        longitude = next((_number(xmp[name]) for name in named if name in xmp), None)
+        latitude, longitude = (_first(xmp, names) for names in (LATITUDES, LONGITUDES))
     if latitude is None or longitude is None or abs(latitude) > 90.0 or abs(longitude) > 180.0:
         return None, None, None
     if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
@@ -265,10 +208,14 @@ def _position(
     return latitude, longitude, _altitude(gps, xmp)
 
 
+def _first(xmp: Mapping[str, str], names: Sequence[str]) -> float | None:
+    return next((_number(xmp[name]) for name in names if name in xmp), None)
+
+
 def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> float | None:
     altitude = _number(gps.get(6))
     if altitude is None:
-        return _number(xmp.get("drone-dji:AbsoluteAltitude"))
+        return _first(xmp, ALTITUDES)
     reference = gps.get(5)
     code = reference[0] if isinstance(reference, bytes) and reference else _number(reference)
     # 1: below sea level; 3: below the ellipsoid (Exif 3.0). Some writers store the character instead of the number.

@@ -77,7 +77,8 @@ def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observatio
     convention = found.convention if angles == "auto" else angles
     attitude = (found.yaw_deg, found.pitch_deg, found.roll_deg)
     forward = convention == "gimbal"
-    return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward, facts.sigma_position_m)
+    sigmas = facts.sigma_position_m, facts.sigma_angle_deg
+    return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward, *sigmas)
 
 
 class Located(NamedTuple):
