@@ -41,9 +41,9 @@ class ExifFacts:
     focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: standard deviation
-    of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles. notes: what was found
-    and could not be used.
+    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: standard
+    deviation of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles. notes:
+    what was found and could not be used.
     """
 
     width_px: int

@@ -1,9 +1,9 @@
 """What aircraft write into the XMP of their pictures: angles of the camera, positions.
 
 Angles come from the camera's tags, never the aircraft's (Flight*Degree): DJI's and newer Autels' Gimbal*Degree,
-Skydio's CameraOrientationNED and Parrot's Camera*Degree count from level (`gimbal`: pitch -90 looks down); Camera:Yaw,
-Pitch, Roll of the Pix4D namespace (senseFly, MicaSense, Sequoia, older Autels, integrators of Sony cameras) from straight down
-with the image's top to the north (`nadir`). Yaw is against true north in all.
+Skydio's CameraOrientationNED and Parrot's Camera*Degree count from level (`gimbal`: pitch -90 looks down);
+Camera:Yaw, Pitch, Roll of the Pix4D namespace (senseFly, MicaSense, Sequoia, older Autels, integrators of Sony
+cameras) from straight down with the image's top to the north (`nadir`). Yaw is against true north in all.
 """
 
 from __future__ import annotations
