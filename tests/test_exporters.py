@@ -324,3 +324,27 @@ def test_a_geopackage_has_three_layers_in_the_blocks_crs(contents, truth: Truth,
     assert fields[list(meta["fields"]).index("image")][0] == "flight/0.jpg"
     _, _, lines, fields = pyogrio.raw.read(path, layer="pairs")
     assert len(lines) == len(truth.pairs)
+
+
+def test_bingo_writes_millimetres_from_the_principal_point(contents, truth: Truth, tmp_path: Path) -> None:
+    """Rays of the adjusted points by the collinearity equations: y up, no distortion left."""
+    EXPORTERS["bingo"](pixel_um=5.0)(contents(), tmp_path / "p")  # type: ignore[operator]
+    lines = (tmp_path / "p" / "image.txt").read_text().splitlines()
+    end = lines.index("-99")
+    number, focal = lines[0].split()
+    fx, fy = truth.block.cameras["a"].params[:2]
+    assert (number, float(focal)) == ("1", pytest.approx((fx + fy) / 2 * 0.005))
+    adjusted = adjusted_block(truth)
+    pose = truth.block.poses["img0"]
+    for line in lines[1:end]:
+        point, x, y = line.split()
+        ray = np.asarray(pose.world_rotation) @ (adjusted.points_m[int(point) - 1] - pose.center_m)
+        expected = ray[0] / ray[2] * fx * 0.005, -ray[1] / ray[2] * fy * 0.005
+        np.testing.assert_allclose([float(x), float(y)], expected, atol=2e-5)
+    assert end > 50
+    assert (tmp_path / "p" / "photos.txt").read_text().splitlines()[1] == "2 flight/1.jpg"
+
+
+def test_the_guide_has_every_exporter() -> None:
+    guide = (Path(__file__).parent.parent / "docs" / "guide.md").read_text()
+    assert [name for name in EXPORTERS if f"| `{name}`" not in guide] == []

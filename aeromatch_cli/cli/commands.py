@@ -26,9 +26,9 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
         "aeromatch synth OUT --preset suburb --images 12 --seed 0",
         "aeromatch synth OUT --preset city --flight two-flights --size 1000x750 --images 24",
     ),
-    "weights list": ("aeromatch weights list",),
-    "weights verify": ("aeromatch weights verify --json",),
-    "weights add": ("aeromatch weights add sift_lightglue.pth",),
+    "weights list": ("aeromatch weights list", "aeromatch weights list --json"),
+    "weights verify": ("aeromatch weights verify", "aeromatch weights verify --json"),
+    "weights add": ("aeromatch weights add sift_lightglue.pth", "aeromatch weights add sift_lightglue.safetensors"),
 }
 # Written out: the modules that know them are too heavy for --help. A test compares.
 _SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"

@@ -21,7 +21,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
         "aeromatch show WORK",
         "aeromatch show WORK DJI_0001.JPG DJI_0002.JPG --rejected",
     ),
-    "compare": ("aeromatch compare WORK1 WORK2",),
+    "compare": ("aeromatch compare WORK1 WORK2", "aeromatch compare WORK1 WORK2 --json"),
     "config": ("aeromatch config", "aeromatch config fusion --set extract.keypoints=12000"),
     "list": ("aeromatch list", "aeromatch list match"),
     "init": ("aeromatch init --images IMGS", "aeromatch init block.yaml --images IMGS"),

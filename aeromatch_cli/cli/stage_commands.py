@@ -52,45 +52,75 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     ),
     "orient": (
         "Find cameras, poses and terrain of the block from a first pass over reduced images.",
-        ("aeromatch orient baseline --images IMGS --poses exif --workspace WORK",),
+        (
+            "aeromatch orient --images IMGS --workspace WORK",
+            "aeromatch orient baseline --images IMGS --poses none --set orient=incremental",
+        ),
     ),
     "pairs": (
         "Read the block and choose the pairs of images.",
-        ("aeromatch pairs baseline --images IMGS --poses poses.csv --set pairs.min_overlap=0.2",),
+        (
+            "aeromatch pairs baseline --images IMGS --poses poses.csv --set pairs.min_overlap=0.2",
+            "aeromatch pairs baseline --images IMGS --poses geo.txt --set pairs.max_neighbours=30",
+        ),
     ),
     "enhance": (
         "Write the enhanced picture of every image that is enhanced.",
-        ("aeromatch enhance fusion --images IMGS --poses poses.csv --workspace WORK",),
+        (
+            "aeromatch enhance fusion --images IMGS --poses poses.csv --workspace WORK",
+            "aeromatch enhance baseline --images IMGS --set enhance=wallis --workspace WORK",
+        ),
     ),
     "simulate": (
         "Write the simulated views of every image.",
-        ("aeromatch simulate baseline --images IMGS --poses poses.csv --workspace WORK",),
+        (
+            "aeromatch simulate baseline --images IMGS --poses poses.csv --workspace WORK",
+            "aeromatch simulate baseline --images IMGS --set simulate=neighbours --workspace WORK",
+        ),
     ),
     "extract": (
         "Find keypoints and descriptors in every image.",
-        ("aeromatch extract baseline --images IMGS --poses poses.csv --shard 1/4",),
+        (
+            "aeromatch extract baseline --images IMGS --poses poses.csv --shard 1/4",
+            "aeromatch extract oblique --images IMGS --set extract.keypoints=6000",
+        ),
     ),
     "match": (
         "Match every pair; features that are missing are made first.",
-        ("aeromatch match baseline --images IMGS --poses poses.csv --shard 1/4",),
+        (
+            "aeromatch match baseline --images IMGS --poses poses.csv --shard 1/4",
+            "aeromatch match baseline --images IMGS --set match.guided=true",
+        ),
     ),
     "filter": (
         "Verify the matches of every pair.",
-        ("aeromatch filter baseline --images IMGS --poses poses.csv --set filter=poselib+graph",),
+        (
+            "aeromatch filter baseline --images IMGS --poses poses.csv --set filter=poselib+graph",
+            "aeromatch filter --workspace WORK",
+        ),
     ),
     "adjust": (
         "Adjust the oriented block from the verified matches: poses, cameras and points.",
-        ("aeromatch adjust baseline --images IMGS --poses poses.csv --workspace WORK",),
+        (
+            "aeromatch adjust --workspace WORK",
+            "aeromatch adjust --workspace WORK --gcp gcp_list.txt",
+        ),
     ),
     "export": (
         "Write the verified matches for other programs.",
-        ("aeromatch export baseline --images IMGS --poses poses.csv --workspace WORK",),
+        (
+            "aeromatch export --workspace WORK",
+            "aeromatch export --workspace WORK --set export=colmap+opensfm+geojson",
+        ),
     ),
-    "report": ("Write the HTML report.", ("aeromatch report baseline --images IMGS --poses poses.csv",)),
+    "report": (
+        "Write the HTML report.",
+        ("aeromatch report --workspace WORK", "aeromatch report baseline --images IMGS --poses poses.csv"),
+    ),
     "check": (
         "Dry run that writes nothing: are images readable, poses plausible, weights present; estimates of pairs, time, "
         "memory and disk.",
-        ("aeromatch check fusion --images IMGS --poses poses.csv",),
+        ("aeromatch check --images IMGS", "aeromatch check fusion --images IMGS --poses poses.csv"),
     ),
 }
 

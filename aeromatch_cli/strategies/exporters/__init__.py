@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.alicevision import AliceVision
+from aeromatch_cli.strategies.exporters.bingo import Bingo
 from aeromatch_cli.strategies.exporters.blocks_exchange import BlocksExchange
 from aeromatch_cli.strategies.exporters.bundler import Bundler
 from aeromatch_cli.strategies.exporters.colmap import Colmap
@@ -28,6 +29,7 @@ EXPORTERS: Mapping[str, type[Strategy]] = {
     "micmac": MicMac,
     "openmvg": OpenMvg,
     "bundler": Bundler,
+    "bingo": Bingo,
     "blocks-exchange": BlocksExchange,
     "alicevision": AliceVision,
     "hloc": Hloc,

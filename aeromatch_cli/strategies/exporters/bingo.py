@@ -1,0 +1,66 @@
+"""BINGO and PATB: image points, one block of lines for every photo.
+
+`photo focal` in millimetres, then `point x y` in millimetres from the principal point with x to the right and y up,
+free of distortion; -99 ends a photo. photos.txt has the number and name of each photo, camera.txt what millimetres
+stand for.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from aeromatch_cli.geometry.cameras import focal_px, parameters, undistort
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+
+_MM_PER_UM = 1e-3
+_END = "-99\n"
+
+
+class Bingo(Strategy):
+    """Writes image.txt (image points of BINGO and PATB), photos.txt (their numbers) and camera.txt."""
+
+    version: ClassVar[int] = 1
+    name: Literal["bingo"] = "bingo"
+    pixel_um: float = Field(
+        4.0, gt=0.0, description="Size of a pixel on the sensor, micrometres; it sets the scale of all millimetres."
+    )
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written."""
+        solution = Solution.of(contents)
+        mm = self.pixel_um * _MM_PER_UM
+        with whole_folder(folder) as partial:
+            found = matched(contents, adjusted_tracks=True)
+            lines, names, keypoints = [], [], 0
+            for number, image in enumerate(solution.images, start=1):
+                camera = solution.camera(image)
+                places = np.asarray(contents.keypoints_px(image.image_id), np.float64).reshape(-1, 2)
+                keypoints += len(places)
+                own = np.flatnonzero(found.image_idx == number - 1)
+                values = parameters(camera)
+                flat = undistort(camera, places[found.keypoint[own]]) - [values["cx"], values["cy"]]
+                names.append(f"{number} {image.name}\n")
+                lines.append(f"{number} {focal_px(camera) * mm:.5f}\n")
+                for track, (x, y) in zip(found.track[own], flat * [mm, -mm], strict=True):
+                    lines.append(f"{track + 1} {x:.6f} {y:.6f}\n")
+                lines.append(_END)
+            write(partial / "image.txt", "".join(lines))
+            write(partial / "photos.txt", "".join(names))
+            write(partial / "camera.txt", "".join(self._camera_lines(solution, mm)))
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+
+    def _camera_lines(self, solution: Solution, mm: float) -> list[str]:
+        lines = [f"pixel {self.pixel_um} um; millimetres count from the principal point, x right, y up\n"]
+        for camera_id, camera in sorted(solution.cameras.items()):
+            values = parameters(camera)
+            lines.append(
+                f"{camera_id}: focal length {focal_px(camera) * mm:.5f} mm, principal point {values['cx']:.3f} "
+                f"{values['cy']:.3f} px from the middle of the first pixel\n"
+            )
+        return lines
