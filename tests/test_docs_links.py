@@ -13,6 +13,7 @@ from conftest import invoke
 from read_pages import PAGES, ROOT, anchors, commands, inline_code, links, text_of
 
 from aeromatch_cli.cli import app
+from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.stage_commands import STAGES
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.errors import ConfigError
@@ -160,7 +161,7 @@ def script_words(text: str) -> list[list[str]]:
     return [code.removeprefix("scripts/").split() for code in written if re.match(r"scripts/\w", code)]
 
 
-@pytest.mark.parametrize("name", [*STAGES, "evaluate", "synth", "weights list", "weights verify", "weights add"])
+@pytest.mark.parametrize("name", [*STAGES, *LOOK, "evaluate", "synth", "weights list", "weights verify", "weights add"])
 def test_help_shows_examples_that_are_understood(name: str) -> None:
     shown = invoke(*name.split(), "--help").stdout.partition("Examples:")[2]
     examples = [line.strip() for line in shown.splitlines() if line.strip()]
