@@ -10,6 +10,8 @@ import pytest
 from conftest import QUICK, Site, invoke
 from read_pages import ROOT, commands, text_of
 
+from aeromatch_cli.cli.look_commands import LOOK
+
 pytestmark = pytest.mark.slow
 
 RUN_PAGES = [ROOT / "README.md", ROOT / "docs" / "guide.md", *sorted((ROOT / "docs" / "methods").glob("*.md"))]
@@ -30,7 +32,10 @@ def on_the_site(command: str, site: Site) -> list[str]:
         r"(IMGS|\w+/images)": str(site.images),
         r"(poses\.csv|\w+/poses_noisy\.csv)": str(site.poses),
         r"\w+/block\.json": str(site.root / "block.json"),
-        r"(WORK|work[\w-]*)": str(site.work),
+        r"(WORK[12]?|work[\w-]*)": str(site.work),
+        r"DJI_0077(\.JPG)?": site.names()[0],
+        r"DJI_0080(\.JPG)?": site.names()[1],
+        r"WORK/verified/\w+\.npz": str(site.work / "verified" / f"{site.names()[0].replace('.', '_')}.npz"),
     }
     for pattern, place in places.items():
         words = [place if re.fullmatch(pattern, word) else word for word in words]
@@ -46,7 +51,7 @@ def quick(words: list[str], site: Site) -> list[str]:
         return [*kept, *(text for pair in options.items() for text in pair), "--jobs", "1"]
     if words[0] == "evaluate":
         return [*words[:3], str(site.root), *words[4:]]
-    if words[0].startswith("-") or words[0] == "weights":
+    if words[0].startswith("-") or words[0] in ("weights", *LOOK):
         return words
     if words[0] == "run" and words[1] in ("oblique", "fusion", "polar"):
         words = ["check", *words[1:]]
@@ -62,7 +67,7 @@ def test_the_command_runs(command: str, site: Site, monkeypatch: pytest.MonkeyPa
     words = quick(on_the_site(command, site), site)
     for earlier in STAGES_BEFORE.get(words[0], ()):
         assert invoke(earlier, *words[1:]).code == 0
-    if words[0] == "evaluate":
+    if words[0] in ("evaluate", "show", "compare"):
         assert site("run").code == 0
     outcome = invoke(*words)
     assert outcome.code == 0, outcome.stderr

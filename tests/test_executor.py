@@ -64,7 +64,7 @@ class Counter:
     def start(self, label: str, total: int) -> None:
         self.told.append(f"{label} {total}")
 
-    def advance(self) -> None:
+    def advance(self, count: int = 1) -> None:
         self.told.append("+")
 
     def stop(self) -> None:
