@@ -271,8 +271,10 @@ class Executor:
                     return []
                 finished, _ = wait(flying, return_when=FIRST_COMPLETED)
                 for future in finished:
-                    index = flying.pop(future)
+                    # The result of a broken pool raises: the task is still in flight then.
+                    index = flying[future]
                     outcomes[index] = future.result()
+                    del flying[future]
                     self._advance(index)
         except BrokenProcessPool:
             self._pool = None
