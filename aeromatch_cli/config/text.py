@@ -48,7 +48,7 @@ def _family(key: str, table: Mapping[str, type[Strategy]], value: Any) -> Iterat
     """A section that chooses among strategies: the default, then the others as comments."""
     chained = isinstance(value, tuple)
     used = value if chained else (value,)
-    yield f"# Names: {', '.join(table)}"
+    yield from _comment(f"Names: {', '.join(table)}")
     yield f"{key}:" if used else f"{key}: []"
     for strategy in used:
         yield from _indented(_strategy_lines(strategy, chained=chained))
