@@ -5,7 +5,6 @@ What XMP says is read by `xmp` and `calibration`.
 
 from __future__ import annotations
 
-import math
 import struct
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigma_m
-from aeromatch_cli.blocks.xmp import ALTITUDES, LATITUDES, LONGITUDES, CameraAngles, xmp_angles, xmp_properties
+from aeromatch_cli.blocks.xmp import (
+    ALTITUDES,
+    LATITUDES,
+    LONGITUDES,
+    CameraAngles,
+    tag_number,
+    xmp_angles,
+    xmp_properties,
+)
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import tiff
@@ -90,7 +97,7 @@ def read_exif(path: Path) -> ExifFacts:
     tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
-    orientation = _number(tags.get(_ORIENTATION)) or 1.0
+    orientation = tag_number(tags.get(_ORIENTATION)) or 1.0
     return ExifFacts(
         width_px=width_px,
         height_px=height_px,
@@ -105,7 +112,7 @@ def read_exif(path: Path) -> ExifFacts:
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
-        relative_altitude_m=_number(xmp.get("drone-dji:RelativeAltitude")),
+        relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
         angles=xmp_angles(xmp),
         calibrated=calibrated_camera(xmp, width_px, height_px),
         sigma_position_m=position_sigma_m(xmp) or _positive(header.gps.get(_POSITIONING_ERROR)),
@@ -209,15 +216,15 @@ def _position(
 
 
 def _first(xmp: Mapping[str, str], names: Sequence[str]) -> float | None:
-    return next((_number(xmp[name]) for name in names if name in xmp), None)
+    return next((tag_number(xmp[name]) for name in names if name in xmp), None)
 
 
 def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> float | None:
-    altitude = _number(gps.get(6))
+    altitude = tag_number(gps.get(6))
     if altitude is None:
         return _first(xmp, ALTITUDES)
     reference = gps.get(5)
-    code = reference[0] if isinstance(reference, bytes) and reference else _number(reference)
+    code = reference[0] if isinstance(reference, bytes) and reference else tag_number(reference)
     # 1: below sea level; 3: below the ellipsoid (Exif 3.0). Some writers store the character instead of the number.
     return -abs(altitude) if code in (1, 3, 49, 51) else altitude
 
@@ -228,12 +235,12 @@ def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> fl
     sign = {letters[0]: 1.0, letters[1]: -1.0}.get(reference[:1].upper())
     if sign is None or not parts or len(parts) > 3:
         return None
-    degrees = _number(parts[0])
+    degrees = tag_number(parts[0])
     if degrees is None or degrees < 0:
         return None
     total = degrees
     for part, scale in zip(parts[1:], (60.0, 3600.0), strict=False):
-        number = _number(part)
+        number = tag_number(part)
         if number is None and getattr(part, "numerator", None) == 0:
             number = 0.0  # 0/0 stands for "no seconds given" with several writers
         if number is None or not 0 <= number <= 60:
@@ -245,7 +252,7 @@ def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> fl
 def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tuple[float | None, bool]:
     """Pixels per millimetre of the stored raster, and whether EXIF names the raster that the tag speaks of."""
     resolution = _positive(exif.get(_FOCAL_PLANE_X))
-    unit_mm = _MM_PER_UNIT.get(int(_number(exif.get(_FOCAL_PLANE_UNIT)) or 2))
+    unit_mm = _MM_PER_UNIT.get(int(tag_number(exif.get(_FOCAL_PLANE_UNIT)) or 2))
     if resolution is None or unit_mm is None:
         return None, False
     exif_width, exif_height = _positive(exif.get(_EXIF_WIDTH)), _positive(exif.get(_EXIF_HEIGHT))
@@ -275,20 +282,6 @@ def _text(value: Any) -> str:
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""
 
 
-def _number(value: Any) -> float | None:
-    """A finite float of a tag or an XMP text (also "a/b"), or None. Pillow makes NaN of a zero denominator."""
-    if isinstance(value, tuple | list) and len(value) == 1:
-        value = value[0]
-    if isinstance(value, str) and "/" in value:
-        numerator, denominator = (_number(part) for part in value.split("/", 1))
-        return numerator / denominator if numerator is not None and denominator else None
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
-
-
 def _positive(value: Any) -> float | None:
-    number = _number(value)
+    number = tag_number(value)
     return number if number is not None and number > 0 else None

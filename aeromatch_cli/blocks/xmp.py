@@ -91,18 +91,22 @@ def _prefix(namespace: str) -> str:
 def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
     """Of the first maker whose three tags are numbers."""
     for names, convention in _ANGLES:
-        values = [_number(xmp.get(name)) for name in names]
+        values = [tag_number(xmp.get(name)) for name in names]
         if None not in values:
             yaw, pitch, roll = (float(value) for value in values if value is not None)
             return CameraAngles(yaw, pitch, roll, convention)
     return None
 
 
-def _number(text: str | None) -> float | None:
-    """A finite number, also written a/b."""
+def tag_number(value: Any) -> float | None:
+    """A finite float of a tag or an XMP text (also "a/b"), or None. Pillow makes NaN of a zero denominator."""
+    if isinstance(value, tuple | list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, str) and "/" in value:
+        numerator, denominator = (tag_number(part) for part in value.split("/", 1))
+        return numerator / denominator if numerator is not None and denominator else None
     try:
-        top, _, bottom = (text or "").partition("/")
-        value = float(top) / float(bottom) if bottom else float(top)
-    except (ValueError, ZeroDivisionError):
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
-    return value if math.isfinite(value) else None
+    return number if math.isfinite(number) else None

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import load
-from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER
+from aeromatch_cli.report.show import opened
 from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.workspace import Workspace, read_json
+from aeromatch_cli.workspace import read_json
 
 _LISTED = 10
 # Settings that change no result.
@@ -77,9 +77,7 @@ def _counts(words: str, first: float, second: float) -> str:
 
 
 def _side(root: Path) -> _Side:
-    workspace = Workspace(root)
-    if not workspace.images.is_file():
-        raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
+    workspace = opened(root)
     names = {image.image_id: image.name for image in read_images(workspace.images)}
     final = FinalEntries(workspace)
     matches: dict[tuple[str, str], int] = {}

@@ -39,16 +39,20 @@ class Shown:
     picture: Path | None = None
 
 
+def opened(root: Path) -> Workspace:
+    """Raises InputError where the folder is no workspace, WorkspaceError for one of another format version."""
+    workspace = Workspace(root)
+    if not workspace.images.is_file():
+        raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
+    workspace.check_version()
+    return workspace
+
+
 class _Work:
     """A workspace's tables, each read once."""
 
     def __init__(self, root: Path) -> None:
-        self.workspace = Workspace(root)
-        if not self.workspace.images.is_file():
-            raise InputError(
-                f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace"
-            )
-        self.workspace.check_version()
+        self.workspace = opened(root)
 
     @cached_property
     def images(self) -> dict[str, Image]:

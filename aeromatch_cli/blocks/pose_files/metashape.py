@@ -15,6 +15,7 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -116,13 +117,12 @@ def _row(
         sigma_position_m=None if from_estimate else max(sigmas, default=None),
     )  # fmt: skip
     if whole and angles == _ANGLES[1]:
-        return PoseRow(**{**vars(row), "attitude_kind": "omega_phi_kappa", "forward": None}), from_estimate
+        return replace(row, attitude_kind="omega_phi_kappa", forward=None), from_estimate
     if whole and angles == _ANGLES[2]:
         phi, omega, kappa = attitude
         photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
         turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, kind)
-        facts = {"attitude": turned.attitude, "attitude_kind": "quaternion", "forward": None}
-        return PoseRow(**{**vars(row), **facts}), from_estimate
+        return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None), from_estimate
     return row, from_estimate
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import PureWindowsPath
 
@@ -76,7 +77,7 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
                 image=image_name(name), line=line, position=(values[0], values[1], values[2]), position_kind="grid",
                 attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
             )  # fmt: skip
-        rows.append(PoseRow(**{**vars(row), "numbered": numbered}))
+        rows.append(replace(row, numbered=numbered))
     words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {'gon' if gon else 'degrees'}"
     remarks: tuple[str, ...] = ()
     if not (order or unit):
@@ -125,7 +126,7 @@ def read_patb(source: Source) -> PoseList:
     transposed = _along_track(places, photos.transpose(0, 2, 1)) > _along_track(places, photos)
     world_from_photo = photos.transpose(0, 2, 1) if transposed else photos
     rows = [
-        PoseRow(**{**vars(rotation_row(name, line, place, CAM_FROM_PHOTO @ matrix.T)), "numbered": is_number(name)})
+        replace(rotation_row(name, line, place, CAM_FROM_PHOTO @ matrix.T), numbered=is_number(name))
         for name, line, place, matrix in zip(names, lines, places, world_from_photo, strict=True)
     ]
     words = "matrix from ground to photo" if transposed else "matrix from photo to ground"

@@ -17,7 +17,7 @@ from aeromatch_cli.data import Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, keypoints_of, matched, summary_of, write
 
 _LOCAL = "local"
 
@@ -33,7 +33,7 @@ class BlocksExchange(Strategy):
         solution = Solution.of(contents)
         with whole_folder(folder) as partial:
             found = matched(contents, adjusted_tracks=True)
-            keypoints = {i.image_id: np.asarray(contents.keypoints_px(i.image_id), np.float64) for i in solution.images}
+            keypoints = keypoints_of(contents)
             origin_m, crs = np.array(contents.block.origin_m), contents.block.crs
             groups = "".join(
                 _group(number, camera, [i for i in solution.images if i.camera_id == camera_id], solution, origin_m)

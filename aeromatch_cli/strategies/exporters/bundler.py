@@ -17,7 +17,7 @@ from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, keypoints_of, matched, summary_of, write
 
 _GREY = "128 128 128"
 
@@ -34,7 +34,7 @@ class Bundler(Strategy):
         solution = Solution.of(contents)
         with whole_folder(folder) as partial:
             found = matched(contents, adjusted_tracks=True)
-            keypoints = {i.image_id: np.asarray(contents.keypoints_px(i.image_id), np.float64) for i in solution.images}
+            keypoints = keypoints_of(contents)
             write(partial / "list.txt", "".join(f"{image.name}\n" for image in solution.images))
             points = _points(found, solution, keypoints)
             cameras = [_camera(solution, number) for number in range(len(solution.images))]

@@ -18,7 +18,7 @@ from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, keypoints_of, matched, summary_of, write
 
 _ORI = "Ori-aeromatch"
 
@@ -37,11 +37,9 @@ class MicMac(Strategy):
         solution = Solution.of(contents)
         names = {image.image_id: image.name.replace("/", "_") for image in solution.images}
         with whole_folder(folder) as partial:
-            found = matched(contents)
+            found, keypoints = matched(contents), keypoints_of(contents)
             for id0, id1, rows in found.pairs:
-                points = [
-                    np.asarray(contents.keypoints_px(i), np.float64)[rows[:, k]] for k, i in enumerate((id0, id1))
-                ]
+                points = [keypoints[i][rows[:, k]] for k, i in enumerate((id0, id1))]
                 for first, second, places in ((id0, id1, points), (id1, id0, points[::-1])):
                     self._write_pair(partial / "Homol" / f"Pastis{names[first]}", names[second], np.hstack(places))
             for image in solution.images:
@@ -51,8 +49,8 @@ class MicMac(Strategy):
                     write(partial / _ORI / f"Orientation-{names[image.image_id]}.xml", text)
             for camera_id, camera in solution.cameras.items():
                 write(partial / _ORI / f"AutoCal_{camera_id}.xml", _calibration(camera))
-            keypoints = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
-            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+            count = sum(map(len, keypoints.values()))
+            return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
 
     def _write_pair(self, folder: Path, name: str, rows: FloatArray) -> None:
         """rows: (N, 4)."""

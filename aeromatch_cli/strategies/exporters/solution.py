@@ -115,6 +115,11 @@ def _joined(
     return nodes[good, 0][order], nodes[good, 1][order], track[order]
 
 
+def keypoints_of(contents: ExportContents) -> dict[str, FloatArray]:
+    """image_id -> (K, 2) float64 stored pixels of every image, each read once."""
+    return {i.image_id: np.asarray(contents.keypoints_px(i.image_id), np.float64) for i in contents.block.images}
+
+
 def summary_of(
     folder: Path, partial: Path, contents: ExportContents, posed: int, keypoints: int, counts: Mapping[str, int]
 ) -> ExportSummary:

@@ -11,7 +11,7 @@ import numpy as np
 
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, keypoints_of, matched, summary_of, write
 
 _COLUMNS = ("track", "image", "keypoint", "x_px", "y_px", "x_m", "y_m", "z_m")
 
@@ -28,7 +28,7 @@ class Tracks(Strategy):
         solution = Solution.of(contents)
         with whole_folder(folder) as partial:
             found = matched(contents, adjusted_tracks=True)
-            keypoints = {i.image_id: np.asarray(contents.keypoints_px(i.image_id), np.float64) for i in solution.images}
+            keypoints = keypoints_of(contents)
             stream = io.StringIO()
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(_COLUMNS)
