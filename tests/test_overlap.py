@@ -6,9 +6,11 @@ from make_features import described
 
 from aeromatch_cli.data import Pair, PairGeometry, Pose
 from aeromatch_cli.geometry.cameras import from_colmap
+from aeromatch_cli.strategies.matchers.descriptors import comparison as comparing
+from aeromatch_cli.strategies.matchers.descriptors import search
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
-from aeromatch_cli.strategies.matchers.lightglue.overlap import in_overlap
+from aeromatch_cli.strategies.matchers.descriptors.overlap import in_overlap
 
 CAMERA = from_colmap("SIMPLE_PINHOLE", 1000, 750, (900.0, 500.0, 375.0))
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -77,3 +79,30 @@ def test_images_without_keypoints_show_nothing() -> None:
     comparison = Comparison(empty, whole.features1, whole.geometry, whole.comparable)
     shown0, shown1 = in_overlap(comparison, found(rng, 0, 0), Nearest().windows)
     assert (len(shown0), shown1.any()) == (0, False)
+
+
+def test_of_many_keypoints_only_what_both_images_show_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """4,500 keypoints: image 0 shows a ninth of image 1, the same 600 places with descriptors off by noise."""
+    rng = np.random.default_rng(4)
+    looks = [rng.integers(0, 200, (4500, 128)).astype(np.uint8) for _ in "01"]
+    looks[1][:600] = np.clip(looks[0][:600] + rng.normal(0.0, 6.0, (600, 128)), 0, 255)
+    points0, points1 = (rng.uniform(2, [998, 748], (4500, 2)) for _ in "01")
+    points1[:600] = FIRST_PX + points0[:600] / 3.0 + rng.normal(0.0, 0.5, (600, 2))
+    sides = described(points0, looks[0]), described(points1, looks[1])
+    geometry = PairGeometry(Pair("a", "b", np.nan, np.nan, "x"), CAMERA, CAMERA, None, None, None)
+    compared_descriptors, scan = [], comparing.mutual_nearest
+
+    def counted(descriptors0: np.ndarray, descriptors1: np.ndarray, *others: object, **named: object) -> object:
+        compared_descriptors.append((len(descriptors0), len(descriptors1)))
+        return scan(descriptors0, descriptors1, *others, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(comparing, "mutual_nearest", counted)
+    quick = Nearest()(*sides, geometry)
+    scouts, both = compared_descriptors
+    assert scouts == (2000, 2000)
+    assert both[0] == 4500
+    assert 600 <= both[1] < 2200  # the ninth, 600 places beside, and a margin
+    monkeypatch.setattr(search, "_SCOUTS_OF", 10**9)
+    np.testing.assert_array_equal(quick.indices, Nearest()(*sides, geometry).indices)
+    assert len(quick.indices) >= 595  # two that lie together in both images are one
+    assert (quick.indices[:, 0] == quick.indices[:, 1]).all()

@@ -13,7 +13,7 @@ from scipy.fft import dctn, idctn
 from trainings.orientation.command import turn_loss
 from trainings.patches import data
 from trainings.patches.data import learnt_from
-from trainings.patches.draws import compressed, cropped, distinct, drawn, photographed, sources_of
+from trainings.patches.draws import compressed, cropped, distinct, drawn, photographed, sources_of, stored_of
 from trainings.patches.loss import descriptor_loss
 from trainings.patches.sources import homography
 from trainings.patches.tracks import Tracks
@@ -73,7 +73,7 @@ def test_a_crop_along_a_direction_shows_its_content_turned_back(tracks: Tracks) 
     off = wrapped_deg(gradient_peaks(straight) - gradient_peaks(along) - 90.0)
     assert np.median(np.abs(off)) < 15.0
     group = drawn(sources_of({"homographies-0.source": tracks})[0], 32, 0.0, np.random.default_rng(1))
-    first, second, turn = turned(group, np.random.default_rng(2))
+    first, second, turn = turned(group, stored_of(group), np.random.default_rng(2))
     sides = [(side[:, 0] * 255.0).to(torch.uint8).numpy() for side in (first, second)]
     off = wrapped_deg(gradient_peaks(sides[1]) - gradient_peaks(sides[0]) - turn)
     assert np.median(np.abs(off)) < 20.0

@@ -39,9 +39,9 @@ from torch import Tensor, nn
 from aeromatch_cli.nets.geodesc import GeoDesc, Size, describe, load_geodesc
 from aeromatch_cli.nets.patches import fold, in_channels_last
 from trainings.patches.data import prepare, read
-from trainings.patches.draws import Source, distinct, drawn, looked_at, sources_of
+from trainings.patches.draws import Group, Source, distinct, drawn, looked_at, sources_of, stored_of
 from trainings.patches.loss import descriptor_loss
-from trainings.patches.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
+from trainings.patches.runs import Run, add_arguments, ahead, answered, draw_curves, parsed, rate_at, ship
 from trainings.patches.validation import Describe, Pair, pairs_of, sift, table, tfeat
 from trainings.runs import check_recipe
 
@@ -50,7 +50,7 @@ GROUPS = 4  # of a batch, each from one block
 HARDNESS = (-1.0, 1.0)
 # Weight of 1 - cosine to the teacher's answer.
 LIKENESS = 4.0
-REPORT_EVERY, SAVE_EVERY = 100, 25  # steps
+REPORTS, SAVES = 32, 128  # of a run
 QUICK = 120  # tracks of a pair of pictures, and every so many pairs, while it trains
 PEERS = {"TFeat": "tfeat-liberty.params", "HardTFeat": "HardTFeat.pth"}
 
@@ -60,29 +60,35 @@ def train(run: Run, known: list[Source], quick: list[Pair], args: argparse.Names
     teacher = None if args.teacher is None else load_geodesc(args.teacher, "bfloat16", str(run.device))
     weights = np.array([source.weight for source in known])
     started, losses = time.monotonic(), []
-    while run.step < args.steps:
-        rng = np.random.default_rng([run.step, 7, args.seed])
-        hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * run.step / args.steps
+
+    def draw(step: int) -> tuple[list[Group], list[tuple[Tensor, Tensor]], Tensor, np.random.Generator]:
+        """A step's groups, what is stored of them, which tracks are negatives, and draws for the rest."""
+        rng = np.random.default_rng([step, 7, args.seed])
+        hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * step / args.steps
         chosen = rng.choice(len(known), GROUPS, p=weights / weights.sum())
         groups = [drawn(known[i], args.batch // GROUPS, hardness, rng) for i in chosen]
-        sides = [looked_at(group, rng) for group in groups]
+        return groups, [stored_of(group) for group in groups], distinct(groups), rng
+
+    for groups, stored, negatives, rng in ahead(draw, run.step, args.steps, args.jobs):
+        there = [(first.to(run.device), second.to(run.device)) for first, second in stored]
+        sides = [looked_at(group, both, rng) for group, both in zip(groups, there, strict=True)]
         first, second = (torch.cat([side[i] for side in sides]) for i in (0, 1))
         run.network.train()
         # Both sides of a pair go through together.
         both = answered(run.network, torch.stack([first, second], dim=1).flatten(0, 1), run.device)
         both = both.view(len(first), 2, -1)
-        loss = descriptor_loss(both[:, 0], both[:, 1], distinct(groups).to(run.device))
+        loss = descriptor_loss(both[:, 0], both[:, 1], negatives.to(run.device))
         if teacher is not None:
             loss = loss + LIKENESS * unlikeness(both[:, 0], first, teacher, run.device)
         run.learn(loss, rate_at(run.step, args.steps, args.rate))
-        losses.append(float(loss.detach()))
-        if run.step % REPORT_EVERY == 0 or run.step == args.steps:
+        losses.append(loss.detach())
+        if run.step % max(1, args.steps // REPORTS) == 0 or run.step == args.steps:
             minutes = round((time.monotonic() - started) / 60.0, 1)
-            row = {"step": run.step, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
+            row = {"step": run.step, "minutes": minutes, "loss": round(float(torch.stack(losses).mean()), 4)}
             run.log.append(row | {"unseen": table(described_by(run, args), quick)["all"]})
             print(json.dumps(run.log[-1]), flush=True)
             losses = []
-        if run.step % SAVE_EVERY == 0 or run.step == args.steps:
+        if run.step % max(1, args.steps // SAVES) == 0 or run.step == args.steps:
             run.save(args.out / "state.pt")
         if args.minutes and time.monotonic() - started > 60.0 * args.minutes:
             run.save(args.out / "state.pt")

@@ -30,8 +30,8 @@ from torch import Tensor
 from aeromatch_cli.nets.orientation import BINS, OrientationNet, directions
 from aeromatch_cli.nets.patches import fold, in_channels_last
 from trainings.patches.data import prepare, read
-from trainings.patches.draws import Source, developed, drawn, photographed, sources_of
-from trainings.patches.runs import Run, add_arguments, answered, draw_curves, parsed, rate_at, ship
+from trainings.patches.draws import Group, Source, developed, drawn, photographed, sources_of, stored_of
+from trainings.patches.runs import Run, add_arguments, ahead, answered, draw_curves, parsed, rate_at, ship
 from trainings.patches.turns import (
     Orient,
     TurnedPairs,
@@ -48,7 +48,7 @@ from trainings.patches.turns import (
 TOLERANCE_DEG, FLOOR = 7.0, 0.02
 # Small view angles first.
 HARDNESS = (-1.0, 0.5)
-REPORT_EVERY, SAVE_EVERY = 200, 50  # steps
+REPORTS, SAVES = 25, 100  # of a run
 GROUPS = 4
 EACH = 1500  # validation pairs of a set
 PEER = "OriNet.pth"
@@ -73,11 +73,18 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
     """Whether it came to the end; False where --minutes ended it before."""
     weights = np.array([source.weight for source in known])
     started, losses = time.monotonic(), []
-    while run.step < args.steps:
-        rng = np.random.default_rng([run.step, 11, args.seed])
-        hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * run.step / args.steps
+
+    def draw(step: int) -> tuple[list[Group], list[tuple[Tensor, Tensor]], np.random.Generator]:
+        """A step's groups, what is stored of them, and draws for the rest."""
+        rng = np.random.default_rng([step, 11, args.seed])
+        hardness = HARDNESS[0] + (HARDNESS[1] - HARDNESS[0]) * step / args.steps
         chosen = rng.choice(len(known), GROUPS, p=weights / weights.sum())
-        sides = [turned(drawn(known[i], args.batch // GROUPS, hardness, rng), rng) for i in chosen]
+        groups = [drawn(known[i], args.batch // GROUPS, hardness, rng) for i in chosen]
+        return groups, [stored_of(group) for group in groups], rng
+
+    for groups, stored, rng in ahead(draw, run.step, args.steps, args.jobs):
+        there = [(first.to(run.device), second.to(run.device)) for first, second in stored]
+        sides = [turned(group, both, rng) for group, both in zip(groups, there, strict=True)]
         first, second = (torch.cat([photographed(developed(side[i], rng), rng) for side in sides]) for i in (0, 1))
         turn = torch.from_numpy(np.concatenate([side[2] for side in sides])).float()
         run.network.train()
@@ -85,15 +92,15 @@ def train(run: Run, known: list[Source], quick: TurnedPairs, args: argparse.Name
         both = both.view(len(first), 2, BINS)
         loss = turn_loss(both[:, 0], both[:, 1], turn.to(run.device))
         run.learn(loss, rate_at(run.step, args.steps, args.rate))
-        losses.append(float(loss.detach()))
-        if run.step % REPORT_EVERY == 0 or run.step == args.steps:
+        losses.append(loss.detach())
+        if run.step % max(1, args.steps // REPORTS) == 0 or run.step == args.steps:
             minutes = round((time.monotonic() - started) / 60.0, 1)
-            row = {"step": run.step, "minutes": minutes, "loss": round(float(np.mean(losses)), 4)}
+            row = {"step": run.step, "minutes": minutes, "loss": round(float(torch.stack(losses).mean()), 4)}
             run.log.append(row | {"unseen": table(oriented_by(run), quick)["all"]})
             print(json.dumps(run.log[-1]), flush=True)
             losses = []
         over = args.minutes and time.monotonic() - started > 60.0 * args.minutes
-        if over or run.step % SAVE_EVERY == 0 or run.step == args.steps:
+        if over or run.step % max(1, args.steps // SAVES) == 0 or run.step == args.steps:
             run.save(args.out / "state.pt")
         if over:
             return run.step >= args.steps

@@ -41,8 +41,8 @@ def prepare(out: Path, rendered: Path, real: Path, names: Sequence[str], args: A
     known |= {f"block-{index}": partial(_rendered, rendered, index) for index in learnt_from(args.blocks)}
     unseen: dict[str, Make] = {f"block-{index}": partial(_rendered, rendered, index) for index in UNSEEN}
     unseen["homographies"] = partial(_unseen_groups, rendered)
-    # Those for validation first: a run that is ended meanwhile has them.
-    parts = ((out / "unseen", unseen), (out / "known", known))
+    # Those for validation first: a run that is ended meanwhile has them. A table alone needs no others.
+    parts = [(out / "unseen", unseen)] + ([] if getattr(args, "only_table", False) else [(out / "known", known)])
     jobs = [partial(_write, folder, make, name) for folder, makes in parts for name, make in makes.items()]
     for folder, _ in parts:
         folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 from torch.nn import functional
 
@@ -102,7 +103,7 @@ def cropped(patches: Tensor, turns_deg: FloatArray, flips: FloatArray, rng: np.r
     angle = np.deg2rad(turns_deg)
     cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
     theta = np.stack([cosine * flips, -sine, shift[:, 0], sine * flips, cosine, shift[:, 1]], axis=1)
-    matrices = torch.from_numpy(theta.reshape(count, 2, 3)).float()
+    matrices = _beside(theta.reshape(count, 2, 3), patches)
     grid = functional.affine_grid(matrices, [count, 1, PATCH_PX, PATCH_PX], align_corners=False)
     pixels = patches[:, None].float() / 255.0
     return functional.grid_sample(pixels, grid, padding_mode="border", align_corners=False)
@@ -111,36 +112,37 @@ def cropped(patches: Tensor, turns_deg: FloatArray, flips: FloatArray, rng: np.r
 def developed(patches: Tensor, rng: np.random.Generator) -> Tensor:
     """Patches (N, 1, 32, 32) in 0-1 through other tone curves, some with the edge of a cast shadow, with noise."""
     count = len(patches)
-    gamma = torch.from_numpy(np.exp(rng.normal(0.0, 0.3, count))).float()
-    values = patches.clamp(min=1e-3) ** gamma[:, None, None, None]
+    gamma = _beside(np.exp(rng.normal(0.0, 0.3, (count, 1, 1, 1))), patches)
+    values = patches.clamp(min=1e-3) ** gamma
     angle, offset = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-12.0, 12.0, count)
-    lines = torch.from_numpy(np.stack([np.cos(angle), np.sin(angle), offset])).float()[..., None, None]
-    axis = torch.arange(PATCH_PX) - (PATCH_PX - 1) / 2.0
+    lines = _beside(np.stack([np.cos(angle), np.sin(angle), offset]), patches)[..., None, None]
+    axis = torch.arange(PATCH_PX, device=patches.device) - (PATCH_PX - 1) / 2.0
     beyond = torch.sigmoid((lines[0] * axis + lines[1] * axis[:, None] - lines[2]) * 1.5)
     depth = np.where(rng.random(count) < 0.15, rng.uniform(0.3, 0.7, count), 0.0)
-    values = values * (1.0 - torch.from_numpy(depth).float()[:, None, None] * beyond)[:, None]
-    spread = values.std(dim=(1, 2, 3), keepdim=True)
-    noise = torch.from_numpy(rng.standard_normal(values.shape, np.float32) * rng.uniform(0, 0.15, (count, 1, 1, 1)))
-    return values + noise.float() * spread
+    values = values * (1.0 - _beside(depth, patches)[:, None, None] * beyond)[:, None]
+    spread = values.std(dim=(1, 2, 3), keepdim=True) * _beside(rng.uniform(0, 0.15, (count, 1, 1, 1)), patches)
+    # Drawn where the patches are: a million numbers a step.
+    draws = torch.Generator(patches.device).manual_seed(int(rng.integers(2**62)))
+    return values + torch.randn(values.shape, generator=draws, device=patches.device) * spread
 
 
 def photographed(patches: Tensor, rng: np.random.Generator) -> Tensor:
     """Patches (N, 1, 32, 32) in 0-1 as different cameras write them: blurred or sharpened, some compressed."""
     count = len(patches)
-    taps = torch.tensor([0.25, 0.5, 0.25])
+    taps = torch.tensor([0.25, 0.5, 0.25], device=patches.device)
     around = functional.pad(patches, (1, 1, 1, 1), mode="replicate")
     blurred = functional.conv2d(around, (taps[:, None] * taps)[None, None])
-    softness = torch.from_numpy(rng.normal(0.0, SOFTNESS, count)).float().clamp(-1.5, 1.0)[:, None, None, None]
+    softness = _beside(rng.normal(0.0, SOFTNESS, (count, 1, 1, 1)), patches).clamp(-1.5, 1.0)
     values = (patches + softness * (blurred - patches)).clamp(0.0, 1.0)
     steps = np.where(rng.random(count) < COMPRESSED, rng.uniform(0.01, COARSEST, count), 0.0)
-    return compressed(values, torch.from_numpy(steps).float(), tuple(rng.integers(_BLOCK_PX, size=2).tolist()))
+    return compressed(values, _beside(steps, patches), tuple(rng.integers(_BLOCK_PX, size=2).tolist()))
 
 
 def compressed(patches: Tensor, steps: Tensor, shift: tuple[int, int]) -> Tensor:
     """Patches (N, 1, S, S) whose cosine coefficients, in blocks of 8 px, are rounded to multiples of steps (N,), higher
     ones to coarser ones, as in JPEG; 0 leaves a patch as it is. shift: where blocks begin, y and x."""
     count, side = len(patches), patches.shape[-1]
-    place = torch.arange(_BLOCK_PX)
+    place = torch.arange(_BLOCK_PX, device=patches.device)
     basis = torch.cos(torch.pi / _BLOCK_PX * (place + 0.5) * place[:, None]) * (2.0 / _BLOCK_PX) ** 0.5
     basis[0] /= 2.0**0.5
     rolled = patches.roll(shift, (2, 3))
@@ -154,8 +156,19 @@ def compressed(patches: Tensor, steps: Tensor, shift: tuple[int, int]) -> Tensor
     return back.roll((-shift[0], -shift[1]), (2, 3))
 
 
-def looked_at(group: Group, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Both sides (N, 1, 32, 32) of a group as they are described in use.
+def _beside(values: FloatArray, patches: Tensor) -> Tensor:
+    """As float32 where the patches are."""
+    return torch.from_numpy(np.asarray(values, np.float32)).to(patches.device)
+
+
+def stored_of(group: Group) -> tuple[Tensor, Tensor]:
+    """Both sides (N, S, S) uint8 of a group as they are stored."""
+    first, second = (torch.from_numpy(group.tracks.patches[rows]) for rows in (group.rows0, group.rows1))
+    return first, second
+
+
+def looked_at(group: Group, stored: tuple[Tensor, Tensor], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Both sides (N, 1, 32, 32) of a group, `stored_of` it, as they are described in use; made where these are.
 
     The whole group is turned, and perhaps mirrored, alike: by a right angle where upright, else at will.
     """
@@ -163,10 +176,9 @@ def looked_at(group: Group, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     turn = 90.0 * rng.integers(4) if group.upright else rng.uniform(0.0, 360.0)
     flips = np.full(count, -1.0 if rng.random() < 0.5 else 1.0)
     sides = []
-    for rows in (group.rows0, group.rows1):
-        stored = torch.from_numpy(group.tracks.patches[rows])
+    for side in stored:
         turns = turn + jitters_deg(group.upright, count, rng)
-        sides.append(photographed(developed(cropped(stored, turns, flips, rng), rng), rng))
+        sides.append(photographed(developed(cropped(side, turns, flips, rng), rng), rng))
     return sides[0], sides[1]
 
 
@@ -178,7 +190,7 @@ def distinct(groups: list[Group]) -> Tensor:
     for group in groups:
         tracks, rows = group.tracks, slice(first, first + len(group.track))
         place, reach = tracks.place_m[group.track], tracks.reach_m[group.track]
-        apart = np.linalg.norm(place[:, None] - place[None], axis=2)
+        apart = cdist(place, place)
         scene = tracks.scene[group.track]
         far = apart > np.maximum(reach[:, None], reach[None])
         out[rows, rows] = far | (scene[:, None] != scene[None])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from aeromatch_cli.geometry.warps import source_from_view, view_from_source
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT, Level, levels_of
 from aeromatch_cli.strategies.extractors.sift import Sift
 
@@ -58,9 +59,11 @@ class Picture:
         needed = _SEEN_SHARE * SUPPORT / 2.0 * np.nan_to_num(sizes_px)
         return np.asarray(inside & (self._room_px[row, column] >= needed))
 
-    def keypoints(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Places (N, 2) and diameters (N,) of at most `count` SIFT keypoints, evenly spread."""
-        found = Sift(keypoints=count, orientation="upright")(self.camera, [self.pixels])
+    def keypoints(self, count: int, *, by: Literal["sift", "network"] = "sift") -> tuple[FloatArray, FloatArray]:
+        """Places (N, 2) and diameters (N,) of at most `count` keypoints, evenly spread: of SIFT, or of the detector
+        network that ships."""
+        detector = Sift if by == "sift" else Learned
+        found = detector(keypoints=count, orientation="upright")(self.camera, [self.pixels])
         return found.view_keypoints_px.astype(np.float64), found.view_size_px.astype(np.float64)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -25,8 +25,10 @@ from trainings.patches.sights import Picture, Sight, sights_of
 from trainings.patches.tracks import MARGIN, STORED_PX, Look, Spots, Tracks, assembled, part, tracks_of
 
 SMALLEST_PX, LARGEST_PX = 3.2, 40.0
-KEYPOINTS = 700  # asked for in a picture of a rendered block
-TRACKS = 1800  # of a block and kind
+KEYPOINTS = 700  # asked for in a picture of a rendered block, of either detector
+TRACKS = 2800  # of a block and kind of picture
+# What is described in use are the network's keypoints; SIFT's are elsewhere, and of other sizes.
+DETECTORS: tuple[Literal["sift", "network"], ...] = ("sift", "network")
 VIEWS, PER_VIEW = 3, 120  # of a homography group
 REAL_SIZE_PX, REAL_TRACKS = 1600, 3500
 # Patches of a reference point that correlate less with the one that is most like the others do not show it.
@@ -49,8 +51,9 @@ def rendered(folder: Path) -> dict[str, Tracks]:
     found = {}
     for name, upright in (("ground", True), ("source", False)):
         of_kind = [sight for sight in sights if sight.upright is upright]
-        parts = [_met(truth, sight, *sight.keypoints(KEYPOINTS)) for sight in of_kind]
-        origins = np.repeat(np.arange(len(parts)), [len(part.sizes_px) for part in parts])
+        asked = [(index, by) for by in DETECTORS for index in range(len(of_kind))]
+        parts = [_met(truth, of_kind[index], *of_kind[index].keypoints(KEYPOINTS, by=by)) for index, by in asked]
+        origins = np.repeat([index for index, _ in asked], [len(part.sizes_px) for part in parts])
         spots = Spots(*(np.concatenate([getattr(p, key) for p in parts]) for key in vars(parts[0])))
         kept = _spread(spots.sizes_px, TRACKS, rng)
         found[name] = tracks_of(of_kind, spots.take(kept), origins[kept], visible, rng)

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from trainings.patches.draws import Group, cropped, developed, drawn, sources_of
+from trainings.patches.draws import Group, cropped, developed, drawn, sources_of, stored_of
 from trainings.patches.tracks import Tracks
 
 Orient = Callable[[NDArray[np.uint8]], FloatArray]  # (N, 32, 32) -> (N,) degrees
@@ -21,14 +21,13 @@ WITHIN_DEG = (10.0, 20.0)
 _BINS, _SIGMA_PX, _STORED_BLUR_PX = 36, 2.5, 0.5
 
 
-def turned(group: Group, rng: np.random.Generator) -> tuple[Tensor, Tensor, FloatArray]:
-    """Both sides (N, 1, 32, 32) in 0-1 of a group, each turned at will, off place and scale; and by how much (N,) the
-    orientation of the second is to exceed that of the first, degrees."""
+def turned(group: Group, stored: tuple[Tensor, Tensor], rng: np.random.Generator) -> tuple[Tensor, Tensor, FloatArray]:
+    """Both sides (N, 1, 32, 32) in 0-1 of a group, `stored_of` it, each turned at will, off place and scale; and by how
+    much (N,) the orientation of the second is to exceed that of the first, degrees."""
     sides, upright = [], []
-    for rows in (group.rows0, group.rows1):
+    for rows, side in zip((group.rows0, group.rows1), stored, strict=True):
         along = rng.uniform(0.0, 360.0, len(rows))
-        stored = torch.from_numpy(group.tracks.patches[rows])
-        sides.append(cropped(stored, along, np.ones(len(rows)), rng))
+        sides.append(cropped(side, along, np.ones(len(rows)), rng))
         # A patch that is cut along a direction shows its content turned back by it.
         upright.append(group.tracks.turn_deg[rows] - along)
     return sides[0], sides[1], upright[1] - upright[0]
@@ -57,7 +56,7 @@ def unseen_pairs(unseen: Mapping[str, Tracks], each: int) -> TurnedPairs:
     for number, (name, source) in enumerate(zip(unseen, sources_of(unseen), strict=True)):
         rng = np.random.default_rng([number, 51])
         group = drawn(source, min(each, len(source.order)), 0.0, rng)
-        first, second, turn = turned(group, rng)
+        first, second, turn = turned(group, stored_of(group), rng)
         light = np.full(len(turn), name.startswith("homographies"))
         if light[0]:
             first, second = developed(first, rng), developed(second, rng)

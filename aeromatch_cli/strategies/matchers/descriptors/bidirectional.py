@@ -21,7 +21,7 @@ class Bidirectional(Search):
     Source: the purification of J. Geo-inf. Sci. 2021(10), 1823-1837.
     """
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["bidirectional"] = "bidirectional"
     ratio: float = Field(
         0.85,

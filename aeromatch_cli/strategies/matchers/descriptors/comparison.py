@@ -68,7 +68,8 @@ class ViewPair:
 class Comparison:
     """Two images, and which of their views are compared.
 
-    comparable: (V0, V1) bool. where: search windows, None for everywhere.
+    comparable: (V0, V1) bool. where: search windows, None for everywhere. shown: (K0,), (K1,) which keypoints the other
+    image may show, None for all.
     """
 
     features0: Features
@@ -76,13 +77,14 @@ class Comparison:
     geometry: PairGeometry
     comparable: BoolArray
     where: Where | None = None
+    shown: tuple[BoolArray, BoolArray] | None = None
 
     def view_pairs(self) -> Iterator[ViewPair]:
         """The comparable view pairs, in the order of their indices."""
         features0, features1 = self.features0, self.features1
         limits = None if self.where is None else Limits(self.where.windows.forms(), self.where.places_px)
         for view0, view1 in np.argwhere(self.comparable):
-            of0, of1 = np.flatnonzero(features0.view_idx == view0), np.flatnonzero(features1.view_idx == view1)
+            of0, of1 = self._described(0, int(view0)), self._described(1, int(view1))
             keypoints0, keypoints1 = features0.descriptor_keypoint_idx[of0], features1.descriptor_keypoint_idx[of1]
             yield ViewPair(
                 of0=of0,
@@ -93,6 +95,14 @@ class Comparison:
                 keypoint_idx1=keypoints1,
                 limits=None if limits is None else Limits(limits.forms[keypoints0], limits.places[keypoints1]),
             )
+
+    def _described(self, side: int, view: int) -> IntArray:
+        """Descriptors (D,) of a view of one image, of keypoints that the other one may show."""
+        features = (self.features0, self.features1)[side]
+        here = features.view_idx == view
+        if self.shown is not None:
+            here = here & self.shown[side][features.descriptor_keypoint_idx]
+        return np.flatnonzero(here)
 
     def keypoints(self, found: Found) -> tuple[IntArray, IntArray]:
         """Matches as keypoints (N,) of either image."""

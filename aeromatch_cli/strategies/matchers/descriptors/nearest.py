@@ -13,7 +13,7 @@ from aeromatch_cli.strategies.matchers.descriptors.search import Search
 class Nearest(Search):
     """Mutual nearest neighbours with Lowe's ratio test, between views of similar direction. Scores are 1 - d1/d2."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["nearest"] = "nearest"
     ratio: float = Field(
         RATIO,

@@ -18,12 +18,17 @@ from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, Where
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
+from aeromatch_cli.strategies.matchers.descriptors.overlap import by_plane, strongest
 from aeromatch_cli.strategies.matchers.descriptors.views import appearances, comparable_views
 
-# Of guide_below_matches: all pairs are searched again, without counting first.
+# Of guide_below_matches: all pairs are searched again.
 EVERY_PAIR = sys.maxsize
 # Matches closer than this in both images are one.
 _SAME_MATCH_PX = 1.0
+# So many matches without windows predict places well: a scan within the windows would find hardly others.
+_PREDICT = 100
+# So many keypoints of either image, of so many and more, are compared first to learn what both images show.
+_SCOUTS, _SCOUTS_OF = 2000, 4000
 
 T = TypeVar("T")
 # A search that yields inputs for a network, is sent as many outputs, and returns a result. The caller decides when the
@@ -114,12 +119,20 @@ class Search(Strategy):
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
         comparison = Comparison(features0, features1, geometry, source)
-        found = None if self.guide_below_matches == EVERY_PAIR else self.scan(comparison)
+        found = self._first_scan(comparison)
         comparison = replace(comparison, where=where)
-        found = None if found is None else comparison.within(found)
-        if found is None or len(found.rows) < self.guide_below_matches:
+        found = comparison.within(found)
+        if len(found.rows) < self.guide_below_matches:
             comparison, found = yield from self._search_again(comparison, found, enhanced)
         return _matches(comparison, found)
+
+    def _first_scan(self, comparison: Comparison) -> Found:
+        """A scan of all keypoints. Where the strongest keypoints tell what both images show, it compares that alone:
+        most of the time goes into the rest, and what is not there can only be mistaken."""
+        if min(len(side.keypoints_px) for side in (comparison.features0, comparison.features1)) < _SCOUTS_OF:
+            return self.scan(comparison)
+        scouted = self.scan(replace(comparison, shown=strongest(comparison, _SCOUTS)))
+        return self.scan(replace(comparison, shown=by_plane(comparison, scouted)))
 
     @abstractmethod
     def scan(self, comparison: Comparison) -> Found:
@@ -129,14 +142,15 @@ class Search(Strategy):
         """
 
     def _search_again(
-        self, comparison: Comparison, found: Found | None, enhanced: list[BoolArray]
+        self, comparison: Comparison, found: Found, enhanced: list[BoolArray]
     ) -> Steps[tuple[Comparison, Found]]:
         """The comparison with most matches (source or enhanced pictures) and its matches after the guided search.
 
-        found: what a scan without windows has left within them, if there was one. enhanced: comparable view pairs
+        found: what a scan without windows has left within them. enhanced: comparable view pairs
         (V0, V1) of the enhanced pictures, if there are any.
         """
-        first = found if found is not None and comparison.where is None else self.scan(comparison)
+        enough = comparison.where is None or len(found.rows) >= _PREDICT
+        first = found if enough else self._first_scan(comparison)
         others = [replace(comparison, comparable=comparable) for comparable in enhanced]
         scans = [(comparison, first), *((other, self.scan(other)) for other in others)]
         # Under the same sun the borders of shadows are texture, else they mislead: the number of matches decides.

@@ -21,6 +21,7 @@ from aeromatch_cli.strategies.matchers.descriptors.assignment import one_to_one
 from aeromatch_cli.strategies.matchers.descriptors.comparison import Comparison, Found, joined, ratio_test
 from aeromatch_cli.strategies.matchers.descriptors.evidence import most_evident
 from aeromatch_cli.strategies.matchers.descriptors.guided import SecondSearch
+from aeromatch_cli.strategies.matchers.descriptors.overlap import in_overlap
 from aeromatch_cli.strategies.matchers.descriptors.search import Search, Steps
 from aeromatch_cli.strategies.matchers.lightglue.inference import (
     NetworkInput,
@@ -29,7 +30,6 @@ from aeromatch_cli.strategies.matchers.lightglue.inference import (
     loaded_network,
     network_input,
 )
-from aeromatch_cli.strategies.matchers.lightglue.overlap import in_overlap
 
 # Smallest cost of matches that the network did not find; those of the network have 1 - probability.
 _DOUBTFUL = 0.7
@@ -43,7 +43,7 @@ class LightGlue(Search):
     Without `weights`, those that ship with the package, trained on aerial images (nets/trained/lightglue.md).
     """
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     reads_descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["lightglue"] = "lightglue"
     network_below_matches: int = Field(

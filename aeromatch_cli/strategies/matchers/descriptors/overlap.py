@@ -29,18 +29,49 @@ def in_overlap(
     windows: where each keypoint of its image may lie in the other one of a geometry.
     """
     geometry = comparison.geometry
-    points0 = undistort(geometry.camera0, comparison.features0.keypoints_px)
-    points1 = undistort(geometry.camera1, comparison.features1.keypoints_px)
-    idx0, idx1 = comparison.keypoints(found)
-    plane = _plane(points0[idx0], points1[idx1])
-    if plane is not None:
-        there0, there1 = apply_homography(plane, points0), apply_homography(_turned(plane, points0[idx0]), points1)
-        return _near(there0, points1), _near(there1, points0)
+    points0, points1 = _undistorted(comparison)
+    shown = _by_plane(comparison, found, points0, points1)
+    if shown is not None:
+        return shown
     forward = comparison.where.windows if comparison.where else windows(comparison.features0, geometry)
     backward = windows(comparison.features1, geometry.turned()) if forward is not None else None
     if forward is None or backward is None:
         return np.ones(len(points0), dtype=bool), np.ones(len(points1), dtype=bool)
     return _meets(forward, points1), _meets(backward, points0)
+
+
+def strongest(comparison: Comparison, most: int) -> tuple[BoolArray, BoolArray]:
+    """Of either image the `most` keypoints with the strongest responses: (K0,), (K1,)."""
+    found = []
+    for features in (comparison.features0, comparison.features1):
+        chosen = np.zeros(len(features.responses), bool)
+        chosen[np.argsort(-features.responses, kind="stable")[:most]] = True
+        found.append(chosen)
+    return found[0], found[1]
+
+
+def by_plane(comparison: Comparison, found: Found) -> tuple[BoolArray, BoolArray] | None:
+    """Which keypoints (K0,), (K1,) the other image may show, by the plane of the matches found; None where chance gives
+    as good a one."""
+    return _by_plane(comparison, found, *_undistorted(comparison))
+
+
+def _undistorted(comparison: Comparison) -> tuple[FloatArray, FloatArray]:
+    geometry = comparison.geometry
+    points0 = undistort(geometry.camera0, comparison.features0.keypoints_px)
+    return points0, undistort(geometry.camera1, comparison.features1.keypoints_px)
+
+
+def _by_plane(
+    comparison: Comparison, found: Found, points0_px: FloatArray, points1_px: FloatArray
+) -> tuple[BoolArray, BoolArray] | None:
+    idx0, idx1 = comparison.keypoints(found)
+    plane = _plane(points0_px[idx0], points1_px[idx1])
+    if plane is None:
+        return None
+    back = _turned(plane, points0_px[idx0])
+    there0, there1 = apply_homography(plane, points0_px), apply_homography(back, points1_px)
+    return _near(there0, points1_px), _near(there1, points0_px)
 
 
 def _plane(points0_px: FloatArray, points1_px: FloatArray) -> FloatArray | None:
