@@ -143,7 +143,7 @@ def row_with(page: str, table: str, *cells: str) -> list[str]:
     """Texts of the cells of the one row of a table that begins with `cells`."""
     body = page.split(f'id="{table}"')[1].split("</table>")[0]
     found = []
-    for row in re.findall(r"<tr>(.*?)</tr>", body, re.S):
+    for row in re.findall(r"<tr[^>]*>(.*?)</tr>", body, re.S):
         texts = [re.sub(r"<[^>]+>", "", cell).strip() for cell in re.findall(r"<td[^>]*>(.*?)</td>", row, re.S)]
         if texts[: len(cells)] == list(cells):
             found.append(texts)

@@ -19,6 +19,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
+from aeromatch_cli.report.pair_viewer import pair_data
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
@@ -82,6 +83,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
+    shown = _worst_pairs(pairs)
+    drawn, keys = pair_data(context, shown)
     return template.render(
         version=__version__,
         colours=COLOURS,
@@ -108,7 +111,9 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         evaluation=evaluation_figures(context.workspace),
         previews=previews(context, pairs),
         error_limits_px=ERROR_LIMITS_PX,
-        pairs=_worst_pairs(pairs),
+        pairs=shown,
+        pair_data=drawn.text(),
+        pair_keys=keys,
         has_steps=any(row.steps for row in pairs),
         settled=settled_words(_facts(context, "match")) if context.settings.cascade else "",
         pair_count=len(pairs),

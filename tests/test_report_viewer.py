@@ -1,0 +1,101 @@
+"""The report's pair viewer: what is stored against the workspace, and what a browser draws of it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a fixture
+
+from aeromatch_cli.report import pair_viewer
+from aeromatch_cli.report.pair_viewer import pair_data
+from aeromatch_cli.report.rows import gather
+from aeromatch_cli.stages.context import Context
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def stored(page: str) -> dict[str, object]:
+    text = page.split('<script type="application/json" id="pair-data">')[1].split("</script>")[0]
+    return dict(json.loads(text))
+
+
+def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Context) -> None:  # noqa: F811
+    data, keys = pair_data(full, gather(full)[0])
+    # d has no picture, a-d no matches; c-d is neither verified nor rejected.
+    assert keys == {("a", "b"): "0,1", ("a", "c"): "0,2", ("b", "c"): "1,2"}
+    sizes = [(width, height) for _, width, height in data.pictures]
+    assert sizes == [(WIDTH, HEIGHT), (HEIGHT, WIDTH), (WIDTH, HEIGHT)]  # b is shown turned
+    for uri, width, height in data.pictures:
+        picture = PilImage.open(io.BytesIO(base64.b64decode(uri.partition("base64,")[2])))
+        assert picture.size == (width, height)
+    table = np.frombuffer(base64.b64decode(data.pairs["0,1"]), np.uint8).reshape(-1, 5)
+    points = features().keypoints_px[:60].astype(np.float64) + 0.5
+    assert np.abs(table[:, :2] - points / [WIDTH, HEIGHT] * 255.0).max() <= 0.5
+    # EXIF 6: a quarter turn clockwise, so x is counted from the lower edge.
+    assert np.abs(table[:, 2] - (HEIGHT - points[:, 1]) / HEIGHT * 255.0).max() <= 0.5
+    assert np.abs(table[:, 3] - points[:, 0] / WIDTH * 255.0).max() <= 0.5
+    assert (table[:, 4] == 1).all()  # 0.72 px: above 0.5, up to 1
+    rejected = np.frombuffer(base64.b64decode(data.pairs["0,2"]), np.uint8).reshape(-1, 5)
+    assert (len(rejected), set(rejected[:, 4])) == (12, {9})
+
+
+def test_a_large_block_has_pictures_of_its_worst_pairs_alone(
+    full: Context,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pair_viewer, "MAX_IMAGES", 2)
+    rows = gather(full)[0]
+    data, keys = pair_data(full, [rows[1], rows[0], rows[3]])
+    assert (list(keys), len(data.pictures)) == ([("a", "c")], 2)
+    monkeypatch.setattr(pair_viewer, "MAX_MATCHES", 10)
+    assert len(base64.b64decode(pair_data(full, rows[:1])[0].pairs["0,1"])) == 50
+
+
+def test_rows_name_their_pair_and_nothing_ends_the_script(full: Context) -> None:  # noqa: F811
+    page = page_of(full)
+    assert re.findall(r'<tr data-pair="([0-9,]+)"', page) == ["0,1", "2,1", "0,2"]  # a-c is rejected, b-c has fewest matches
+    assert set(stored(page)) == {"pictures", "pairs"}
+    hostile = pair_viewer.PairData([("</script><b>", 1, 1)])
+    assert "<" not in hostile.text()
+    assert json.loads(hostile.text())["pictures"][0][0] == "</script><b>"
+
+
+def test_without_readable_images_the_page_is_as_before(full: Context) -> None:  # noqa: F811
+    for path in Path(full.settings.block.images).rglob("*.*"):
+        path.unlink()
+    page = page_of(full)
+    assert stored(page) == {"pictures": [], "pairs": {}}
+    assert "A click on a row" not in page
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+def test_a_browser_draws_the_pair_that_the_address_names(full: Context, tmp_path: Path) -> None:  # noqa: F811
+    page_of(replace(full))
+    address = full.workspace.report.resolve().as_uri()
+    drawn = {}
+    for key in ("", "#pair=0,2"):
+        command = [
+            str(BROWSER),
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={tmp_path / 'browser'}",
+        ]
+        command += ["--virtual-time-budget=3000", "--enable-logging=stderr", "--dump-dom", address + key]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        assert "CONSOLE" not in done.stderr  # neither an error of a script nor a refused resource
+        drawn[key] = done.stdout.split('<dialog id="pair-viewer"')[1].split("</dialog>")[0]
+    assert drawn[""].count('class="tie') == 0
+    assert drawn["#pair=0,2"].startswith(' open=""')
+    assert drawn["#pair=0,2"].count('class="tie e1"') == 60
+    assert "60 of 80 matches verified, 60 drawn; verified" in drawn["#pair=0,2"]
