@@ -32,6 +32,24 @@ def run_process(*arguments: object, **options: object) -> subprocess.CompletedPr
     return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)  # type: ignore[call-overload,no-any-return]
 
 
+def test_help_has_its_options_in_groups():
+    text = CliRunner().invoke(app, ["run", "--help"]).output
+    parts = re.split(r"^(\S[^:\n]*):$", text, flags=re.MULTILINE)
+    groups = dict(zip(parts[1::2], parts[2::2], strict=True))
+    assert list(groups) == ["Arguments", "Block", "Results and settings", "How it runs", "Messages"]
+    for option, group in (
+        ("--poses", "Block"),
+        ("--set", "Results and settings"),
+        ("--shard", "How it runs"),
+        ("--json", "Messages"),
+    ):
+        assert [name for name, part in groups.items() if re.search(rf"^  (-\w, )?{option}\b", part, re.MULTILINE)] == [
+            group
+        ]
+    own = CliRunner().invoke(app, ["evaluate", "--help"]).output
+    assert own.index("Options:") < own.index("--truth") < own.index("Messages:") < own.index("--help")
+
+
 def test_help_names_every_command_and_option():
     for arguments in ([], ["--help"]):
         text = CliRunner().invoke(app, arguments).output

@@ -63,7 +63,8 @@ def test_a_large_block_has_pictures_of_its_worst_pairs_alone(
 
 def test_rows_name_their_pair_and_nothing_ends_the_script(full: Context) -> None:  # noqa: F811
     page = page_of(full)
-    assert re.findall(r'<tr data-pair="([0-9,]+)"', page) == ["0,1", "2,1", "0,2"]  # a-c is rejected, b-c has fewest matches
+    # a-c is rejected, b-c has fewest matches.
+    assert re.findall(r'<tr data-pair="([0-9,]+)"', page) == ["0,1", "2,1", "0,2"]
     assert set(stored(page)) == {"pictures", "pairs"}
     hostile = pair_viewer.PairData([("</script><b>", 1, 1)])
     assert "<" not in hostile.text()

@@ -14,6 +14,7 @@ from aeromatch_cli import __version__
 from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, synth
 from aeromatch_cli.cli.look_commands import EXAMPLES as LOOK_EXAMPLES
 from aeromatch_cli.cli.look_commands import LOOK
+from aeromatch_cli.cli.options import GroupedHelp
 from aeromatch_cli.cli.output import ARGUMENTS, as_epilog
 from aeromatch_cli.cli.stage_commands import STAGES, stage_command
 from aeromatch_cli.errors import ConfigError
@@ -63,11 +64,11 @@ weights_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Lis
 app.add_typer(weights_app, name="weights")
 
 for _name, (_help, _examples) in STAGES.items():
-    app.command(_name, help=_help, epilog=as_epilog(_examples))(stage_command(_name))
+    app.command(_name, cls=GroupedHelp, help=_help, epilog=as_epilog(_examples))(stage_command(_name))
 for _name, _look in LOOK.items():
-    app.command(_name, epilog=as_epilog(LOOK_EXAMPLES[_name]))(_look)
-app.command(epilog=as_epilog(EXAMPLES["evaluate"]))(evaluate)
-app.command(epilog=as_epilog(EXAMPLES["synth"]))(synth)
+    app.command(_name, cls=GroupedHelp, epilog=as_epilog(LOOK_EXAMPLES[_name]))(_look)
+app.command(cls=GroupedHelp, epilog=as_epilog(EXAMPLES["evaluate"]))(evaluate)
+app.command(cls=GroupedHelp, epilog=as_epilog(EXAMPLES["synth"]))(synth)
 for _name, (_help, _command) in WEIGHTS.items():
     weights_app.command(_name, help=_help, epilog=as_epilog(EXAMPLES[f"weights {_name}"]))(_command)
 

@@ -3,9 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
+
+# Groups of options in every help.
+_BLOCK, _RESULTS, _WORK, _MESSAGES = "Block", "Results and settings", "How it runs", "Messages"
+
+
+class GroupedHelp(TyperCommand):
+    """A command whose help has its options in groups, as plain text: its own first, --help last."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for param in self.get_params(ctx):
+            own = "Arguments" if param.param_type_name == "argument" else "Options"
+            group = _MESSAGES if param.name == "help" else getattr(param, "rich_help_panel", None) or own
+            record = param.get_help_record(ctx)
+            if record is not None:
+                groups.setdefault(group, []).append(record)
+        for heading, records in groups.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
+
 
 Config = Annotated[
     str | None,
@@ -22,6 +44,7 @@ Images = Annotated[
         metavar="DIR",
         envvar="AEROMATCH_IMAGES",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Folder of images, searched recursively.",
     ),
 ]
@@ -32,6 +55,7 @@ Poses = Annotated[
         metavar="FILE|exif|none",
         envvar="AEROMATCH_POSES",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Pose file of any program, or GPS and XMP angles (default exif).",
     ),
 ]
@@ -42,6 +66,7 @@ PoseFormat = Annotated[
         metavar="NAME",
         envvar="AEROMATCH_POSE_FORMAT",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Format of the pose file (default auto: by its content); see docs/input.md.",
     ),
 ]
@@ -52,6 +77,7 @@ Cameras = Annotated[
         metavar="FILE|exif|folder",
         envvar="AEROMATCH_CAMERAS",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Camera file, EXIF (default), or one camera per folder.",
     ),
 ]
@@ -62,6 +88,7 @@ Crs = Annotated[
         metavar="CODE",
         envvar="AEROMATCH_CRS",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="World frame: EPSG:32633, local, or auto (UTM zone; default).",
     ),
 ]
@@ -72,6 +99,7 @@ Ground = Annotated[
         metavar="METRES|DEM|auto",
         envvar="AEROMATCH_GROUND",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Ground height, DEM file, or auto (default).",
     ),
 ]
@@ -82,6 +110,7 @@ Masks = Annotated[
         metavar="DIR|FILE",
         envvar="AEROMATCH_MASKS",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Masks in COLMAP naming, 0 = ignore; or one mask.",
     ),
 ]
@@ -92,6 +121,7 @@ ControlFile = Annotated[
         metavar="FILE",
         envvar="AEROMATCH_GCP",
         show_envvar=False,
+        rich_help_panel=_BLOCK,
         help="Ground control points (ODM's gcp_list.txt) to compare the result with.",
     ),
 ]
@@ -102,12 +132,18 @@ WorkspaceDir = Annotated[
         metavar="DIR",
         envvar="AEROMATCH_WORKSPACE",
         show_envvar=False,
+        rich_help_panel=_RESULTS,
         help="Folder for every result (default aeromatch-work).",
     ),
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, as extract.keypoints=12000; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        rich_help_panel=_RESULTS,
+        help="Change a setting, as extract.keypoints=12000; repeatable.",
+    ),
 ]
 MaxSize = Annotated[
     int | None,
@@ -117,13 +153,19 @@ MaxSize = Annotated[
         metavar="PX",
         envvar="AEROMATCH_MAX_SIZE",
         show_envvar=False,
+        rich_help_panel=_RESULTS,
         help="Reduce larger images to this longer side, pixels.",
     ),
 ]
 Jobs = Annotated[
     int | None,
     typer.Option(
-        "--jobs", min=0, envvar="AEROMATCH_JOBS", show_envvar=False, help="Worker processes (default 0: one per core)."
+        "--jobs",
+        min=0,
+        envvar="AEROMATCH_JOBS",
+        show_envvar=False,
+        rich_help_panel=_WORK,
+        help="Worker processes (default 0: one per core).",
     ),
 ]
 ExecutorName = Annotated[
@@ -133,15 +175,25 @@ ExecutorName = Annotated[
         metavar="serial|processes|dask",
         envvar="AEROMATCH_EXECUTOR",
         show_envvar=False,
+        rich_help_panel=_WORK,
         help="Where tasks run (default processes).",
     ),
 ]
 ShardText = Annotated[
-    str | None, typer.Option("--shard", metavar="I/N", help="Only part I of N of the images and pairs, 1 <= I <= N.")
+    str | None,
+    typer.Option(
+        "--shard", metavar="I/N", rich_help_panel=_WORK, help="Only part I of N of the images and pairs, 1 <= I <= N."
+    ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Make every result again, even if it is up to date.")]
+Overwrite = Annotated[
+    bool,
+    typer.Option("--overwrite", rich_help_panel=_RESULTS, help="Make every result again, even if it is up to date."),
+]
 KeepImages = Annotated[
-    bool, typer.Option("--keep-images", help="Keep enhanced and simulated pictures in the workspace.")
+    bool,
+    typer.Option(
+        "--keep-images", rich_help_panel=_RESULTS, help="Keep enhanced and simulated pictures in the workspace."
+    ),
 ]
 LogFile = Annotated[
     Path | None,
@@ -150,13 +202,18 @@ LogFile = Annotated[
         metavar="FILE",
         envvar="AEROMATCH_LOG_FILE",
         show_envvar=False,
+        rich_help_panel=_MESSAGES,
         help="Append every message, with time, to this file.",
     ),
 ]
 Json = Annotated[
     bool,
     typer.Option(
-        "--json", envvar="AEROMATCH_JSON", show_envvar=False, help="Print a JSON object as the last line of stdout."
+        "--json",
+        envvar="AEROMATCH_JSON",
+        show_envvar=False,
+        rich_help_panel=_MESSAGES,
+        help="Print a JSON object as the last line of stdout.",
     ),
 ]
 Quiet = Annotated[
@@ -166,6 +223,7 @@ Quiet = Annotated[
         "-q",
         envvar="AEROMATCH_QUIET",
         show_envvar=False,
+        rich_help_panel=_MESSAGES,
         help="Print only errors, no summary and no progress.",
     ),
 ]

@@ -1,0 +1,40 @@
+"""The schema of --json: the file in docs is that of the code, and what commands print fits it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from conftest import Site, invoke
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from aeromatch_cli.cli import app
+from aeromatch_cli.cli.outcome import Outcome, schema
+
+
+def test_the_file_is_up_to_date() -> None:
+    path = Path(__file__).parents[1] / "docs" / "outcome.schema.json"
+    assert path.read_text(encoding="utf-8") == schema()
+    assert json.loads(schema())["title"] == "aeromatch --json"
+
+
+def test_results_and_errors_fit_the_schema(site: Site) -> None:
+    outcome = invoke("run", *site.options("--quiet", "--json"))
+    found = Outcome.model_validate(outcome.facts)
+    assert found.stages is not None
+    assert found.stages.match is not None
+    assert found.stages.match.done == outcome.facts["stages"]["match"]["done"] > 0
+    assert found.stages.consistency is not None
+    assert (
+        found.stages.consistency.facts.verified_matches
+        == outcome.facts["stages"]["consistency"]["facts"]["verified_matches"]
+    )
+    for arguments in (("run", "nowhere.yaml"), ("pairs", "baseline", "--images", str(site.root / "absent"))):
+        error = Outcome.model_validate(invoke(*arguments, "--json").facts)
+        assert (error.exit_code in (2, 3), bool(error.error), error.stages) == (True, True, None)
+    wrong = CliRunner().invoke(app, ["run", "--jobs", "many", "--json"])
+    assert Outcome.model_validate_json(wrong.stdout.splitlines()[-1]).exit_code == 2
+    with pytest.raises(ValidationError):
+        Outcome.model_validate(outcome.facts | {"more": 1})
