@@ -27,13 +27,14 @@ from aeromatch_cli.stages import (
     simulate,
     union,
 )
+from aeromatch_cli.stages.changes import changed_words
 from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.workspace import read_json, remove_stale_temporaries, translated_os_errors
+from aeromatch_cli.workspace import Workspace, read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
 
@@ -124,6 +125,8 @@ def _attempt(
     command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
 ) -> Result:
     dry = command == "check"
+    if words := changed_words(Workspace(Path(settings.workspace)).config, settings):
+        said(f"changed          {words}")
     context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":
         return _check(context, reports[0], reports[-1], said)

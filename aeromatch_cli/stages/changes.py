@@ -1,0 +1,82 @@
+"""What other settings than those of the last run mean for a workspace, said before its results are replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from aeromatch_cli.config import Settings, dump
+
+# Most settings that are named.
+_NAMED = 4
+# Section of the settings -> the first stage that reads it; others, as `run`, change no result.
+_FIRST_STAGE = {
+    "block": "orient",
+    "orient": "orient",
+    "seed": "orient",
+    "pairs": "pairs",
+    "enhance": "extract",
+    "simulate": "extract",
+    "extract": "extract",
+    "match": "match",
+    "cascade": "match",
+    "filter": "filter",
+    "adjust": "adjust",
+    "consistency": "consistency",
+    "export": "export",
+}
+_ORDER = tuple(dict.fromkeys(_FIRST_STAGE.values()))
+
+
+def changed_words(config: Path, settings: Settings) -> str:
+    """The settings that differ from those in `config`, the workspace's own, and from where on results that depend on
+    them are made again; "" where there are none, or no readable file."""
+    try:
+        before = yaml.safe_load(config.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return ""
+    if not isinstance(before, Mapping):
+        return ""
+    old, new = (dict(_leaves(tree)) for tree in (before, yaml.safe_load(dump(settings))))
+    keys = [
+        key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key) and _section(key) in _FIRST_STAGE
+    ]
+    if not keys:
+        return ""
+    named = ", ".join(f"{key} {_said(old.get(key))} -> {_said(new.get(key))}" for key in keys[:_NAMED])
+    more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
+    first = min((_FIRST_STAGE[_section(key)] for key in keys), key=_ORDER.index)
+    return f"{named}{more}: what depends on it is made again, from {first} on"
+
+
+def _section(key: str) -> str:
+    return key.partition(".")[0]
+
+
+def _leaves(tree: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        name = f"{above}{key}"
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{name}.")
+        else:
+            yield name, _resolved(value)
+
+
+def _resolved(value: Any) -> Any:
+    """The same file or folder, however it is written, is the same value."""
+    return str(Path(value).resolve()) if isinstance(value, str) and "/" in value and Path(value).exists() else value
+
+
+def _said(value: Any) -> str:
+    """A value as the command line writes it; steps and filters by their names."""
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return (
+            "+".join(str(item.get("name", item)) if isinstance(item, Mapping) else str(item) for item in value)
+            or "none"
+        )
+    return str(value).lower() if isinstance(value, bool) else str(value)
