@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from aeromatch_cli.nets.context import Context
+from aeromatch_cli.nets.context import Context, load_context
 from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.strategies.extractors.context import context_inputs_of_coarse, from_bytes
 from aeromatch_cli.strategies.extractors.detection import Raw
@@ -53,7 +53,7 @@ from trainings.runs import (
 )
 
 DECAY, CLIP, RATE, BATCH = 0.999, 1.0, 1e-3, 4
-OF_RUN = ("blocks", "pairs", "weights", "seed")
+OF_RUN = ("blocks", "pairs", "weights", "start", "seed")
 REPORT_EVERY = 2_000
 _KEEP = (0.5, 1.0)  # share of the keypoints of a view, drawn for every step
 
@@ -61,11 +61,13 @@ _KEEP = (0.5, 1.0)  # share of the keypoints of a view, drawn for every step
 class Run(torch.nn.Module):
     """The network, the temperature of its loss, and the average that is kept."""
 
-    def __init__(self) -> None:
+    def __init__(self, start: Path | None = None) -> None:
+        """start: weights to go on from."""
         super().__init__()
         torch.manual_seed(0)
+        network = Context() if start is None else load_context(start).requires_grad_(True)
         # Channels last: 1.6 times as fast in bfloat16.
-        self.network = Context().to(training_device(), memory_format=torch.channels_last)
+        self.network = network.to(training_device(), memory_format=torch.channels_last)
         self.sharpness = torch.nn.Parameter(torch.tensor(math.log(15.0), device=training_device()))
         self.average = copy.deepcopy(self.network).requires_grad_(False)
 
@@ -109,7 +111,7 @@ def loss_of(run: Run, pair: ContextPair, rng: np.random.Generator) -> Tensor:
 
 def train(pairs: list[ContextPair], unseen: list[ContextPair], args: argparse.Namespace) -> Run | None:
     """The finished run, or None where --minutes ended it before."""
-    run, started = Run(), time.monotonic()
+    run, started = Run(args.start), time.monotonic()
     optimiser = torch.optim.AdamW([*run.network.parameters(), run.sharpness], RATE, weight_decay=1e-3)
     state = args.out / "state.pt"
     device = run.sharpness.device
@@ -172,6 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add_blocks(parser)
     add("--weights", type=Path, help="folder of your own networks, as `extract.weights` takes it; default: what ships")
+    add("--start", type=Path, help="weights to go on from, as those of other descriptors")
     add("--rendered", type=Path, help="where rendered blocks are, or go (default OUT/blocks)")
     add("--pairs", type=at_least_one, default=6_000, help="to be seen")
     add("--seed", type=int, default=0, help="of what is drawn")
