@@ -225,7 +225,7 @@ def test_page_escapes_names_and_needs_no_network(full):
     for _, key, value in structure.attributes:
         assert not key.startswith("on")
         if key in ("src", "srcset", "data", "action") or key.endswith("href"):
-            assert value.startswith(("data:image/jpeg;base64,", "#", "../../images/"))
+            assert value.startswith(("data:image/jpeg;base64,", "data:image/png;base64,", "#", "../../images/"))
 
 
 def test_every_figure_of_the_page_is_well_formed_and_the_map_shows_the_poses(full):

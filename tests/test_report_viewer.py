@@ -16,9 +16,10 @@ import pytest
 from PIL import Image as PilImage
 from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a fixture
 
-from aeromatch_cli.report import pair_viewer
-from aeromatch_cli.report.pair_viewer import pair_data
-from aeromatch_cli.report.rows import gather
+from aeromatch_cli.report import pair_viewer, thumbnails
+from aeromatch_cli.report.pair_viewer import PairData, drawable
+from aeromatch_cli.report.rows import PairRow, gather
+from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.stages.context import Context
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -27,6 +28,10 @@ BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil
 def stored(page: str) -> dict[str, object]:
     text = page.split('<script type="application/json" id="pair-data">')[1].split("</script>")[0]
     return dict(json.loads(text))
+
+
+def pair_data(context: Context, rows: list[PairRow]) -> tuple[PairData, dict[tuple[str, str], str]]:
+    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context, drawable(rows)))
 
 
 def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Context) -> None:  # noqa: F811
@@ -53,7 +58,7 @@ def test_a_large_block_has_pictures_of_its_worst_pairs_alone(
     full: Context,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(pair_viewer, "MAX_IMAGES", 2)
+    monkeypatch.setattr(thumbnails, "MAX_IMAGES", 2)
     rows = gather(full)[0]
     data, keys = pair_data(full, [rows[1], rows[0], rows[3]])
     assert (list(keys), len(data.pictures)) == ([("a", "c")], 2)
@@ -77,6 +82,25 @@ def test_without_readable_images_the_page_is_as_before(full: Context) -> None:  
     page = page_of(full)
     assert stored(page) == {"pictures": [], "pairs": {}}
     assert "A click on a row" not in page
+
+
+def test_the_sketch_shows_the_ground_where_its_cameras_see_it(full: Context) -> None:  # noqa: F811
+    """Cameras 100 m above level ground, looking down, focal length 200 px: a pixel is 0.5 m. Image a is red left of its
+    middle and blue right of it, and is alone."""
+    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    picture[:, : WIDTH // 2, 0], picture[:, WIDTH // 2 :, 2] = 255, 255
+    low, high = np.array([-50.0, -40.0]), np.array([50.0, 40.0])
+    canvas = ground_sketch(full, {"a": picture}, low, high)
+    assert canvas is not None
+    assert canvas.shape == (512, 640, 4)
+    shown = np.argwhere(canvas[..., 3] == 255)
+    # 160 x 128 px of 0.5 m: 80 x 64 m around the camera at (0, 0).
+    metres = (shown[:, ::-1] + 0.5) * [100.0 / 640, -100.0 / 640] + [low[0], high[1]]
+    assert np.abs(metres.min(axis=0) - [-40.0, -32.0]).max() < 0.6
+    assert np.abs(metres.max(axis=0) - [40.0, 32.0]).max() < 0.6
+    red = canvas[shown[:, 0], shown[:, 1], 0] == 255
+    assert (red == (metres[:, 0] < 0.0)).mean() > 0.99
+    assert ground_sketch(full, {}, low, high) is None
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.report.figures import COLOURS, evenly_chosen, new_axes, svg
@@ -31,6 +32,10 @@ _CAMERAS = {
     "weak": ("weakly tied image", {"facecolor": COLOURS["panel"], "edgecolor": COLOURS["bad"], "linewidth": 2.0}),
     "wrong": ("wrong attitude given", {"facecolor": COLOURS["bad"], "edgecolor": COLOURS["bad"], "linewidth": 0.8}),
 }
+
+
+# Picture (h, w, 4) RGBA of the ground between two corners (2,) of the world, metres, north up; None if unknown.
+Sketch = Callable[[FloatArray, FloatArray], NDArray[np.uint8] | None]
 
 
 @dataclass(frozen=True)
@@ -85,11 +90,17 @@ def class_of(count: int, limits: Sequence[int]) -> int:
 
 
 def block_map(
-    stations: Sequence[Station], footprints: Sequence[FloatArray], links: Sequence[Link], *, in_world: bool = True
+    stations: Sequence[Station],
+    footprints: Sequence[FloatArray],
+    links: Sequence[Link],
+    *,
+    in_world: bool = True,
+    sketch: Sketch | None = None,
 ) -> MapFigure:
     """Footprints, pairs and cameras in world metres. footprints: polygons (N, 2). At least one station.
 
-    in_world: else in a frame of the pictures' own, where neither north nor a metre is known.
+    in_world: else in a frame of the pictures' own, where neither north nor a metre is known. sketch: what the ground
+    looks like, of two corners of the map.
     """
     place = {s.image_id: (s.x_m, s.y_m) for s in stations}
     placed = [link for link in links if link.image_id0 in place and link.image_id1 in place]
@@ -121,6 +132,8 @@ def block_map(
     _scale_equally(axes)
     if len(stations) <= MAX_LABELS:
         _draw_labels(axes, stations)
+    if sketch is not None:
+        _draw_sketch(axes, sketch)
     return MapFigure(svg(axes.figure, "Block map", "map", titles), tuple(remarks))
 
 
@@ -172,6 +185,16 @@ def _scale_equally(axes: Any) -> None:
     axes.figure.draw_without_rendering()
     axes.figure.set_layout_engine("none")
     _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
+
+
+def _draw_sketch(axes: Any, sketch: Sketch) -> None:
+    """Below everything else."""
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    picture = sketch(low, high)
+    if picture is not None:
+        extent = (low[0], high[0], low[1], high[1])
+        axes.imshow(picture, extent=extent, aspect="auto", zorder=0.5, gid="sketch", alpha=0.75, interpolation="none")
+        _show(axes, (low + high) / 2, (high - low) / 2)
 
 
 def _draw_footprints(axes: Any, polygons: Sequence[FloatArray]) -> None:

@@ -6,11 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib import resources
 from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
@@ -19,7 +21,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
-from aeromatch_cli.report.pair_viewer import pair_data
+from aeromatch_cli.report.pair_viewer import drawable, pair_data
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
@@ -30,6 +32,8 @@ from aeromatch_cli.report.rows import (
     gather,
     stage_rows,
 )
+from aeromatch_cli.report.sketch import ground_sketch
+from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, components, summarise
@@ -84,7 +88,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
     shown = _worst_pairs(pairs)
-    drawn, keys = pair_data(context, shown)
+    pictures = thumbnails(context, drawable(shown))
+    drawn, keys = pair_data(context, shown, pictures)
     return template.render(
         version=__version__,
         colours=COLOURS,
@@ -99,7 +104,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         adjusted=_adjusted_facts(_facts(context, "adjust")),
         residuals=(_facts(context, "adjust").get("control") or {}).get("residuals", {}),
         block=_block_facts(context),
-        map=_map(context, images, pairs, wrong),
+        map=_map(context, images, pairs, wrong, pictures),
         histograms=[
             histogram(counts, f"verified matches per {words}", unit)
             for counts, words, unit in (
@@ -301,9 +306,13 @@ def _settings_text(context: Context) -> str:
 
 
 def _map(
-    context: Context, images: Sequence[ImageRow], pairs: Sequence[PairRow], wrong: Mapping[str, float]
+    context: Context,
+    images: Sequence[ImageRow],
+    pairs: Sequence[PairRow],
+    wrong: Mapping[str, float],
+    pictures: Mapping[str, NDArray[np.uint8]],
 ) -> MapFigure | None:
-    """None where no image has a position."""
+    """None where no image has a position. pictures: reduced ones, for the sketch of the ground."""
     stations = []
     for row, label in zip(images, _labels([row.name for row in images]), strict=True):
         pose = context.pose(row.image_id)
@@ -318,7 +327,8 @@ def _map(
         return None
     footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
     in_world = _facts(context, "orient").get("frame") != "own"
-    return block_map(stations, footprints, [_link(row) for row in pairs], in_world=in_world)
+    sketch = partial(ground_sketch, context, pictures)
+    return block_map(stations, footprints, [_link(row) for row in pairs], in_world=in_world, sketch=sketch)
 
 
 def _link(row: PairRow) -> Link:

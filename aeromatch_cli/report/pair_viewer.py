@@ -1,39 +1,29 @@
-"""What the report's pair viewer draws from: a small picture of each image and some matches of each pair.
-
-The page stays small: pictures get smaller the more there are, and beyond MAX_IMAGES the worst pairs' images have one.
-"""
+"""What the report's pair viewer draws from: a small picture of each image and some matches of each pair."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.errors import ItemError, WorkspaceError
+from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import read_match_row, read_verified_row
-from aeromatch_cli.images.files import read_pixels
-from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.figures import evenly_chosen
-from aeromatch_cli.report.previews import ERROR_LIMITS_PX, jpeg_uri, to_colour8, turned, turned_points
+from aeromatch_cli.report.previews import ERROR_LIMITS_PX, jpeg_uri, turned, turned_points
 from aeromatch_cli.report.rows import PairRow
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
 
-MAX_IMAGES = 300
 MAX_MATCHES = 80
-# Longest side of a picture, for at most so many images.
-_SIDES_PX = ((40, 480), (120, 320), (MAX_IMAGES, 240))
-_JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
 # Places are stored as so many steps of a picture's width and height.
 _STEPS = 255
 _NO_MODEL = 9
@@ -52,22 +42,21 @@ class PairData:
         return json.dumps(vars(self), separators=(",", ":")).replace("<", "\\u003c")
 
 
-def pair_data(context: Context, rows: Sequence[PairRow]) -> tuple[PairData, dict[tuple[str, str], str]]:
-    """What can be drawn of the pairs, in their order, and under which key of PairData.pairs each is."""
-    wanted = [row for row in rows if row.matches_in and row.state in ("verified", "rejected")]
-    images = _images_of(wanted)
-    side_px = next(side for most, side in _SIDES_PX if len(images) <= most)
+def pair_data(
+    context: Context, rows: Sequence[PairRow], pictures: Mapping[str, NDArray[np.uint8]]
+) -> tuple[PairData, dict[tuple[str, str], str]]:
+    """What can be drawn of the pairs, in their order, and under which key of PairData.pairs each is.
+
+    pictures: image_id -> reduced picture as stored.
+    """
     data, number_of = PairData(), {}
-    for image_id in images:
-        try:
-            picture = _picture(context, image_id, side_px)
-        except ItemError:
-            continue  # gone since: its pairs are not drawn
+    for image_id, stored in pictures.items():
         number_of[image_id] = len(data.pictures)
-        data.pictures.append(picture)
+        picture = turned(stored, context.image_by_id[image_id].exif_orientation)
+        data.pictures.append((jpeg_uri(picture, quality=70), picture.shape[1], picture.shape[0]))
     points = _Points(context)
     keys: dict[tuple[str, str], str] = {}
-    for row in wanted:
+    for row in drawable(rows):
         ids = row.image_id0, row.image_id1
         if ids[0] in number_of and ids[1] in number_of:
             key = f"{number_of[ids[0]]},{number_of[ids[1]]}"
@@ -77,38 +66,9 @@ def pair_data(context: Context, rows: Sequence[PairRow]) -> tuple[PairData, dict
     return data, keys
 
 
-def _images_of(rows: Sequence[PairRow]) -> list[str]:
-    """At most MAX_IMAGES, those of the first rows."""
-    found: dict[str, None] = {}
-    for row in rows:
-        new = {row.image_id0, row.image_id1} - found.keys()
-        if len(found) + len(new) <= MAX_IMAGES:
-            found |= dict.fromkeys(sorted(new))
-    return list(found)
-
-
-def _picture(context: Context, image_id: str, side_px: int) -> tuple[str, int, int]:
-    """As it is displayed. Raises ItemError where the image cannot be read."""
-    image = context.image_by_id[image_id]
-    small = turned(_small(context.image_path(image), side_px), image.exif_orientation)
-    return jpeg_uri(small, quality=70), small.shape[1], small.shape[0]
-
-
-def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
-    """The stored raster, reduced. A JPEG is decoded at reduced size: a tenth of the time."""
-    if path.suffix.lower() in _JPEG_SUFFIXES:
-        from PIL import Image
-
-        try:
-            with Image.open(path) as picture:
-                if picture.mode in ("RGB", "L"):
-                    picture.draft(picture.mode, (side_px, side_px))
-                    picture.thumbnail((side_px, side_px), reducing_gap=2.0)
-                    return np.asarray(picture)
-        except (OSError, ValueError) as error:
-            raise ItemError(f"{path}: {error}") from error
-    pixels = read_pixels(path, colour=True)
-    return to_colour8(shrink(pixels, min(1.0, side_px / max(pixels.shape[:2]))))
+def drawable(rows: Sequence[PairRow]) -> list[PairRow]:
+    """Those of the pairs that have matches to draw."""
+    return [row for row in rows if row.matches_in and row.state in ("verified", "rejected")]
 
 
 class _Points:

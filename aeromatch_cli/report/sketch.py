@@ -1,0 +1,78 @@
+"""A sketch of the ground below the block map: small pictures laid on the terrain, the one taken from nearest on top.
+
+No orthophoto: seams are not blended, and what rises above the terrain leans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.stages.context import Context
+
+# Longer side of the sketch, pixels.
+_SIDE_PX = 640
+# Ground that is seen from farther than this many flying heights aside is left out.
+_FARTHEST = 2.0
+
+
+def ground_sketch(
+    context: Context, pictures: Mapping[str, NDArray[np.uint8]], low_m: FloatArray, high_m: FloatArray
+) -> NDArray[np.uint8] | None:
+    """RGBA (h, w, 4) of the world from low_m to high_m (2,), north up, clear where nothing is known; None without
+    terrain or attitudes. pictures: image_id -> reduced picture as stored."""
+    ground = context.block.ground
+    if ground is None:
+        return None
+    step_m = float((high_m - low_m).max()) / _SIDE_PX
+    width, height = (max(1, round(float(extent) / step_m)) for extent in high_m - low_m)
+    x = low_m[0] + (np.arange(width) + 0.5) * step_m
+    y = high_m[1] - (np.arange(height) + 0.5) * step_m
+    places = np.stack([*np.meshgrid(x, y)], axis=2)
+    heights = np.asarray(ground.height_m(places.reshape(-1, 2)), np.float64).reshape(height, width)
+    points = np.dstack([places, heights])
+    canvas, nearest = np.zeros((height, width, 4), np.uint8), np.full((height, width), _FARTHEST)
+    for image_id, picture in pictures.items():
+        _lay(context, image_id, picture, points, canvas, nearest)
+    return canvas if canvas[..., 3].any() else None
+
+
+def _lay(
+    context: Context,
+    image_id: str,
+    picture: NDArray[np.uint8],
+    points_m: FloatArray,
+    canvas: NDArray[np.uint8],
+    nearest: FloatArray,
+) -> None:
+    """Paint what an image shows of points_m (h, w, 3) where it is nearer, in flying heights aside, than `nearest`."""
+    import cv2
+
+    pose, image = context.pose(image_id), context.image_by_id[image_id]
+    if pose is None or pose.world_rotation is None:
+        return
+    aside = np.linalg.norm(points_m[..., :2] - pose.center_m[:2], axis=2)
+    above = pose.center_m[2] - points_m[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(above > 0.0, aside / above, np.inf)
+    rows, columns = np.nonzero(distance < nearest)
+    if not len(rows):
+        return
+    camera = context.block.cameras[image.camera_id]
+    seen = project(camera, pose.world_rotation, pose.center_m, points_m[rows, columns])
+    scale = np.array([picture.shape[1] / image.width_px, picture.shape[0] / image.height_px])
+    seen = (seen + 0.5) * scale - 0.5
+    with np.errstate(invalid="ignore"):
+        inside = ((seen >= 0.0) & (seen <= np.array(picture.shape[1::-1]) - 1.0)).all(axis=1)
+    rows, columns, seen = rows[inside], columns[inside], seen[inside]
+    if not len(rows):
+        return
+    colour = picture if picture.ndim == 3 else cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB)
+    whole = np.rint(seen).astype(np.int64)
+    canvas[rows, columns, :3] = colour[whole[:, 1], whole[:, 0], :3]
+    canvas[rows, columns, 3] = 255
+    nearest[rows, columns] = distance[rows, columns]
