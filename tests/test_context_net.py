@@ -88,11 +88,11 @@ def test_the_shipped_weights_are_as_good_as_when_they_were_made(
         found = compared(pairs, lambda view: network(*train_context.inputs(view, None)[0]).numpy())
     plain = compared(pairs, lambda view: train_context.inputs(view, None)[0][0].numpy())
     assert plain["0-20"]["rank1"] == pytest.approx(0.961, abs=0.01)  # a set as hard as it was
-    # When they were made 0.968 of 0.961 and 0.934 of 0.899. Keypoints of a better detector are easier by themselves
-    # (0.915), and leave less to gain to weights that were trained on those of another.
+    # When they were made 0.940 of 0.933 (20-40 degrees). Those before, for descriptors that were worse by themselves,
+    # had 0.934 of 0.899: what the card says holds, there is little left to gain.
     assert found["0-20"]["rank1"] >= plain["0-20"]["rank1"]
-    assert found["20-40"]["rank1"] == pytest.approx(0.934, abs=0.01)
-    assert found["20-40"]["rank1"] >= plain["20-40"]["rank1"] + 0.01
+    assert found["20-40"]["rank1"] == pytest.approx(0.940, abs=0.005)
+    assert found["20-40"]["rank1"] > plain["20-40"]["rank1"]
 
 
 @pytest.mark.parametrize("count", [1, 2, NEIGHBOURS, NEIGHBOURS + 1, 60])
