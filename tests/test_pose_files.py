@@ -240,3 +240,16 @@ def test_every_format_that_content_tells_is_tried_in_the_tests() -> None:
     """Formats above by folder name, and those of tests of their own."""
     tried = {name.split("/")[0] for name in (*WORLD, *LOCAL)} | {"micmac", "patb", "dji-mrk", "metashape-given"}
     assert set(POSE_FORMATS) - tried <= {"columns", "pix4d", "table", "metashape-given"}
+
+
+def test_metashape_accuracies_of_position_and_angles_are_used(tmp_path: Path) -> None:
+    path = tmp_path / "reference.csv"
+    path.write_text(
+        '# CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+        'PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]]\n'
+        "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,Accuracy_X_(m),Accuracy_Y_(m),Accuracy_Z_(m),"
+        "Accuracy_Yaw_(deg),Accuracy_Pitch_(deg),Accuracy_Roll_(deg)\n"
+        "a,13.39384028,52.50098746,140.6,-4.3,0.9,0.2,0.02,0.03,0.04,2,1,0.5\n"
+    )
+    row = read_pose_file(path).rows[0]
+    assert (row.sigma_position_m, row.sigma_angle_deg) == (0.04, 2.0)

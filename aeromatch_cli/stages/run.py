@@ -125,7 +125,9 @@ def _attempt(
     command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
 ) -> Result:
     dry = command == "check"
-    if words := changed_words(Workspace(Path(settings.workspace)).config, settings):
+    # Without images nothing is made at all.
+    there = bool(settings.block.images) and Path(settings.block.images).is_dir()
+    if there and (words := changed_words(Workspace(Path(settings.workspace)).config, settings)):
         said(f"changed          {words}")
     context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":

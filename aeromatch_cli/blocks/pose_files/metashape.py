@@ -108,6 +108,7 @@ def _row(
     attitude, _ = triple(angles)
     whole = all(math.isfinite(v) for v in attitude)
     sigmas = [v for name in ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y") if (v := value(name)) > 0.0]
+    turns = [v for name in angles if (v := value(f"accuracy_{name}")) > 0.0]
     kind: PositionKind = "geographic" if geographic else "grid"
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,
@@ -115,6 +116,7 @@ def _row(
         attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
         forward=False, true_north=angles[0] == "yaw",
         sigma_position_m=None if from_estimate else max(sigmas, default=None),
+        sigma_angle_deg=max(turns, default=None),
     )  # fmt: skip
     if whole and angles == _ANGLES[1]:
         return replace(row, attitude_kind="omega_phi_kappa", forward=None), from_estimate
