@@ -245,7 +245,7 @@ def test_every_format_that_content_tells_is_tried_in_the_tests() -> None:
 def test_metashape_accuracies_of_position_and_angles_are_used(tmp_path: Path) -> None:
     path = tmp_path / "reference.csv"
     path.write_text(
-        '# CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+        '# CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257]],'
         'PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]]\n'
         "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,Accuracy_X_(m),Accuracy_Y_(m),Accuracy_Z_(m),"
         "Accuracy_Yaw_(deg),Accuracy_Pitch_(deg),Accuracy_Roll_(deg)\n"
