@@ -30,8 +30,11 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def unseen(rendered: Path) -> TurnedPairs:
-    """Two patches each of places of a small block, turned at will."""
-    found = {f"block.{kind}": tracks for kind, tracks in sources.rendered(rendered).items()}
+    """Two patches each of SIFT's places in a small block, which these weights learned from, turned at will."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sources, "DETECTORS", ("sift",))
+        patch.setattr(sources, "TRACKS", 1800)
+        found = {f"block.{kind}": tracks for kind, tracks in sources.rendered(rendered).items()}
     return unseen_pairs(found, 10_000)  # all there are: of 600 the figures below vary by 0.02
 
 

@@ -39,7 +39,7 @@ def on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def options(out: Path, **further: object) -> argparse.Namespace:
-    return argparse.Namespace(out=out, seed=0, steps=STEPS, batch=4, rate=1e-3, minutes=0.0, **further)
+    return argparse.Namespace(out=out, seed=0, steps=STEPS, batch=4, rate=1e-3, minutes=0.0, jobs=1, **further)
 
 
 def same(first: nn.Module, second: nn.Module) -> bool:
