@@ -9,6 +9,7 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
 from typing import Any
 
@@ -27,11 +28,13 @@ from aeromatch_cli.report.rows import PairRow
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.workspace import Workspace
 
 MAX_REJECTED_PREVIEWS = 2
 MAX_PREVIEW_LINES = 150
 MAX_PREVIEW_POINTS = 2000
 ERROR_LIMITS_PX = (0.5, 1.0, 2.0)
+NO_MODEL = 9  # the class of a match whose error is not known
 
 _PREVIEW_SIDE_PX = 442
 _PREVIEW_GAP_PX = 12
@@ -59,35 +62,54 @@ def chosen_previews(pairs: Sequence[PairRow]) -> list[tuple[str, PairRow]]:
     return result + [("Rejected pair", row) for row in rejected[:MAX_REJECTED_PREVIEWS]]
 
 
+class DrawnMatches:
+    """The matches of pairs as they are drawn; every file is read once."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace, self._final = workspace, FinalEntries(workspace)
+        self._keypoints = cache(lambda image_id: read_keypoints(workspace.features(image_id))[0])
+        self._verified = cache(lambda image_id: read_verified_row(workspace.verified(image_id)))
+        self._matched = cache(lambda image_id: read_match_row(workspace.matches(image_id)))
+
+    def of(self, row: PairRow) -> tuple[tuple[FloatArray, FloatArray], FloatArray | None]:
+        """Stored pixels (M, 2) of either image, and errors (M,): verified matches with theirs, of a rejected pair those
+        before verification, None for errors. Raises WorkspaceError where the files do not hold the pair."""
+        ids = row.image_id0, row.image_id1
+        entry: VerifiedEntry | MatchEntry | None
+        if row.state == "verified":
+            path, judged = self._workspace.verified(ids[0]), self._verified(ids[0]).get(ids[1])
+            entry = judged = self._final(ids[0], judged) if judged else None
+            errors = judged.verdict.errors_px if judged else None
+        else:
+            path, entry, errors = self._workspace.matches(ids[0]), self._matched(ids[0]).get(ids[1]), None
+        if entry is None:
+            raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
+        return match_points(entry.matches, *(self._keypoints(i) for i in ids)), errors
+
+
+def error_classes(errors_px: FloatArray | None, count: int) -> IntArray:
+    """(count,) CSS classes of errors (count,): 0-3 from small to large, NO_MODEL where NaN or None."""
+    errors = np.full(count, np.nan) if errors_px is None else errors_px
+    return np.where(np.isnan(errors), NO_MODEL, np.searchsorted(ERROR_LIMITS_PX, errors))
+
+
 def previews(context: Context, pairs: Sequence[PairRow]) -> list[Preview]:
     """Pictures of the chosen pairs."""
-    found = []
+    found, drawn = [], DrawnMatches(context.workspace)
     for heading, row in chosen_previews(pairs):
         try:
-            svg, note = _preview(context, row), ""
+            svg, note = _preview(context, row, drawn), ""
         except (ItemError, WorkspaceError) as error:
             svg, note = "", f"no preview: {error}"
         found.append(Preview(heading, row, svg, note))
     return found
 
 
-def _preview(context: Context, row: PairRow) -> str:
+def _preview(context: Context, row: PairRow, drawn: DrawnMatches) -> str:
     """Verified matches with their errors, or, of a rejected pair, the matches before verification."""
-    workspace, ids = context.workspace, (row.image_id0, row.image_id1)
-    entry: VerifiedEntry | MatchEntry | None
-    if row.state == "verified":
-        path = workspace.verified(ids[0])
-        judged = read_verified_row(path).get(ids[1])
-        entry = judged = FinalEntries(workspace)(ids[0], judged) if judged else None
-        errors = judged.verdict.errors_px if judged else None
-    else:
-        path = workspace.matches(ids[0])
-        entry, errors = read_match_row(path).get(ids[1]), None
-    if entry is None:
-        raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
-    points = match_points(entry.matches, *(read_keypoints(workspace.features(i))[0] for i in ids))
+    points, errors = drawn.of(row)
     sides = []
-    for image_id, points_px in zip(ids, points, strict=True):
+    for image_id, points_px in zip((row.image_id0, row.image_id1), points, strict=True):
         image = context.image_by_id[image_id]
         pixels = read_pixels(context.image_path(image), colour=True)
         sides.append(Side(pixels, image.exif_orientation, points_px))
@@ -132,8 +154,7 @@ def preview(side0: Side, side1: Side, errors_px: FloatArray | None, label: str) 
     offset = size0[0] + _PREVIEW_GAP_PX
     width, height = offset + size1[0], max(size0[1], size1[1])
     points1 = points1 + np.array([float(offset), 0.0])
-    errors = np.full(len(points0), np.nan) if errors_px is None else errors_px
-    classes = np.where(np.isnan(errors), 9, np.searchsorted(ERROR_LIMITS_PX, errors))
+    classes = error_classes(errors_px, len(points0))
     chosen = _spread(points0, MAX_PREVIEW_LINES)
     dots = _spread(points0, MAX_PREVIEW_POINTS)
     parts = [
