@@ -1,6 +1,7 @@
 """Settings: the schema, presets and files, `--set` overrides, messages on faults, and the commented default file."""
 
 from aeromatch_cli.config.load import dump, load, parse_method, preset_names, validate
+from aeromatch_cli.config.merge import differing
 from aeromatch_cli.config.schema import FAMILIES, BlockSettings, RunSettings, Settings
 
 __all__ = [
@@ -8,6 +9,7 @@ __all__ = [
     "BlockSettings",
     "RunSettings",
     "Settings",
+    "differing",
     "dump",
     "load",
     "parse_method",

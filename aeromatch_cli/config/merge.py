@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,3 +85,13 @@ def _member(members: Iterable[Any], parts: Sequence[str]) -> dict[str, Any]:
         example = f"{parts[0]}.{found[0]['name'] if found else (names or list(FAMILIES[parts[0]]))[0]}"
         raise ConfigError(f"--set {place}: name the chain's member and its setting: {example}.KEY=VALUE")
     return found[0]
+
+
+def differing(first: Any, second: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Keys, as `extract.keypoints`, under which two trees of settings differ, and either's value; None where it has
+    none."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        for key in dict.fromkeys([*first, *second]):
+            yield from differing(first.get(key), second.get(key), f"{place}.{key}" if place else key)
+    elif first != second:
+        yield place, first, second

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.config import load
+from aeromatch_cli.config import differing, load
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER
@@ -37,7 +37,8 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
     """In words, and as facts. Raises InputError where a folder is no workspace."""
     one, two = _side(first), _side(second)
     lines = [f"first       {first}", f"second      {second}"]
-    changed = list(_differences(one.settings, two.settings))
+    apart = differing(one.settings, two.settings)
+    changed = [f"{key}: {old} and {new}" for key, old, new in apart if key.partition(".")[0] not in _OUTWARD]
     lines += [f"setting     {words}" for words in changed] or ["settings    the same"]
     lines.append(_counts("images", len(one.images), len(two.images)))
     for words, names in (
@@ -97,14 +98,3 @@ def _side(root: Path) -> _Side:
         seconds={stage: float(report["seconds"]) for stage, report in reports.items() if "." not in stage},
         adjusted=reports.get("adjust", {}).get("facts", {}),
     )
-
-
-def _differences(first: Any, second: Any, place: str = "") -> Iterator[str]:
-    """key: value and value, deepest first."""
-    if isinstance(first, Mapping) and isinstance(second, Mapping):
-        for key in dict.fromkeys([*first, *second]):
-            if not place and key in _OUTWARD:
-                continue
-            yield from _differences(first.get(key), second.get(key), f"{place}.{key}" if place else key)
-    elif first != second:
-        yield f"{place}: {first} and {second}"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from aeromatch_cli.config import Settings, dump
+from aeromatch_cli.config import Settings, differing, dump
 
 # Most settings that are named.
 _NAMED = 4
@@ -40,29 +40,21 @@ def changed_words(config: Path, settings: Settings) -> str:
         return ""
     if not isinstance(before, Mapping):
         return ""
-    old, new = (dict(_leaves(tree)) for tree in (before, yaml.safe_load(dump(settings))))
-    keys = [
-        key for key in dict.fromkeys((*new, *old)) if old.get(key) != new.get(key) and _section(key) in _FIRST_STAGE
+    changed = [
+        (key, old, new)
+        for key, new, old in differing(yaml.safe_load(dump(settings)), before)
+        if _section(key) in _FIRST_STAGE and _resolved(old) != _resolved(new)
     ]
-    if not keys:
+    if not changed:
         return ""
-    named = ", ".join(f"{key} {_said(old.get(key))} -> {_said(new.get(key))}" for key in keys[:_NAMED])
-    more = f" and {len(keys) - _NAMED} more" if len(keys) > _NAMED else ""
-    first = min((_FIRST_STAGE[_section(key)] for key in keys), key=_ORDER.index)
+    named = ", ".join(f"{key} {_said(old)} -> {_said(new)}" for key, old, new in changed[:_NAMED])
+    more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+    first = min((_FIRST_STAGE[_section(key)] for key, *_ in changed), key=_ORDER.index)
     return f"{named}{more}: what depends on it is made again, from {first} on"
 
 
 def _section(key: str) -> str:
     return key.partition(".")[0]
-
-
-def _leaves(tree: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        name = f"{above}{key}"
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{name}.")
-        else:
-            yield name, _resolved(value)
 
 
 def _resolved(value: Any) -> Any:
