@@ -207,7 +207,7 @@ def test_light_is_restored_exactly_under_the_true_mask_and_hue_stays():
     log_gain = np.full((HEIGHT, WIDTH), np.log(1.0 / 0.25), dtype=np.float32)
     light = ground()
     light[cast()] *= 0.25
-    lifted, mask = relit(stored(light), None, true_soft(cast()), cast(), log_gain, Tone(255.0, linear=False))
+    lifted, mask = relit(stored(light), None, true_soft(cast()), cast(), log_gain, Tone(255.0, linear=False), np.zeros(2))
     inner = np.s_[66:124, 96:254]
     assert np.abs(lifted[inner].astype(float) - sunny()[inner]).mean() < 3.0
     assert (mask > 0)[inner].all()

@@ -1,4 +1,4 @@
-"""Gains applied to the full picture, strip by strip: penumbra feathered, hue kept, highlights and noise unchanged."""
+"""Gains applied to the full picture, strip by strip: feathered, noise calmed, highlights kept, coloured as if lit."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.strategies.enhancers.brightness import multiplied
+from aeromatch_cli.strategies.enhancers.colour import as_sunlit
 from aeromatch_cli.strategies.enhancers.shadow_mask import SoftMask, guide_of
 from aeromatch_cli.strategies.enhancers.tone import Tone
 
@@ -25,10 +26,12 @@ def relit(
     inside: BoolArray,
     log_gain: FloatArray,
     tone: Tone,
+    tint: FloatArray,
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """Pixels with their shadow lifted, and the mask (H, W) uint8, 255 = shadow.
 
     inside: (h, w) bool, the regions treated; log_gain: (h, w) float32; both, like `soft`, at the overview's size.
+    tint: (2,) see `Regions`.
     """
     import cv2
 
@@ -56,7 +59,10 @@ def relit(
             continue
         calm = _calmed(around, noise)[top - first :][: bottom - top]
         factor = np.where(changed, tone.factor(level, log) * calm, np.float32(1.0))
-        lifted[top:bottom] = multiplied(source, np.maximum(factor, np.float32(1.0)))
+        brighter = multiplied(source, np.maximum(factor, np.float32(1.0)))
+        if brighter.ndim == 3 and brighter.shape[2] == 3:
+            brighter = as_sunlit(brighter, level, share * changed, tint, linear=tone.linear)
+        lifted[top:bottom] = brighter
     return lifted, mask
 
 

@@ -24,7 +24,7 @@ from aeromatch_cli.strategies.enhancers.shadow_regions import Regions, find_regi
 class ShadowEnhancement(KeepsSource):
     """Cast shadow brightened region by region to the light around it; an image without shadow stays unchanged."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_colour: ClassVar[bool] = True
     name: Literal["shadow"] = "shadow"
     keep_source: bool = Field(True, description=KeepsSource.model_fields["keep_source"].description)
@@ -92,7 +92,7 @@ class ShadowEnhancement(KeepsSource):
         if regions is None or not self._is_shadow(regions, overview.valid):
             mask = np.zeros(pixels.shape[:2], dtype=np.uint8)
             return Enhanced(pixels, mask, {"shadow_share": 0.0, "start_gain": 1.0, "region_count": 0, "regions": []})
-        lifted, mask = relit(pixels, valid, soft, regions.labels > 0, gain_field(regions), overview.tone)
+        lifted, mask = relit(pixels, valid, soft, regions.labels > 0, gain_field(regions), overview.tone, regions.tint)
         scale = pixels.shape[1] / soft.share.shape[1]
         facts = {
             "shadow_share": round(float(np.count_nonzero(mask)) / mask.size, 5),

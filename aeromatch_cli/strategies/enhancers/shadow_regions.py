@@ -24,6 +24,7 @@ class Regions:
     """labels: (h, w) int32, 0 = lit, regions from 1 by area, largest first. log_gain: (R + 1,) float32, natural
     logarithm of each region's gain on light, [0] the start factor's. start: the picture's lit / shadow ratio of light.
     area_px: (R + 1,) at the overview; light: (R + 1,) mean linear light; boxes_px: (R + 1, 4) x, y, width, height.
+    tint: (2,) logarithms of by how much red over green, and blue over green, of light are larger where it is lit.
     """
 
     labels: IntArray
@@ -32,6 +33,7 @@ class Regions:
     area_px: IntArray
     light: FloatArray
     boxes_px: IntArray
+    tint: FloatArray
 
 
 def find_regions(
@@ -57,16 +59,16 @@ def find_regions(
     log_light = np.log(np.maximum(overview.light, np.float32(_LEAST_LIGHT))).astype(np.float64)
     areas = np.bincount(labels.ravel(), minlength=len(kept) + 1)
     means = np.bincount(labels.ravel(), weights=log_light.ravel(), minlength=len(kept) + 1) / np.maximum(areas, 1)
-    start = _log_ratio(overview, log_light, share)
+    start, tint = _log_ratio(overview, log_light, share)
     log_gain = start + exponent * (log_light[labels > 0].mean() - means)
     log_gain[0] = start
     bounded = np.clip(log_gain, 0.0, np.log(max_gain)).astype(np.float32)
     boxes = np.asarray(stats, dtype=np.int64)[np.concatenate([[0], kept]), : cv2.CC_STAT_AREA]
-    return Regions(labels, bounded, float(np.exp(start)), areas, np.exp(means), boxes)
+    return Regions(labels, bounded, float(np.exp(start)), areas, np.exp(means), boxes, tint)
 
 
-def _log_ratio(overview: Overview, log_light: FloatArray, share: FloatArray) -> float:
-    """Logarithm of lit over shadowed light, of the same ground.
+def _log_ratio(overview: Overview, log_light: FloatArray, share: FloatArray) -> tuple[float, FloatArray]:
+    """Logarithm of lit over shadowed light, of the same ground; and (2,) of the change of colour, `Regions.tint`.
 
     Compared are pairs of pixels a few apart, one surely lit and one surely in shadow, so that the penumbra is left out;
     of these the half whose difference in colour is nearest to the usual one, since a pair of two materials differs in
@@ -83,9 +85,10 @@ def _log_ratio(overview: Overview, log_light: FloatArray, share: FloatArray) -> 
             shifts.append(colours[sunny][pairs] - colours[shady][pairs])
     ratio, shift = np.concatenate(ratios), np.concatenate(shifts)
     if len(ratio) < _LEAST_PAIRS:
-        return float(log_light[lit].mean() - log_light[dark].mean()) if lit.any() and dark.any() else 0.0
-    distance = np.abs(shift - np.median(shift, axis=0)).sum(axis=1)
-    return float(np.median(ratio[distance <= np.median(distance)]))
+        return float(log_light[lit].mean() - log_light[dark].mean()) if lit.any() and dark.any() else 0.0, np.zeros(2)
+    usual = np.median(shift, axis=0)
+    distance = np.abs(shift - usual).sum(axis=1)
+    return float(np.median(ratio[distance <= np.median(distance)])), usual
 
 
 def gain_field(regions: Regions) -> FloatArray:
