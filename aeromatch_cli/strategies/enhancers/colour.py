@@ -21,10 +21,11 @@ _LARGEST_LOG = 0.7
 def as_sunlit(
     lifted: NDArray[Any], level: FloatArray, share: FloatArray, tint: FloatArray, *, linear: bool
 ) -> NDArray[Any]:
-    """Lifted pixels (H, W, 3) in the colour that the sun would give them, their gray level unchanged.
+    """Lifted pixels (H, W, 3) in the colour that the sun would give them, their gray level unchanged up to rounding.
 
-    level: (H, W) of the brightest band before, 0-1. share: (H, W) of shadow, 0-1. tint: (2,) logarithms of by how much
-    red over green, and blue over green, of light are larger where it is lit.
+    level: (H, W) of the brightest band before, 0-1. share: (H, W) of shadow, 0-1; pixels without
+    any stay as they are. tint: (2,) logarithms of by how much red over green, and blue over green, of light are larger
+    where it is lit.
     """
     power = 1.0 if linear else _POWER
     change = np.clip(np.array([tint[0], 0.0, tint[1]]), -_LARGEST_LOG, _LARGEST_LOG) / power
@@ -33,4 +34,5 @@ def as_sunlit(
     bands *= (before / np.maximum(brightness(bands), np.float32(1.0)))[..., None]
     doubt = share * (1.0 - np.clip(level / np.float32(_KNOWN_LEVEL), 0.0, 1.0))
     bands += doubt[..., None] * (before[..., None] - bands)
-    return np.clip(np.rint(bands), 0, np.iinfo(lifted.dtype).max).astype(lifted.dtype)
+    coloured = np.clip(np.rint(bands), 0, np.iinfo(lifted.dtype).max).astype(lifted.dtype)
+    return np.where((share > 0)[..., None], coloured, lifted)
