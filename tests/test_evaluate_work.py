@@ -19,7 +19,7 @@ from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
 from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.evaluate.work import Evaluation
-from aeromatch_cli.formats.features import read_features, write_features
+from aeromatch_cli.formats.features import features_fingerprint, read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
 
 pytestmark = pytest.mark.slow
@@ -62,9 +62,9 @@ def test_shifted_keypoints_are_nearly_all_wrong(work: Path, rendered: Path, tmp_
     copy = tmp_path / "work"
     shutil.copytree(work, copy)
     path = sorted((copy / "features").iterdir())[0]
-    features = read_features(path)
+    features, same = read_features(path), str(features_fingerprint(path))
     with path.open("wb") as stream:
-        write_features(stream, replace(features, keypoints_px=features.keypoints_px + np.float32(12.0)), "moved")
+        write_features(stream, replace(features, keypoints_px=features.keypoints_px + np.float32(12.0)), same)
     found = evaluate_workspace(copy, rendered, mapping=False)
     name = next(row["name"] for row in rows(copy / "images.csv") if row["image_id"] == path.stem)
     moved = [row for row in found.pairs if name in (row.name0, row.name1)]

@@ -63,6 +63,26 @@ def test_show_says_what_a_workspace_an_image_and_a_pair_hold(done_site: Site) ->
 
 
 @pytest.mark.slow
+def test_matches_of_keypoints_that_were_found_again_are_named_and_not_drawn(done_site: Site, rendered: Path) -> None:
+    """`extract` alone with other settings: the matches on file point into features that are gone."""
+    work, names = done_site.work, done_site.names()
+    assert done_site("extract", "--set", "extract.keypoints=300").code == 0
+    for command in (
+        ("show", work, names[0]),
+        ("show", work, names[0], names[1]),
+        ("compare", work, work),
+        ("evaluate", work, "--truth", rendered),
+    ):
+        told = invoke(*command)
+        assert told.code == 3, command
+        assert "run `aeromatch match` and then `aeromatch filter`" in told.stderr
+    assert invoke("report", "--workspace", work).code == 0
+    assert "pairs were not judged" in (work / "report" / "index.html").read_text()
+    assert done_site("run", "--set", "extract.keypoints=300").code == 0
+    assert invoke("show", work, names[0], names[1]).code == 0
+
+
+@pytest.mark.slow
 def test_show_reads_files(done_site: Site) -> None:
     rows = invoke("show", done_site.work / "images.csv").stdout
     assert f"{IMAGES} rows" in rows

@@ -166,6 +166,7 @@ workspace; those of the workspace itself join them. `guided` has no features: it
 One row: all P pairs of id0, concatenated. Pair p owns the entries `offsets[p]` to `offsets[p + 1]` of M matches.
 
 - `image_id1` (P,) str. `fingerprint` (P,) str. `offsets` (P + 1,) int64. `strategy` (P,) str: the matcher.
+- `features0`, `features1` (P,) str: fingerprints of the feature files that `indices` point into.
 - `indices` (M, 2) int32 into both keypoint lists; -1 for a point that was measured without a keypoint.
 - `scores` (M,) float32 in 0-1, larger is better. `view_pairs` (M, 2) int16: the views that were compared.
 - `points0_px`, `points1_px` (M, 2) float64: measured places; only where some index is -1.
@@ -174,8 +175,8 @@ One row: all P pairs of id0, concatenated. Pair p owns the entries `offsets[p]` 
 
 ### verified/<id0>.npz
 
-The same row layout with the kept matches: `image_id1`, `fingerprint`, `offsets`, `indices`, `scores` and, where there
-are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
+The same row layout with the kept matches: `image_id1`, `fingerprint`, `features0`, `features1`, `offsets`, `indices`,
+`scores` and, where there are any, `points0_px`, `points1_px`, `sigmas_px`, as above.
 
 - `errors_px` (M,) float32: error to the model, undistorted pixels; NaN where unknown.
 - `state` (P,) str: `verified`, `rejected` or `not verifiable`. `reason` (P,) str.

@@ -6,6 +6,7 @@ import struct
 import zipfile
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -77,6 +78,17 @@ def features_fingerprint(path: Path) -> str | None:
         return str(load_arrays(path, ("fingerprint",))["fingerprint"])
     except BrokenFileError:
         return None
+
+
+def known_fingerprint(path: Path) -> str | None:
+    """The same, read once as long as the file is not written again."""
+    return _cached_fingerprint(path, path.stat().st_mtime_ns) if path.is_file() else None
+
+
+@lru_cache(maxsize=1 << 16)
+def _cached_fingerprint(path: Path, stamp: int) -> str | None:
+    del stamp  # only tells rewritten files apart
+    return features_fingerprint(path)
 
 
 def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:

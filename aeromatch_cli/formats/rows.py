@@ -20,26 +20,34 @@ from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.features import ARCHIVE_FAULTS, load_arrays
 from aeromatch_cli.formats.reading import readable
 
+# Features of rows that earlier versions wrote.
+UNKNOWN = ("", "")
+
 
 @dataclass(frozen=True, eq=False)
 class MatchEntry:
-    """One pair of a matches row."""
+    """One pair of a matches row. features: fingerprints of both images' features that its numbers point into."""
 
     image_id1: str
     fingerprint: str
     strategy: str
     matches: Matches
+    features: tuple[str, str] = UNKNOWN
 
 
 @dataclass(frozen=True, eq=False)
 class VerifiedEntry:
-    """One pair of a verified row: the kept matches and what the filters said (verdict.keep is all True here)."""
+    """One pair of a verified row: the kept matches and what the filters said (verdict.keep is all True here).
+
+    features: fingerprints of both images' features that the matches' numbers point into.
+    """
 
     image_id1: str
     fingerprint: str
     matches_in: int
     matches: Matches
     verdict: Verdict
+    features: tuple[str, str] = UNKNOWN
 
 
 def write_match_row(stream: BinaryIO, entries: Sequence[MatchEntry]) -> None:
@@ -59,7 +67,7 @@ def read_match_row(path: Path) -> dict[str, MatchEntry]:
     with readable(path, *ARCHIVE_FAULTS):
         view_pairs, strategy = row["view_pairs"], row["strategy"]
         return {
-            id1: MatchEntry(id1, fp, str(strategy[p]), row.matches(p, view_pairs))
+            id1: MatchEntry(id1, fp, str(strategy[p]), row.matches(p, view_pairs), row.features(p))
             for p, (id1, fp) in enumerate(row.keys())
         }
 
@@ -106,7 +114,7 @@ def _verified_entry(row: _Row, p: int, image_id1: str, fingerprint: str) -> Veri
         rejected=json.loads(str(row["rejected"][p])),
         relative_rotation=None if np.isnan(rotation).any() else rotation,
     )
-    return VerifiedEntry(image_id1, fingerprint, int(row["matches_in"][p]), matches, verdict)
+    return VerifiedEntry(image_id1, fingerprint, int(row["matches_in"][p]), matches, verdict, row.features(p))
 
 
 def row_fingerprints(path: Path) -> dict[str, str]:
@@ -138,6 +146,11 @@ class _Row:
     def span(self, p: int) -> slice:
         return slice(int(self._offsets[p]), int(self._offsets[p + 1]))
 
+    def features(self, p: int) -> tuple[str, str]:
+        if "features0" not in self._arrays:
+            return UNKNOWN
+        return str(self["features0"][p]), str(self["features1"][p])
+
     def matches(self, p: int, view_pairs: IntArray | None) -> Matches:
         span = self.span(p)
         indices = self["indices"][span]
@@ -158,6 +171,8 @@ def _row_arrays(entries: Sequence[MatchEntry] | Sequence[VerifiedEntry]) -> dict
     arrays: dict[str, NDArray[Any]] = {
         "image_id1": _strings([e.image_id1 for e in entries]),
         "fingerprint": _strings([e.fingerprint for e in entries]),
+        "features0": _strings([e.features[0] for e in entries]),
+        "features1": _strings([e.features[1] for e in entries]),
         "offsets": np.cumsum([0, *(len(m.indices) for m in matches)], dtype=np.int64),
         "indices": _joined([m.indices for m in matches], (0, 2), np.int32),
         "scores": _joined([m.scores for m in matches], (0,), np.float32),

@@ -28,6 +28,7 @@ from aeromatch_cli.report.rows import PairRow
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.workspace import Workspace
 
 MAX_REJECTED_PREVIEWS = 2
@@ -84,6 +85,7 @@ class DrawnMatches:
             path, entry, errors = self._workspace.matches(ids[0]), self._matched(ids[0]).get(ids[1]), None
         if entry is None:
             raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
+        check_features(self._workspace, ids[0], entry)
         return match_points(entry.matches, *(self._keypoints(i) for i in ids)), errors
 
 

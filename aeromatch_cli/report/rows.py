@@ -237,7 +237,7 @@ def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> Pair
     names = (context.image_by_id[pair.image_id0].name, context.image_by_id[pair.image_id1].name)
     known = (pair.image_id0, pair.image_id1, *names, pair.overlap, pair.view_angle_deg, pair.reason)
     if entry is None:
-        words = "no matches on file: the match stage failed or has not run"
+        words = "no matches of the present keypoints on file: run match and filter"
         return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})
     verdict = entry.verdict
     errors = np.zeros(0) if verdict.errors_px is None else verdict.errors_px[np.isfinite(verdict.errors_px)]

@@ -24,6 +24,7 @@ from aeromatch_cli.report.pictures import image_picture, pair_picture, write_pic
 from aeromatch_cli.report.rows import STAGE_ORDER
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.workspace import Workspace, read_json
 
 # Partners that are listed one by one.
@@ -201,6 +202,7 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     found, raw = work.final(pair), read_match_row(workspace.matches(ids[0])).get(ids[1])
     if found is None or raw is None:
         raise InputError(f"{image0.name} and {image1.name} have no matches on file: run aeromatch match and filter")
+    check_features(workspace, ids[0], raw)
     verdict = found.verdict
     kept = found.matches if verdict.state == "verified" else None
     count = 0 if kept is None else len(kept.indices)

@@ -22,6 +22,7 @@ from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, select, verified_pairs
+from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
@@ -131,12 +132,17 @@ def final_pairs(context: Context) -> Judged:
 
 
 class FinalEntries:
-    """What is left of verified entries, by what a workspace has on file; all, where that is of other results."""
+    """What is left of verified entries, by what a workspace has on file; all, where that is of other results.
+
+    Raises WorkspaceError for an entry whose features were made again since.
+    """
 
     def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
         self._dropped, self._least = read_dropped(workspace.dropped)
 
     def __call__(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
+        check_features(self._workspace, image_id0, entry)
         made_of, rows = self._dropped.get((image_id0, entry.image_id1), ("", None))
         if rows is None or made_of != entry.fingerprint:
             return entry

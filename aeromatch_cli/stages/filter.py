@@ -113,7 +113,8 @@ def _judge(task: FilterTask, pair: PairTask, entry: MatchEntry) -> VerifiedEntry
     verdict = replace(verdict, keep=np.ones(len(kept.indices), dtype=bool), errors_px=errors)
     if entry.matches.remark:
         verdict = replace(verdict, reason=entry.matches.remark)
-    return VerifiedEntry(entry.image_id1, pair.fingerprint, len(entry.matches.indices), kept, verdict)
+    features = rows.features_of(task.workspace, task.image_id0, entry.image_id1)
+    return VerifiedEntry(entry.image_id1, pair.fingerprint, len(entry.matches.indices), kept, verdict, features)
 
 
 def match_points(matches: Matches, keypoints0: FloatArray, keypoints1: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -196,13 +197,14 @@ def outdated_pairs(context: Context) -> list[Pair]:
 
 
 def verified_pairs(context: Context) -> Judged:
-    """Judged pairs in the order of pairs.csv: stale rows of older pair lists cannot leak."""
+    """Judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again since,
+    cannot leak."""
     row_id, row = "", dict[str, VerifiedEntry]()
     for pair in context.pairs:
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_verified_row(context.workspace.verified(pair.image_id0))
         entry = row.get(pair.image_id1)
-        if entry is not None:
+        if entry is not None and not rows.stale_image(context.workspace, pair.image_id0, entry):
             yield pair, entry
 
 

@@ -104,7 +104,7 @@ def _match_pair(task: MatchTask, pair: PairTask, features0: Features, ahead: dic
     if matches is None:
         sources = (task.sources[ids[0]], task.sources[ids[1]]) if matcher.reads_pixels else None
         matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
-    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches)
+    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, rows.features_of(task.workspace, *ids))
 
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from aeromatch_cli.data import PairGeometry
-from aeromatch_cli.errors import BrokenFileError
+from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 from aeromatch_cli.executor import guarded
+from aeromatch_cli.formats.features import known_fingerprint
+from aeromatch_cli.formats.rows import UNKNOWN, MatchEntry, VerifiedEntry
+from aeromatch_cli.workspace import Workspace
 
 
 class Entry(Protocol):
@@ -65,6 +68,34 @@ def missing(pairs: Sequence[PairTask], old: Mapping[str, E]) -> list[PairTask]:
     """The pairs without an entry that carries the wanted fingerprint."""
     on_file = {image_id1: entry.fingerprint for image_id1, entry in old.items()}
     return [pair for pair in pairs if on_file.get(pair.image_id1) != pair.fingerprint]
+
+
+def features_of(workspace: Workspace, image_id0: str, image_id1: str) -> tuple[str, str]:
+    """Fingerprints of the features on file: what an entry that is made now points into."""
+    first, second = (known_fingerprint(workspace.features(i)) or "" for i in (image_id0, image_id1))
+    return first, second
+
+
+def stale_image(workspace: Workspace, image_id0: str, entry: MatchEntry | VerifiedEntry) -> str:
+    """The image whose features were made again after the pair was matched, so that its matches' numbers mean other
+    keypoints; "" where there is none."""
+    if entry.features == UNKNOWN:
+        return ""
+    now = features_of(workspace, image_id0, entry.image_id1)
+    for image_id, made_of, present in zip((image_id0, entry.image_id1), entry.features, now, strict=True):
+        if present not in (made_of, ""):
+            return image_id
+    return ""
+
+
+def check_features(workspace: Workspace, image_id0: str, entry: MatchEntry | VerifiedEntry) -> None:
+    """Raises WorkspaceError where an entry's matches point into features that are no longer there."""
+    if image_id := stale_image(workspace, image_id0, entry):
+        raise WorkspaceError(
+            f"{workspace.root}: the keypoints of {image_id} were found again with other settings or inputs after it "
+            "was matched, so that its matches no longer hold: run `aeromatch match` and then `aeromatch filter`, or "
+            "`aeromatch run`"
+        )
 
 
 def readable(read: Callable[[Path], dict[str, E]], path: Path, overwrite: bool) -> dict[str, E]:

@@ -29,6 +29,7 @@ from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
+from aeromatch_cli.stages.rows import features_of
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, run_stage
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically, write_text
@@ -226,7 +227,8 @@ def join_row(task: RowTask) -> int:
         keypoints1 = _joined(task.workspace.features(image_id1))
         parts = [(name, raw[w][image_id1], kept[w].get(image_id1)) for name, w in task.steps[image_id1]]
         names = "+".join(dict.fromkeys(entry.strategy for _, entry, _ in parts))
-        entries.append(MatchEntry(image_id1, own, names, joined_matches(parts, keypoints0, keypoints1)))
+        features = features_of(task.workspace, task.image_id0, image_id1)
+        entries.append(MatchEntry(image_id1, own, names, joined_matches(parts, keypoints0, keypoints1), features))
     write_atomically(task.workspace.matches(task.image_id0), lambda stream: write_match_row(stream, entries))
     return sum(len(entry.matches.indices) for entry in entries)
 

@@ -61,7 +61,7 @@ def relit(
         factor = np.where(changed, tone.factor(level, log) * calm, np.float32(1.0))
         brighter = multiplied(source, np.maximum(factor, np.float32(1.0)))
         if brighter.ndim == 3 and brighter.shape[2] == 3:
-            brighter = as_sunlit(brighter, level, share * changed, tint, linear=tone.linear)
+            brighter = as_sunlit(brighter, level, np.where(changed, share, np.float32(0.0)), tint, linear=tone.linear)
         lifted[top:bottom] = brighter
     return lifted, mask
 
