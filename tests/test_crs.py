@@ -11,6 +11,7 @@ from aeromatch_cli.blocks.crs import (
     choose_crs,
     convergence_deg,
     grid_from_geographic,
+    outside_area,
     rounded_origin_m,
     utm_crs,
 )
@@ -79,3 +80,25 @@ def test_origin_is_rounded_down_to_kilometres() -> None:
     centers_m = np.array([[576663.2, 5188164.9, 197.0], [576673.1, 5188174.2, 198.0], [0.0, 0.0, 0.0]])
     assert rounded_origin_m(centers_m) == (576000.0, 5188000.0, 0.0)
     assert rounded_origin_m(np.array([[-137.0, 7.0, 59.0]])) == (-1000.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("crs", "latitude", "longitude", "said"),
+    [
+        ("EPSG:32633", 52.5, 13.4, ""),
+        ("EPSG:32633", 52.5, 10.0, ""),  # the zone beside
+        ("EPSG:32610", 52.5, 13.4, "far outside EPSG:32610"),
+        ("EPSG:2154", 52.5, 13.4, "far outside EPSG:2154"),
+        ("EPSG:2193", -41.0, 175.0, ""),  # across the antimeridian
+        ("local", 52.5, 13.4, ""),
+    ],
+)
+def test_a_crs_of_another_place_is_named(crs: str, latitude: float, longitude: float, said: str) -> None:
+    geographic = np.array([latitude, latitude]), np.array([longitude, longitude])
+    remark = outside_area(crs, np.zeros((2, 2)) if crs == "local" else grid_from_geographic(crs, *geographic))
+    assert (said in remark) if said else not remark
+
+
+def test_eastings_with_the_zones_number_are_named() -> None:
+    assert "take 33,000,000 off" in outside_area("EPSG:32633", np.array([[33_391_000.0, 5_818_000.0]]))
+    assert not outside_area("EPSG:4647", np.array([[32_391_000.0, 5_818_000.0]]))

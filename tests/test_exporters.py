@@ -18,7 +18,8 @@ from aeromatch_cli.blocks.crs import geographic_from_grid
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.geometry.rotations import from_quaternion
+from aeromatch_cli.geometry.cameras import normalise
+from aeromatch_cli.geometry.rotations import from_quaternion, to_omega_phi_kappa
 from aeromatch_cli.strategies.exporters import EXPORTERS, ExportContents, PairContents
 from aeromatch_cli.strategies.exporters.solution import matched
 
@@ -200,6 +201,19 @@ def test_orientations_read_back(contents, truth: Truth, tmp_path: Path) -> None:
     assert read_pose_file(tmp_path / "blocks-exchange" / "blocks.xml").crs == CRS
 
 
+@pytest.mark.parametrize(("name", "file"), [("micmac", "Ori-aeromatch"), ("blocks-exchange", "blocks.xml")])
+def test_cameras_read_back(truth: Truth, tmp_path: Path, name: str, file: str) -> None:
+    """One with tangential distortion and one with radial alone: the same pixels as before."""
+    EXPORTERS[name]()(truth.contents(), tmp_path / name)  # type: ignore[operator]
+    found = read_pose_file(tmp_path / name / file)
+    cameras = {row.image.rsplit("/", 1)[-1].removeprefix("flight_"): found.cameras[row.camera] for row in found.rows}
+    places = np.array([[0.0, 0.0], [799.0, 0.0], [123.0, 456.0], [799.0, 599.0]])
+    for image in truth.block.images:
+        before, after = truth.block.cameras[image.camera_id], cameras[image.name.rsplit("/", 1)[-1]]
+        assert (before.width_px, before.height_px) == (after.width_px, after.height_px)
+        np.testing.assert_allclose(normalise(after, places), normalise(before, places), atol=2e-7)
+
+
 def test_bundlers_points_are_seen_where_its_camera_model_says(contents, truth: Truth, tmp_path: Path) -> None:
     """Of camera B, whose principal point is the middle: x right and y up of it, k1 alone."""
     EXPORTERS["bundler"]()(contents(), tmp_path / "b")  # type: ignore[operator]
@@ -259,6 +273,63 @@ def test_geojson_lies_where_the_cameras_are(contents, truth: Truth, tmp_path: Pa
     np.testing.assert_allclose(place, [longitude, latitude, height], atol=1e-4)
     assert len(pairs["features"]) == len(truth.pairs)
     assert pairs["features"][0]["properties"]["matches"] == len(truth.pairs[0].verified)
+    assert "crs" not in pairs
+
+
+def test_geojson_of_a_local_block_is_no_longitude_and_latitude(truth: Truth, tmp_path: Path) -> None:
+    import pyogrio
+
+    local = dataclasses.replace(truth.contents(), geographic=None)
+    EXPORTERS["geojson"]()(local, tmp_path / "g")  # type: ignore[operator]
+    assert pyogrio.read_info(tmp_path / "g" / "cameras.geojson")["crs"].startswith(
+        'LOCAL_CS["local frame of the block"'
+    )
+
+
+def test_styles_name_the_fields_of_their_layers(contents, tmp_path: Path) -> None:
+    from defusedxml.ElementTree import parse
+
+    EXPORTERS["geojson"]()(contents(), tmp_path / "g")  # type: ignore[operator]
+    for name, field in (("cameras", "weak"), ("footprints", None), ("pairs", "matches")):
+        renderer = parse(tmp_path / "g" / f"{name}.qml", forbid_dtd=False).getroot().find("renderer-v2")
+        assert renderer.get("attr") == field
+        symbols = {symbol.get("name") for symbol in renderer.iter("symbol")}
+        used = {one.get("symbol") for one in (*renderer.iter("range"), *renderer.iter("category"))}
+        assert used <= symbols
+        if field:
+            features = json.loads((tmp_path / "g" / f"{name}.geojson").read_text())["features"]
+            assert field in features[0]["properties"]
+
+
+def test_a_track_has_one_place_in_each_image(truth: Truth, tmp_path: Path) -> None:
+    """A second keypoint of an image, 5 px off the point's projection: the nearer one is kept, whichever is first."""
+    base = truth.contents()
+    adjusted = adjusted_block(truth)
+    track = adjusted.tracks["img0"]
+    points = truth.keypoints_px["img0"].copy()
+    far = np.concatenate([points, points[track[:1, 0]] + np.float32(5.0)])
+    for tracks in (
+        np.concatenate([track, [[len(points), track[0, 1]]]]),
+        np.concatenate([[[len(points), track[0, 1]]], track]),
+    ):
+        doubled = dataclasses.replace(adjusted, tracks={**adjusted.tracks, "img0": tracks})
+        contents = dataclasses.replace(
+            base, adjusted=doubled, keypoints_px=lambda i: far if i == "img0" else truth.keypoints_px[i]
+        )
+        EXPORTERS["tracks"]()(contents, tmp_path / "t")  # type: ignore[operator]
+        with (tmp_path / "t" / "tracks.csv").open(newline="") as stream:
+            table = list(csv.DictReader(stream))
+        rows = [(row["track"], row["image"]) for row in table]
+        assert len(set(rows)) == len(rows)
+        own = [row for row in table if row["image"] == "flight/0.jpg" and row["track"] == str(track[0, 1])]
+        assert [int(row["keypoint"]) for row in own] == [track[0, 0]]
+
+
+@pytest.mark.parametrize("name", ["bundler", "openmvg", "alicevision", "hloc", "colmap"])
+def test_formats_without_a_crs_say_what_they_count_from(contents, tmp_path: Path, name: str) -> None:
+    EXPORTERS[name]()(contents(), tmp_path / name)  # type: ignore[operator]
+    world = json.loads((tmp_path / name / "world.json").read_text())
+    assert (world["crs"], world["origin_m"]) == (CRS, list(ORIGIN_M))
 
 
 def test_tracks_are_a_table(contents, truth: Truth, tmp_path: Path) -> None:
@@ -319,6 +390,11 @@ def test_a_geopackage_has_three_layers_in_the_blocks_crs(contents, truth: Truth,
     assert set(layers) >= {"cameras", "pairs"}
     meta, _, geometry, fields = pyogrio.raw.read(path, layer="cameras")
     assert meta["crs"] == CRS
+    styles = pyogrio.raw.read(path, layer="layer_styles", read_geometry=False)
+    table = dict(zip(styles[0]["fields"], styles[3], strict=True))
+    assert {"cameras", "pairs"} <= set(table["f_table_name"])
+    assert table["useAsDefault"].all()
+    assert all("renderer-v2" in text for text in table["styleQML"])
     point = from_wkb(geometry[0])
     np.testing.assert_allclose([point.x, point.y, point.z], truth.block.poses["img0"].center_m + ORIGIN_M)
     assert fields[list(meta["fields"]).index("image")][0] == "flight/0.jpg"
@@ -343,6 +419,13 @@ def test_bingo_writes_millimetres_from_the_principal_point(contents, truth: Trut
         np.testing.assert_allclose([float(x), float(y)], expected, atol=2e-5)
     assert end > 50
     assert (tmp_path / "p" / "photos.txt").read_text().splitlines()[1] == "2 flight/1.jpg"
+    found = read_pose_file(tmp_path / "p" / "exterior.txt", "opk-gon")
+    row = found.rows[0]
+    assert row.position is not None
+    assert row.attitude is not None
+    np.testing.assert_allclose(row.position, pose.center_m + ORIGIN_M, atol=1e-4)
+    assert pose.world_rotation is not None
+    np.testing.assert_allclose(row.attitude, to_omega_phi_kappa(pose.world_rotation), atol=1e-5)
 
 
 def test_the_guide_has_every_exporter() -> None:

@@ -131,9 +131,8 @@ def test_an_mrk_names_exposures_by_number(tmp_path: Path) -> None:
     assert found.rows[2].position is None
     assert len(remarks) == 1
     assert [word in " ".join(found.warnings) for word in ("1 exposures had no fix", "1 of 3 exposures had no fixed")]
-    ambiguous, said = matched_rows(found, ["a/DJI_0001.JPG", "b/DJI_0001.JPG", "DJI_0002.JPG"], "list")
-    assert set(ambiguous) == {"DJI_0002.JPG"}
-    assert "names that several images have (1)" in said[0] or "names that several images have (1)" in " ".join(said)
+    with pytest.raises(ConfigError, match=r"'1' may be a/DJI_0001\.JPG or b/DJI_0001\.JPG"):
+        matched_rows(found, ["a/DJI_0001.JPG", "b/DJI_0001.JPG", "DJI_0002.JPG"], "list")
 
 
 @pytest.mark.parametrize(("encoding", "separator"), [("utf-8-sig", ","), ("utf-16", ";"), ("latin-1", "\t")])

@@ -231,13 +231,19 @@ def test_a_list_without_heights(tmp_path: Path) -> None:
 def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:
     for name in ("a/1.jpg", "b/1.jpg", "b/2.JPG", "c/3.jpg"):
         write_image(tmp_path / name)
-    table = "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,2,0,9\n2.jpg,3,0,9\n1.jpg,4,0,9\nlost.jpg,5,0,9\n3,6,0,9\n"
+    table = "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,2,0,9\n2.jpg,3,0,9\nlost.jpg,5,0,9\n3,6,0,9\n"
     inputs = read_inputs(tmp_path, write_poses(tmp_path, table))
     found = {image.name: inputs.poses[image.image_id].center_m[0] for image in inputs.images}
     assert found == {"a/1.jpg": 1.0, "b/1.jpg": 2.0, "b/2.JPG": 3.0, "c/3.jpg": 6.0}
     text = "\n".join(inputs.warnings)
     assert "names 1 image that is not in the folder: lost.jpg" in text
-    assert "names that several images have (1.jpg)" in text
+    for name, place in (("1.jpg", 1.0), (r"D:\flight\b\1.jpg", 2.0)):
+        table = f"image,x,y,z\n{name},{place},0,9\n"
+        if name == "1.jpg":
+            with pytest.raises(ConfigError, match=r"line 2, column image: '1\.jpg' may be a/1\.jpg or b/1\.jpg"):
+                read_inputs(tmp_path, write_poses(tmp_path, table))
+        else:
+            assert set(read_inputs(tmp_path, write_poses(tmp_path, table)).poses) == {"b--1_jpg"}
 
     partial = read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\na/1.jpg,1,0,9\nb/1.jpg,,,\n"))
     assert set(partial.poses) == {"a--1_jpg"}
@@ -312,3 +318,17 @@ def test_facts_may_be_read_elsewhere(tmp_path: Path) -> None:
     inputs = read_inputs(tmp_path, read_header=lambda path: "refused" if path.name == "a.jpg" else exif_or_reason(path))
     assert inputs.failures[0].reason == "refused"
     assert [image.name for image in inputs.images] == ["b.jpg"]
+
+
+def test_a_camera_file_goes_before_the_cameras_of_a_pose_file(tmp_path: Path) -> None:
+    write_image(tmp_path / "images" / "a.jpg", (40, 30))
+    shot = {"rotation": [3.14159, 0.0, 0.0], "translation": [0.0, 0.0, 100.0], "camera": "theirs"}
+    theirs = {"projection_type": "perspective", "width": 40, "height": 30, "focal": 0.9, "k1": 0.0, "k2": 0.0}
+    poses = tmp_path / "reconstruction.json"
+    poses.write_text(json.dumps([{"cameras": {"theirs": theirs}, "shots": {"a.jpg": shot}}]))
+    assert [camera.params[0] for camera in read_inputs(tmp_path / "images", poses).cameras.values()] == [36.0]
+    own = tmp_path / "own.json"
+    own.write_text('{"own": {"model": "SIMPLE_PINHOLE", "width": 40, "height": 30, "params": [77, 20, 15]}}')
+    found = read_inputs(tmp_path / "images", poses, str(own))
+    assert [camera.params[0] for camera in found.cameras.values()] == [77.0]
+    assert not found.failures

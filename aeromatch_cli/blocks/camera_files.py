@@ -14,20 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.blocks.lenses import Nearest, of_colmap
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import MODELS, focal_px, from_colmap
+from aeromatch_cli.geometry.cameras import MODELS, colmap_params, focal_px
 
 _ENTRY_KEYS = ("model", "width", "height", "params")
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a camera file states. cameras: name -> Camera; crs, ground_z_m: in that CRS, None where not given."""
+    """What a camera file states. cameras: name -> Camera; crs, ground_z_m: in that CRS, None where not given; remarks:
+    on lens models that others stand for."""
 
     cameras: Mapping[str, Camera]
     crs: str | None = None
     ground_z_m: float | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def read_camera_file(path: Path) -> CameraFile:
@@ -46,7 +49,7 @@ def read_camera_file(path: Path) -> CameraFile:
 
 
 def _colmap(path: Path, text: str) -> CameraFile:
-    cameras: dict[str, Camera] = {}
+    cameras: dict[str, Nearest] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
@@ -57,7 +60,7 @@ def _colmap(path: Path, text: str) -> CameraFile:
         if fields[0] in cameras:
             raise ConfigError(f"{where}: camera {fields[0]} is defined twice: keep one")
         cameras[fields[0]] = _camera(where, fields[1], fields[2], fields[3], fields[4:])
-    return CameraFile(cameras)
+    return _file(path, cameras)
 
 
 def _tree(path: Path, text: str) -> CameraFile:
@@ -81,14 +84,22 @@ def _tree(path: Path, text: str) -> CameraFile:
         raise ConfigError(f"{path}, key cameras: must hold NAME: {{model, width, height, params}}")
     cameras = {str(name): _entry(f"{path}, camera {name!r}", entry) for name, entry in entries.items()}
     if entries is tree:
-        return CameraFile(cameras)
+        return _file(path, cameras)
     crs = tree.get("crs")
     if crs is not None and not isinstance(crs, str):
         raise ConfigError(f"{path}, key crs: must be a code such as EPSG:32633, got {crs!r}")
-    return CameraFile(cameras, crs, _ground_z(path, tree.get("ground_z")))
+    return _file(path, cameras, crs, _ground_z(path, tree.get("ground_z")))
 
 
-def _entry(where: str, entry: Any) -> Camera:
+def _file(
+    path: Path, lenses: Mapping[str, Nearest], crs: str | None = None, ground_z_m: float | None = None
+) -> CameraFile:
+    cameras = {name: lens.camera for name, lens in lenses.items() if lens.camera is not None}
+    remarks = [lens.remark(f"{path.name}, camera {name}") for name, lens in lenses.items()]
+    return CameraFile(cameras, crs, ground_z_m, tuple(filter(None, remarks)))
+
+
+def _entry(where: str, entry: Any) -> Nearest:
     if not isinstance(entry, dict):
         raise ConfigError(f"{where}: must be {{model, width, height, params}}, got {entry!r}")
     for key in _ENTRY_KEYS:
@@ -102,7 +113,7 @@ def _entry(where: str, entry: Any) -> Camera:
     return _camera(where, str(entry["model"]), entry["width"], entry["height"], entry["params"])
 
 
-def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) -> Camera:
+def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) -> Nearest:
     try:
         size = int(width), int(height)
         values = tuple(float(value) for value in params)
@@ -111,16 +122,20 @@ def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) 
     if min(size) < 1 or not all(math.isfinite(value) for value in values):
         raise ConfigError(f"{where}: width and height must be positive and all params finite")
     try:
-        camera = from_colmap(model, *size, values)
+        lens = of_colmap(model, *size, values)
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
-    named = dict(zip(MODELS[model], values, strict=True))
+    camera = lens.camera
+    if camera is None:
+        raise ConfigError(f"{lens.remark(where)}: give one of {', '.join(MODELS)}")
+    names = MODELS[camera.model]
+    named = dict(zip(names, colmap_params(camera), strict=True))
     if focal_px(camera) <= 0 or not (0 <= named["cx"] <= size[0] and 0 <= named["cy"] <= size[1]):
         raise ConfigError(
             f"{where}: focal length {focal_px(camera):g} px and principal point ({named['cx']:g}, {named['cy']:g}) px "
-            f"do not fit an image of {size[0]} x {size[1]} px: check the order of params ({', '.join(MODELS[model])})"
+            f"do not fit an image of {size[0]} x {size[1]} px: check the order of params ({', '.join(names)})"
         )
-    return camera
+    return lens
 
 
 def _ground_z(path: Path, value: Any) -> float | None:

@@ -8,6 +8,7 @@ north. Worked case: at 28 N, 1 degree east of UTM 17's meridian it is +sin(28) =
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,10 @@ from aeromatch_cli.errors import ConfigError
 LOCAL = "local"
 AUTO = "auto"
 _ORIGIN_STEP_M = 1000.0
+# A neighbouring zone is often used a little beyond its border.
+_MARGIN_DEG = 3.0
+# Eastings of some CRSs and many lists begin with the number of the zone, in millions.
+_PREFIX_M = 1_000_000.0
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,34 @@ def geographic_from_grid(crs: str, xy_m: FloatArray) -> FloatArray:
     transformer = Transformer.from_crs(_crs(crs), "EPSG:4326", always_xy=True)
     longitudes, latitudes = transformer.transform(xy_m[:, 0], xy_m[:, 1])
     return np.column_stack([latitudes, longitudes])
+
+
+def outside_area(crs: str, xy_m: FloatArray) -> str:
+    """What is odd about coordinates (N, 2) in a CRS, for a person: the block lies far from where the CRS is used, or
+    eastings begin with the number of the zone; "" where nothing is, and in a local frame."""
+    if crs == LOCAL or not len(xy_m):
+        return ""
+    known = _crs(crs)
+    x, y = np.nanmedian(xy_m, axis=0)
+    zone = re.fullmatch(r"(\d{1,2})[NS]", known.utm_zone or "")
+    if zone and x // _PREFIX_M == int(zone[1]):
+        return (
+            f"x begins with the number of the zone ({x:.0f} in {crs}): take {zone[1]},000,000 off, or name a CRS that "
+            "counts so"
+        )
+    area = known.area_of_use
+    latitude, longitude = geographic_from_grid(crs, np.array([[x, y]]))[0]
+    if area is None or not np.isfinite(latitude + longitude):
+        return "" if area is None else f"the coordinates ({x:.0f}, {y:.0f}) are no place in {crs}: is it the right CRS?"
+    width = (area.east - area.west) % 360.0
+    east = (longitude - area.west + _MARGIN_DEG) % 360.0
+    south, north = area.south - _MARGIN_DEG, area.north + _MARGIN_DEG
+    if east <= width + 2.0 * _MARGIN_DEG and south <= latitude <= north:
+        return ""
+    return (
+        f"the block lies at latitude {latitude:.2f}, longitude {longitude:.2f}, far outside {crs} ({known.name}, "
+        f"{area.name.rstrip('.')[:80]}): is it the right CRS?"
+    )
 
 
 def convergence_deg(crs: str, latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> FloatArray:

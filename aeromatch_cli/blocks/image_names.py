@@ -15,9 +15,9 @@ from aeromatch_cli.errors import ConfigError
 def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and remarks on lines without image and images without line.
 
-    An exact relative path comes first; then, only where exactly one image fits, the same path in another case, the
-    bare file name, and the name without suffix (Metashape's labels). Running numbers (DJI's MRK, PATB) are those at the
-    end of the names, of one folder.
+    An exact relative path comes first; then the same path in another case, the bare file name, and the name without
+    suffix (Metashape's labels); of several, the one whose folders are named, too. Running numbers (DJI's MRK, PATB) are
+    those at the end of the names, of one folder. Raises ConfigError where two images fit a line, or two lines an image.
     """
     by_key: dict[str, list[str]] = defaultdict(list)
     by_number: dict[int, list[str]] = defaultdict(list)
@@ -31,7 +31,6 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
     exact = set(names)
     rows: dict[str, PoseRow] = {row.image: row for row in pose_list.rows if row.image in exact}
     absent: list[str] = []
-    ambiguous: list[str] = []
     for row in pose_list.rows:
         if row.image in exact:
             continue
@@ -43,8 +42,13 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
                 rows |= dict.fromkeys(found, row)  # the cameras of one exposure
                 continue
         if len(found) > 1:
-            ambiguous.append(row.image)
-        elif not found:
+            found = _with_most_in_common(row.image, found)
+        if len(found) > 1:
+            raise ConfigError(
+                f"{source}, line {row.line}, column image: {row.image!r} may be {found[0]} or {found[1]}: write the "
+                "path relative to the images folder"
+            )
+        if not found:
             absent.append(row.image)
         elif found[0] in rows:
             raise ConfigError(
@@ -62,12 +66,21 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
     if absent:
         what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
         remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
-    if ambiguous:
-        remarks.append(
-            f"{source} gives {len(ambiguous)} names that several images have ({listed(ambiguous)}): their lines are "
-            "not used; write the path relative to the images folder"
-        )
     unnamed = [name for name in names if name not in rows]
     if unnamed:
         remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
     return rows, remarks
+
+
+def _with_most_in_common(written: str, names: Sequence[str]) -> list[str]:
+    """Those that share most folders, from the last on, with a path as it was written on another machine."""
+    wanted = PurePosixPath(written.lower()).parent.parts[::-1]
+
+    def shared(name: str) -> int:
+        own = PurePosixPath(name.lower()).parent.parts[::-1]
+        return next(
+            (k for k, (a, b) in enumerate(zip(wanted, own, strict=False)) if a != b), min(len(wanted), len(own))
+        )
+
+    most = max(map(shared, names))
+    return [name for name in names if shared(name) == most]

@@ -24,7 +24,7 @@ from aeromatch_cli.blocks.cameras import (
     contradicting_exif,
     listed,
 )
-from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
@@ -159,6 +159,7 @@ def block_inputs(
     frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
+    warnings += _foreign_crs(located)
     stated = None if _all_level(located) else _stated_ground(camera_file, frame, Path(lists.cameras).name)
     hint_z_m, hint_source = stated or _relative_ground({} if _all_level(located) else named_poses, facts)
     angles |= _angles_alone(lists, facts, angles)
@@ -221,10 +222,15 @@ def _nothing_left(images_dir: Path, failures: list[ReadFailure]) -> str:
 
 
 def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: Mapping[str, str]) -> CameraAssignment:
+    stated = lists.pose_list.cameras if lists.pose_list is not None else {}
     if lists.camera_file is not None:
         sizes_px = {name: (fact.width_px, fact.height_px) for name, fact in facts.items()}
-        return cameras_from_file(lists.camera_file.cameras, sizes_px, columns)
-    stated = lists.pose_list.cameras if lists.pose_list is not None and lists.cameras == EXIF else {}
+        own = lists.camera_file.cameras
+        # Cameras of the pose file give way, and so do their names.
+        known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
+        found = cameras_from_file(own, sizes_px, known)
+        return replace(found, warnings=(*lists.camera_file.remarks, *found.warnings))
+    stated = stated if lists.cameras == EXIF else {}
     if stated:
         return _cameras_of_poses(stated, facts, columns)
     groups = dict(columns)
@@ -325,6 +331,14 @@ def _with_exif_heights(
 def _all_level(located: Located) -> bool:
     """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
     return bool(located.level) and len(located.level) == len(located.poses)
+
+
+def _foreign_crs(located: Located) -> list[str]:
+    """What is said of a CRS that is used elsewhere."""
+    origin = np.array(located.frame.origin_m[:2])
+    places = np.array([pose.center_m[:2] for pose in located.poses.values()]).reshape(-1, 2) + origin
+    remark = outside_area(located.frame.crs, places)
+    return [remark] if remark else []
 
 
 def _level_flight(located: Located, facts: Mapping[str, ExifFacts]) -> list[str]:

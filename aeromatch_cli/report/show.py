@@ -138,7 +138,9 @@ def _workspace(work: _Work) -> Shown:
             if stage == "filter":
                 states = ", ".join(f"{count} {state}" for state, count in found["facts"].get("pairs", {}).items())
                 lines.append(f"            {states}; {found['facts'].get('verified_matches', 0)} verified matches")
-    lines += [f"export      {folder}" for folder in sorted(workspace.export("x").parent.glob("[!.]*"))]
+    written = set(stages.get("export", {}).get("facts", {}))
+    folders = sorted(workspace.export("x").parent.glob("[!.]*"))
+    lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")

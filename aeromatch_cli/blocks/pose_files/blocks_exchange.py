@@ -2,7 +2,8 @@
 
 `Pose/Rotation` is cam_from_world in the camera axes that `CameraOrientation` names (XRightYDown unless it says
 otherwise), as M_00 to M_22 or as Omega, Phi, Kappa with M = (Rx(omega) Ry(phi) Rz(kappa))'; `Center` is in the spatial
-reference system of the block or photo group, x being the easting or longitude.
+reference system of the block or photo group, x being the easting or longitude. The photo group is the camera:
+`PrincipalPoint` counts from the centre of the first pixel; distortion is Brown's, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.lenses import Nearest, brown
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, number, rotation_row
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -32,10 +34,15 @@ def read_blocks_exchange(source: Source) -> PoseList:
     root = source.xml
     systems = {srs.findtext("Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     rows: list[PoseRow] = []
+    groups: list[str] = []
     found: set[tuple[str | None, PositionKind]] = set()
+    cameras = CameraShelf(source.path.name)
     unposed = 0
     for block in root.iter("Block"):
         for group in block.iter("Photogroup"):
+            key = f"group{len(groups)}"
+            groups.append(key)
+            cameras.add(key, _lens(group))
             identifier = group.findtext("SRSId") or block.findtext("SRSId")
             definition = systems.get(identifier, "") if identifier else ""
             system = described_crs(str(source.path), definition) if definition else (None, "grid")
@@ -51,15 +58,47 @@ def read_blocks_exchange(source: Source) -> PoseList:
                 rotation = _rotation(source, path, photo.find("Pose/Rotation"))
                 place = (y, x, z) if system[1] == "geographic" else (x, y, z)
                 cam = None if rotation is None else axes @ rotation
-                rows.append(rotation_row(_short(path), len(rows) + 1, place, cam, system[1]))
+                rows.append(rotation_row(_short(path), len(rows) + 1, place, cam, system[1], camera=cameras.key(key)))
     if len(found) > 1:
         raise ConfigError(f"{source.path}: photo groups are in different reference systems: export them in one")
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this BlocksExchange file has a pose")
     crs, kind = found.pop()
-    remarks = (f"{source.path.name}: {unposed} photos have no pose there",) if unposed else ()
+    remarks = [f"{source.path.name}: {unposed} photos have no pose there"] if unposed else []
     words = crs or ("degrees" if kind == "geographic" else "local frame")
-    return PoseList(tuple(rows), kind, remarks, f"BlocksExchange, {words}", crs)
+    remarks += cameras.remarks
+    return PoseList(tuple(rows), kind, tuple(remarks), f"BlocksExchange, {words}", crs, cameras.found)
+
+
+def _lens(group: Any) -> Nearest | None:
+    """The camera of a photo group, in axes that go right and down; None where it is incomplete."""
+
+    def number_of(path: str, otherwise: float | None = None) -> float:
+        text = group.findtext(path)
+        if text is None and otherwise is not None:
+            return otherwise
+        return float(text)
+
+    if (group.findtext("CameraModelType") or "Perspective").strip() != "Perspective":
+        return Nearest(None)
+    try:
+        size = int(number_of("ImageDimensions/Width")), int(number_of("ImageDimensions/Height"))
+        if group.find("FocalLengthPixels") is not None:
+            focal = number_of("FocalLengthPixels")
+        else:
+            focal = number_of("FocalLength") * max(size) / number_of("SensorSize")
+        middle = (
+            number_of("PrincipalPoint/x", (size[0] - 1) / 2.0) + 0.5,
+            number_of("PrincipalPoint/y", (size[1] - 1) / 2.0) + 0.5,
+        )
+        radial = [number_of(f"Distortion/K{k}", 0.0) for k in (1, 2, 3)]
+        tangential = number_of("Distortion/P1", 0.0), number_of("Distortion/P2", 0.0)
+        ratio, skew = number_of("AspectRatio", 1.0), number_of("Skew", 0.0)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    if not focal > 0.0 or min(size) < 1:
+        return None
+    return brown(size, (focal, focal * ratio), middle, radial, tangential, skew)
 
 
 def _short(path: str) -> str:

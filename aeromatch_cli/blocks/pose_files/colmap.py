@@ -13,18 +13,18 @@ from collections.abc import Iterator
 import numpy as np
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
-from aeromatch_cli.blocks.pose_files.source import Source, numbers, rotation_row
+from aeromatch_cli.blocks.lenses import Nearest, of_colmap
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, numbers, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import MODELS, from_colmap
 from aeromatch_cli.geometry.rotations import from_quaternion
 
 _FLOAT = r"[-+0-9.eE]+"
 _IMAGE = re.compile(rf"\d+[ ,]+(?:{_FLOAT}[ ,]+){{7}}\d+[ ,]+\S.*[A-Za-z_./].*")
 _NAMES = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID")
 # COLMAP's numbers of the models that are known here, and how many parameters all of them have.
-_MODEL_IDS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV"}
+_MODEL_IDS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 5: "OPENCV_FISHEYE",
+              6: "FULL_OPENCV"}  # fmt: skip
 _PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12}
 
 
@@ -45,11 +45,11 @@ def read_model(source: Source) -> PoseList:
     rows = tuple(_binary_rows(images, cameras) if binary else _text_rows(images, cameras))
     if not rows:
         raise ConfigError(f"{images.path}: the model has no image")
-    known = f", {len(cameras)} cameras" if cameras else ""
-    return PoseList(rows, "grid", (), f"COLMAP {images.path.name}{known}", None, cameras)
+    known = f", {len(cameras.found)} cameras" if cameras.found else ""
+    return PoseList(rows, "grid", tuple(cameras.remarks), f"COLMAP {images.path.name}{known}", None, cameras.found)
 
 
-def _text_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow]:
+def _text_rows(source: Source, cameras: CameraShelf) -> Iterator[PoseRow]:
     points = False  # whether the next line holds the points of the image before
     for line, text in enumerate(source.lines, start=1):
         if text.lstrip().startswith("#"):
@@ -69,17 +69,17 @@ def _text_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow]:
 
 
 def _row(
-    source: Source, line: int, pose: list[float] | tuple[float, ...], camera: str, name: str, cameras: dict[str, Camera]
+    source: Source, line: int, pose: list[float] | tuple[float, ...], camera: str, name: str, cameras: CameraShelf
 ) -> PoseRow:
     try:
         rotation = from_quaternion(*pose[:4])
     except ValueError as error:
         raise ConfigError(f"{source.at(line)}, column QW: {error}") from error
     center = -rotation.T @ np.array(pose[4:7])
-    return rotation_row(name, line, center, rotation, camera=camera if camera in cameras else "")
+    return rotation_row(name, line, center, rotation, camera=cameras.key(camera))
 
 
-def _binary_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow]:
+def _binary_rows(source: Source, cameras: CameraShelf) -> Iterator[PoseRow]:
     raw, place = source.raw, 8
     try:
         (count,) = struct.unpack_from("<Q", raw, 0)
@@ -95,14 +95,15 @@ def _binary_rows(source: Source, cameras: dict[str, Camera]) -> Iterator[PoseRow
         raise ConfigError(f"{source.path}, byte {place}: not COLMAP's images.bin ({error})") from error
 
 
-def _cameras(images: Source) -> dict[str, Camera]:
+def _cameras(images: Source) -> CameraShelf:
     """Those beside the images whose model is known here."""
     found = images.beside("cameras.bin" if images.name.endswith(".bin") else "cameras.txt")
+    cameras = CameraShelf("" if found is None else found.path.name)
     if found is None:
-        return {}
+        return cameras
     if found.name.endswith(".txt"):
-        return dict(read_camera_file(found.path).cameras)
-    cameras: dict[str, Camera] = {}
+        content = read_camera_file(found.path)
+        return CameraShelf(found.path.name, dict(content.cameras), list(content.remarks))
     raw, place = found.raw, 8
     try:
         (count,) = struct.unpack_from("<Q", raw, 0)
@@ -111,9 +112,8 @@ def _cameras(images: Source) -> dict[str, Camera]:
             place += 24
             parameters = struct.unpack_from(f"<{_PARAMETERS[model]}d", raw, place)
             place += 8 * _PARAMETERS[model]
-            if model in _MODEL_IDS:
-                name = _MODEL_IDS[model]
-                cameras[str(identifier)] = from_colmap(name, width, height, parameters[: len(MODELS[name])])
+            known = _MODEL_IDS.get(model)
+            cameras.add(str(identifier), of_colmap(known, width, height, parameters) if known else Nearest(None))
     except (struct.error, KeyError) as error:
         raise ConfigError(f"{found.path}, byte {place}: not COLMAP's cameras.bin ({error!r})") from error
     return cameras

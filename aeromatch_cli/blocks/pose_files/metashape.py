@@ -5,8 +5,8 @@ pitch, roll are zero straight down, yaw from true north; omega, phi, kappa (and 
 Estimated columns (`_est`) stand before those that were given.
 
 cameras.xml: a camera's `transform` takes camera axes (OpenCV's) to the chunk; the chunk's (or component's) takes these
-to geocentric coordinates. `sensor/calibration`: f, cx and cy from the image's centre in pixels; p1 and p2 are exchanged
-against OpenCV's.
+to geocentric coordinates. `sensor/calibration`: f, cx and cy from the image's centre in pixels; b1 and b2 affinity and
+skew, k1 to k4; p1 and p2 are exchanged against OpenCV's.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks import lenses
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
@@ -135,11 +135,12 @@ def is_cameras_xml(source: Source) -> bool:
 def read_cameras_xml(source: Source) -> PoseList:
     """Raises ConfigError naming the camera."""
     rows: list[PoseRow] = []
-    cameras: dict[str, Camera] = {}
+    cameras = CameraShelf(source.path.name)
     unaligned = 0
     georeferenced: set[bool] = set()
     for chunk in source.xml.iter("chunk"):
-        cameras |= {f"sensor{key}": c for s in chunk.iter("sensor") if (key := s.get("id")) and (c := _sensor(s))}
+        for sensor in chunk.iter("sensor"):
+            cameras.add(f"sensor{sensor.get('id')}", _sensor(sensor))
         whole = _similarity(source, chunk.find("transform"))
         parts = {c.get("id"): _similarity(source, c.find("transform")) for c in chunk.iter("component")}
         for camera in chunk.iter("camera"):
@@ -161,7 +162,7 @@ def read_cameras_xml(source: Source) -> PoseList:
             rows.append(
                 rotation_row(
                     label, len(rows) + 1, center, rotation, "geographic" if earth else "grid", true_north=earth,
-                    camera=sensor if sensor in cameras else "",
+                    camera=cameras.key(sensor),
                 )
             )  # fmt: skip
     if len(georeferenced) > 1:
@@ -170,10 +171,11 @@ def read_cameras_xml(source: Source) -> PoseList:
         raise ConfigError(
             f"{source.path}: no camera of this Metashape file is aligned: align the photos, or export the reference"
         )
-    remarks = (f"{source.path.name}: {unaligned} cameras are not aligned there",) if unaligned else ()
+    remarks = [f"{source.path.name}: {unaligned} cameras are not aligned there"] if unaligned else []
     kind: PositionKind = "geographic" if georeferenced == {True} else "grid"
     words = "georeferenced" if kind == "geographic" else "not georeferenced"
-    return PoseList(tuple(rows), kind, remarks, f"Metashape cameras.xml, {words}", None, cameras)
+    title = f"Metashape cameras.xml, {words}"
+    return PoseList(tuple(rows), kind, (*remarks, *cameras.remarks), title, None, cameras.found)
 
 
 def _numbers(source: Source, what: str, text: str | None, count: int) -> FloatArray:
@@ -192,11 +194,13 @@ def _similarity(source: Source, element: Any) -> tuple[FloatArray, FloatArray, f
     return turn, shift, float(scale[0])
 
 
-def _sensor(sensor: Any) -> Camera | None:
-    """The adjusted calibration of a frame camera; None for other types and without one."""
+def _sensor(sensor: Any) -> lenses.Nearest | None:
+    """The adjusted calibration of a frame camera; without camera for other types, None without a calibration."""
     found = [c for c in sensor.findall("calibration") if c.get("class") == "adjusted"] or sensor.findall("calibration")
-    if not found or found[0].get("type", "frame") != "frame":
+    if not found:
         return None
+    if found[0].get("type", "frame") != "frame":
+        return lenses.Nearest(None)
     try:
         facts = {child.tag: float(child.text) for child in found[0] if child.tag != "resolution" and child.text}
         size = found[0].find("resolution")
@@ -205,6 +209,8 @@ def _sensor(sensor: Any) -> Camera | None:
         f = facts["f"]
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
+    focal = f + facts.get("b1", 0.0), f
     middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
-    lens = [facts.get(key, 0.0) for key in ("k1", "k2", "p2", "p1")]
-    return from_colmap("OPENCV", width, height, (f + facts.get("b1", 0.0), f, *middle, *lens))
+    radial = [facts.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)]
+    tangential = facts.get("p2", 0.0), facts.get("p1", 0.0)
+    return lenses.brown((width, height), focal, middle, radial, tangential, facts.get("b2", 0.0))

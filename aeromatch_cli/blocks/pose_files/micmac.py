@@ -2,16 +2,23 @@
 
 XML: `Centre` and the matrix camera to world (OpenCV's axes) of `CodageMatr`. Text: the first line says what the columns
 are, such as `#F=N X Y Z W P K` (N name, W P K omega, phi, kappa in degrees, S skipped). No CRS is stated.
+
+Calibration (`FileInterne`, or `Interne` in the file): F, PP and SzIm in pixels, whole numbers being middles of pixels;
+ModRad and ModPhgrStd (Fraser) in powers of pixels from CDist, from the undistorted to the measured place
+(eConvApero_DistM2C; src/photogram/phgr_ebner_brown_dist.cpp).
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.lenses import Nearest, brown, nearest
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 
 _PREFIX = "Orientation-"
@@ -29,6 +36,7 @@ def read_ori(source: Source) -> PoseList:
     """Raises ConfigError naming the file."""
     files = sorted(source.path.glob(f"{_PREFIX}*.xml")) if source.is_folder else [source.path]
     rows: list[PoseRow] = []
+    cameras = CameraShelf(source.path.name)
     for path in files:
         one = Source(path)
         external = None if one.xml is None else one.xml.find(".//Externe")
@@ -40,8 +48,69 @@ def read_ori(source: Source) -> PoseList:
         matrix = np.array([_numbers(one, external, f".//CodageMatr/L{row}") for row in (1, 2, 3)])
         center = _numbers(one, external, "Centre")
         name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
-        rows.append(rotation_row(name, len(rows) + 1, center, matrix.T))
-    return PoseList(tuple(rows), "grid", (), f"MicMac orientation, {len(files)} files")
+        key, internal = _internal(one)
+        if key not in cameras.found:
+            cameras.add(key, None if internal is None else _lens(internal))
+        rows.append(rotation_row(name, len(rows) + 1, center, matrix.T, camera=cameras.key(key)))
+    title = f"MicMac orientation, {len(files)} files"
+    return PoseList(tuple(rows), "grid", tuple(cameras.remarks), title, None, cameras.found)
+
+
+def _internal(orientation: Source) -> tuple[str, Any]:
+    """Name and element of the calibration that an orientation names or holds; None where there is none."""
+    named = (orientation.xml.findtext(".//FileInterne") or "").strip()
+    if not named:
+        return orientation.path.stem, orientation.xml.find(".//Interne")
+    folder = orientation.path.parent
+    for path in (folder.parent / named, folder / Path(named).name):
+        if path.is_file():
+            return path.stem, Source(path).xml
+    return Path(named).stem, None
+
+
+def _lens(calibration: Any) -> Nearest | None:
+    """None where the calibration is incomplete."""
+    try:
+        (focal,), principal = _values(calibration, ".//F", 1), _values(calibration, ".//PP", 2)
+        width, height = (int(value) for value in _values(calibration, ".//SzIm", 2))
+        models = [model for place in calibration.iter("CalibDistortion") for model in place]
+        direct = (calibration.findtext(".//KnownConv") or "eConvApero_DistM2C").strip() == "eConvApero_DistM2C"
+        if {model.tag for model in models} - {"ModRad", "ModPhgrStd", "ModNoDist"} or not direct or len(models) > 1:
+            return Nearest(None)
+        model = models[0] if models and models[0].tag != "ModNoDist" else None
+        center = np.array(principal if model is None else _values(model, ".//CDist", 2))
+        radial = [] if model is None else [float(item.text) for item in model.iter("CoeffDist")]
+        p1, p2, b1, b2 = (float(calibration.findtext(f".//{name}") or 0.0) for name in ("P1", "P2", "b1", "b2"))
+    except (TypeError, ValueError):
+        return None
+    powers = [term * focal ** (2 * k) for k, term in enumerate(radial, 1)]
+    middle = np.array(principal) + 0.5
+    if np.allclose(center, principal) and not b2:
+        return brown(
+            (width, height), (focal * (1.0 + b1), focal), (middle[0], middle[1]), powers, (p2 * focal, p1 * focal)
+        )
+
+    def forward(rays: FloatArray) -> FloatArray:
+        x, y = (focal * rays + principal - center).T
+        r2 = x * x + y * y
+        factor = sum(term * r2**k for k, term in enumerate(radial, 1))
+        return np.column_stack(
+            [
+                x + x * factor + p1 * (2.0 * x * x + r2) + 2.0 * p2 * x * y + b1 * x + b2 * y,
+                y + y * factor + p2 * (2.0 * y * y + r2) + 2.0 * p1 * x * y,
+            ]
+        ) + (center + 0.5)
+
+    first = powers[0] if powers else 0.0
+    return nearest((width, height), (focal, focal, middle[0], middle[1], first, 0.0, 0.0, 0.0), forward)
+
+
+def _values(element: Any, place: str, count: int) -> list[float]:
+    """Raises ValueError where there are not so many numbers."""
+    values = [float(cell) for cell in (element.findtext(place) or "").split()]
+    if len(values) != count:
+        raise ValueError(f"{place}: {len(values)} numbers")
+    return values
 
 
 def _numbers(source: Source, element: Any, place: str) -> list[float]:

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.lenses import Nearest, brown, fisheye
 from aeromatch_cli.blocks.pose_files.geodesy import from_topocentric
 from aeromatch_cli.blocks.pose_files.odm import rotation_of_vector
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, rotation_row
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import from_colmap
 
@@ -30,7 +31,7 @@ def read_reconstruction(source: Source) -> PoseList:
     """All parts of the file. Raises ConfigError naming the shot."""
     parts = source.tree if isinstance(source.tree, list) else [source.tree]
     rows: list[PoseRow] = []
-    cameras: dict[str, Camera] = {}
+    cameras = CameraShelf(source.path.name)
     kinds: set[PositionKind] = set()
     for part in parts:
         names, centers, rotations, ids = [], [], [], []
@@ -46,7 +47,8 @@ def read_reconstruction(source: Source) -> PoseList:
             rotations.append(rotation)
             centers.append(-rotation.T @ translation)
             ids.append(str(shot.get("camera", "")))
-        cameras |= {str(key): c for key, entry in part["cameras"].items() if (c := _camera(entry)) is not None}
+        for key, entry in part["cameras"].items():
+            cameras.add(str(key), _camera(entry))
         reference = _reference(source, part)
         places: FloatArray = np.array(centers).reshape(-1, 3)
         local: list[FloatArray | None] = [*rotations]
@@ -58,17 +60,17 @@ def read_reconstruction(source: Source) -> PoseList:
             rows.append(
                 rotation_row(
                     name, 0, place, attitude, kind, true_north=reference is not None,
-                    camera=camera if camera in cameras else "",
+                    camera=cameras.key(camera),
                 )
             )  # fmt: skip
     if len(kinds) > 1:
         raise ConfigError(f"{source.path}: some parts have a reference_lla and some have none: give one part alone")
     whole: PositionKind = kinds.pop() if kinds else "grid"
-    remarks: tuple[str, ...] = ()
+    remarks = list(cameras.remarks)
     if len(parts) > 1:
-        remarks = (f"{source.path.name} has {len(parts)} parts, each in a frame that only GPS ties to the others",)
+        remarks.append(f"{source.path.name} has {len(parts)} parts, each in a frame that only GPS ties to the others")
     where = "reference_lla" if whole == "geographic" else "local frame"
-    return PoseList(tuple(rows), whole, remarks, f"OpenSfM reconstruction, {where}", None, cameras)
+    return PoseList(tuple(rows), whole, tuple(remarks), f"OpenSfM reconstruction, {where}", None, cameras.found)
 
 
 def _reference(source: Source, part: Any) -> tuple[float, float, float] | None:
@@ -85,23 +87,26 @@ def _reference(source: Source, part: Any) -> tuple[float, float, float] | None:
     return (values[0], values[1], values[2]) if any(values) else None
 
 
-def _camera(entry: Any) -> Camera | None:
-    """None for models that are not known here (fisheye, spherical) and for incomplete ones."""
+def _camera(entry: Any) -> Nearest | None:
+    """Without camera for models that are not known here (spherical), None for incomplete ones."""
     try:
         width, height = int(entry["width"]), int(entry["height"])
         longer = max(width, height)
         model = entry["projection_type"]
         if model == "perspective":
             f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
-            return from_colmap("RADIAL", width, height, (f, *middle, float(entry["k1"]), float(entry["k2"])))
+            return Nearest(from_colmap("RADIAL", width, height, (f, *middle, float(entry["k1"]), float(entry["k2"]))))
         if model == "brown":
             fx, fy = (float(entry[key]) * longer for key in ("focal_x", "focal_y"))
             cx, cy = width / 2.0 + float(entry["c_x"]) * longer, height / 2.0 + float(entry["c_y"]) * longer
-            lens = (float(entry[key]) for key in ("k1", "k2", "p1", "p2"))
-            return from_colmap("OPENCV", width, height, (fx, fy, cx, cy, *lens))
+            radial = [float(entry.get(key, 0.0)) for key in ("k1", "k2", "k3")]
+            return brown((width, height), (fx, fy), (cx, cy), radial, (float(entry["p1"]), float(entry["p2"])))
+        if model == "fisheye":
+            f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
+            return fisheye((width, height), (f, f), middle, (float(entry["k1"]), float(entry["k2"])))
     except (KeyError, TypeError, ValueError):
         return None
-    return None
+    return Nearest(None)
 
 
 def is_overrides(source: Source) -> bool:

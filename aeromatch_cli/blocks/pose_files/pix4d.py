@@ -17,7 +17,9 @@ from functools import partial
 
 import numpy as np
 
+from aeromatch_cli.blocks.lenses import Nearest, brown
 from aeromatch_cli.blocks.pose_files.source import (
+    CameraShelf,
     Source,
     cells_of,
     image_name,
@@ -114,6 +116,7 @@ def read_camera_parameters(source: Source) -> PoseList:
         offset = np.array(numbers(str(beside), Source(beside).text.split(), ("x", "y", "z")))
     else:
         remarks.append(f"{source.path.name}: no *_offset.xyz beside it: positions count from the project's offset")
+    cameras, known = CameraShelf(source.path.name), dict[str, str]()
     records = [(line, text) for line, text in source.records() if line > 8]
     rows = []
     for start in range(0, len(records), _LINES_OF_IMAGE):
@@ -122,9 +125,27 @@ def read_camera_parameters(source: Source) -> PoseList:
         name = head.rsplit(maxsplit=2)[0]
         if len(part) < _LINES_OF_IMAGE or not _IMAGE.fullmatch(name):
             raise ConfigError(f"{source.at(line)}: an image has ten lines here, beginning with name, width and height")
+        lens = _lens(source, head, part)
+        key = known.setdefault(repr(lens), f"camera{len(known)}")
+        cameras.add(key, lens)
         center = numbers(source.at(part[6][0]), part[6][1].split(), ("t1", "t2", "t3"))
         matrix = [numbers(source.at(n), text.split(), ("r1", "r2", "r3")) for n, text in part[7:10]]
-        rows.append(rotation_row(name, line, offset + center, np.array(matrix)))
+        rows.append(rotation_row(name, line, offset + center, np.array(matrix), camera=cameras.key(key)))
     if not rows:
         raise ConfigError(f"{source.path}: no image follows the eight lines of the header")
-    return PoseList(tuple(rows), "grid", tuple(remarks), "Pix4D calibrated camera parameters")
+    remarks += cameras.remarks
+    title = "Pix4D calibrated camera parameters"
+    return PoseList(tuple(rows), "grid", tuple(remarks), title, None, cameras.found)
+
+
+def _lens(source: Source, head: str, part: Sequence[tuple[int, str]]) -> Nearest:
+    """Of the ten lines of an image. Raises ConfigError with file and line."""
+
+    def values(place: int, names: Sequence[str]) -> list[float]:
+        return numbers(source.at(part[place][0]), part[place][1].split(), names)
+
+    width, height = numbers(source.at(part[0][0]), head.split()[-2:], ("imageWidth", "imageHeight"))
+    (fx, _, cx), (_, fy, cy) = values(1, ("fx", "0", "cx")), values(2, ("0", "fy", "cy"))
+    tangential = values(5, ("T1", "T2"))
+    size = int(width), int(height)
+    return brown(size, (fx, fy), (cx, cy), values(4, ("R1", "R2", "R3")), (tangential[0], tangential[1]))

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.pose_files.source import Source, number, numbers, rotation_row
+from aeromatch_cli.blocks.lenses import Nearest, brown, fisheye
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, number, numbers, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.rotations import from_quaternion
 
@@ -87,7 +86,7 @@ def read_transforms(source: Source) -> PoseList:
     if "applied_transform" in tree:
         applied[:3] = np.array(tree["applied_transform"], dtype=np.float64)[:3, :4]
     rows: list[PoseRow] = []
-    cameras: dict[str, Camera] = {}
+    cameras = CameraShelf(source.path.name)
     for count, frame in enumerate(tree["frames"], start=1):
         where = f"{source.path}, frame {count}"
         try:
@@ -100,29 +99,32 @@ def read_transforms(source: Source) -> PoseList:
         world_from_photo = turn[:3, :3] @ matrix[:, :3]
         lens = _lens(tree | frame)
         key = "" if lens is None else "camera" if not {"fl_x", "camera_angle_x"} & frame.keys() else f"camera{count}"
-        if lens is not None:
-            cameras[key] = lens
+        cameras.add(key, lens)
         short = name.rsplit("images/", 1)[-1]
-        rows.append(rotation_row(short, count, center, CAM_FROM_PHOTO @ world_from_photo.T, camera=key))
+        rows.append(rotation_row(short, count, center, CAM_FROM_PHOTO @ world_from_photo.T, camera=cameras.key(key)))
     return _list(source, rows, "transforms.json", cameras)
 
 
-def _lens(facts: dict[str, Any]) -> Camera | None:
+def _lens(facts: dict[str, Any]) -> Nearest | None:
     try:
         width, height = int(facts["w"]), int(facts["h"])
         half_rad = 0.5 * float(facts.get("camera_angle_x", "nan"))
         fx = float(facts["fl_x"]) if "fl_x" in facts else 0.5 * width / math.tan(half_rad)
         fy = float(facts.get("fl_y", fx))
         middle = float(facts.get("cx", width / 2.0)), float(facts.get("cy", height / 2.0))
-        lens = [float(facts.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")]
+        radial = [float(facts.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4")]
+        tangential = float(facts.get("p1", 0.0)), float(facts.get("p2", 0.0))
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
     if not math.isfinite(fx):
         return None
-    return from_colmap("OPENCV", width, height, (fx, fy, *middle, *lens))
+    if facts.get("camera_model") == "OPENCV_FISHEYE":
+        return fisheye((width, height), (fx, fy), middle, radial)
+    return brown((width, height), (fx, fy), middle, radial, tangential)
 
 
-def _list(source: Source, rows: list[PoseRow], words: str, cameras: dict[str, Camera] | None = None) -> PoseList:
+def _list(source: Source, rows: list[PoseRow], words: str, cameras: CameraShelf | None = None) -> PoseList:
     if not rows:
         raise ConfigError(f"{source.path}: no camera is oriented there")
-    return PoseList(tuple(rows), "grid", (), f"{words}, local frame", None, cameras or {})
+    remarks, found = (cameras.remarks, cameras.found) if cameras is not None else ([], {})
+    return PoseList(tuple(rows), "grid", tuple(remarks), f"{words}, local frame", None, found)

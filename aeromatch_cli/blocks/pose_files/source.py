@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.lenses import Nearest
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import to_quaternion
 
@@ -106,6 +107,29 @@ class Source:
     def at(self, line: int, column: str = "") -> str:
         """A place for messages."""
         return f"{self.path}, line {line}" + (f", column {column}" if column else "")
+
+
+@dataclass
+class CameraShelf:
+    """Cameras of a pose file, by the names that its rows have. remarks: what is to be said of them, each once."""
+
+    file: str
+    found: dict[str, Camera] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    def add(self, key: str, lens: Nearest | None) -> None:
+        """None: there is none, and nothing to say."""
+        if lens is None:
+            return
+        if lens.camera is not None:
+            self.found[key] = lens.camera
+        remark = lens.remark(f"{self.file}, camera {key}")
+        if remark and remark not in self.remarks:
+            self.remarks.append(remark)
+
+    def key(self, wanted: str) -> str:
+        """The name for a row, "" where there is no such camera."""
+        return wanted if wanted in self.found else ""
 
 
 def cells_of(line: str) -> list[str]:

@@ -17,15 +17,16 @@ from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
 
 _VERSION = ["1", "2", "1"]
 
 
 class AliceVision(Strategy):
-    """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat and matches/0.matches.txt."""
+    """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat, matches/0.matches.txt and world.json (CRS
+    and origin that poses count from)."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["alicevision"] = "alicevision"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -33,6 +34,7 @@ class AliceVision(Strategy):
         solution = Solution.of(contents)
         views = {image.image_id: number for number, image in enumerate(solution.images, start=1)}
         with whole_folder(folder) as partial:
+            write_world(partial, contents.block)
             found = matched(contents)
             keypoints = 0
             for image_id, view in views.items():

@@ -2,30 +2,35 @@
 
 `photo focal` in millimetres, then `point x y` in millimetres from the principal point with x to the right and y up,
 free of distortion; -99 ends a photo. photos.txt has the number and name of each photo, camera.txt what millimetres
-stand for.
+stand for, exterior.txt `photo x y z omega phi kappa` with angles in gon (400 to the circle) and coordinates of the CRS.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, parameters, undistort
+from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
 
 _MM_PER_UM = 1e-3
 _END = "-99\n"
+_DEG_PER_GON = 0.9
 
 
 class Bingo(Strategy):
-    """Writes image.txt (image points of BINGO and PATB), photos.txt (their numbers) and camera.txt."""
+    """Writes image.txt (image points of BINGO and PATB), exterior.txt (positions and angles in gon), photos.txt (their
+    numbers) and camera.txt."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["bingo"] = "bingo"
     pixel_um: float = Field(
         4.0, gt=0.0, description="Size of a pixel on the sensor, micrometres; it sets the scale of all millimetres."
@@ -51,6 +56,7 @@ class Bingo(Strategy):
                     lines.append(f"{track + 1} {x:.6f} {y:.6f}\n")
                 lines.append(_END)
             write(partial / "image.txt", "".join(lines))
+            write(partial / "exterior.txt", "".join(_exterior(solution, np.array(contents.block.origin_m))))
             write(partial / "photos.txt", "".join(names))
             write(partial / "camera.txt", "".join(self._camera_lines(solution, mm)))
             return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
@@ -64,3 +70,13 @@ class Bingo(Strategy):
                 f"{values['cy']:.3f} px from the middle of the first pixel\n"
             )
         return lines
+
+
+def _exterior(solution: Solution, origin_m: FloatArray) -> Iterator[str]:
+    """A line for every image with an attitude."""
+    for number, image in enumerate(solution.images, start=1):
+        if image.image_id in solution.poses:
+            rotation, center_m = solution.poses[image.image_id]
+            place = " ".join(f"{value:.4f}" for value in center_m + origin_m)
+            angles = " ".join(f"{value / _DEG_PER_GON:.6f}" for value in to_omega_phi_kappa(rotation))
+            yield f"{number} {place} {angles}\n"

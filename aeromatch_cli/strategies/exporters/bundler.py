@@ -17,22 +17,31 @@ from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, keypoints_of, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import (
+    Matched,
+    Solution,
+    keypoints_of,
+    matched,
+    summary_of,
+    write,
+    write_world,
+)
 
 _GREY = "128 128 128"
 
 
 class Bundler(Strategy):
-    """Writes bundle.out (cameras, points of the adjusted block with their measurements) and list.txt; coordinates
-    are those of the block's world, the CRS less the origin of world.json beside COLMAP's files."""
+    """Writes bundle.out (cameras, points of the adjusted block with their measurements), list.txt and world.json;
+    coordinates are those of the block's world, the CRS less the origin that world.json names."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["bundler"] = "bundler"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written."""
         solution = Solution.of(contents)
         with whole_folder(folder) as partial:
+            write_world(partial, contents.block)
             found = matched(contents, adjusted_tracks=True)
             keypoints = keypoints_of(contents)
             write(partial / "list.txt", "".join(f"{image.name}\n" for image in solution.images))

@@ -8,7 +8,6 @@ world.json.
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import Block, Camera, Image, IntArray, Pose
+from aeromatch_cli.data import Camera, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.adjusted import orientation_text
 from aeromatch_cli.geometry.cameras import colmap_params
@@ -27,6 +26,7 @@ from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.colmap_model import Numbers, import_pycolmap, write_model
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
+from aeromatch_cli.strategies.exporters.solution import write_world
 
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
 _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFSET_PX], [0.0, 0.0, 1.0]])
@@ -56,7 +56,7 @@ class Colmap(Strategy):
             if contents.adjusted is not None:
                 text = orientation_text(contents.adjusted, contents.block)
                 (partial / "orientation.csv").write_text(text, encoding="utf-8")
-            (partial / "world.json").write_text(_world_text(contents.block), encoding="utf-8")
+            write_world(partial, contents.block)
             names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
         return ExportSummary(
             files=tuple(folder / name for name in names),
@@ -200,8 +200,3 @@ def _two_view_geometry(pycolmap: ModuleType, item: PairContents, camera0: Camera
     else:
         raise ValueError(f"pair {item.pair.image_id0}, {item.pair.image_id1}: unknown model {item.model_kind!r}")
     return geometry
-
-
-def _world_text(block: Block) -> str:
-    world = {"crs": block.crs, "origin_m": list(block.origin_m), "note": "coordinate in crs = coordinate here + origin"}
-    return json.dumps(world, indent=2) + "\n"

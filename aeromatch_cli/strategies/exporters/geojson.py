@@ -1,7 +1,7 @@
 """GeoJSON for maps (QGIS and others): camera positions, footprints, and pairs with their matches.
 
 RFC 7946: longitude and latitude, WGS84, rings counter-clockwise. A local block has none: its files hold metres of the
-block's own frame, which a map shows in a project without CRS.
+block's own frame and say so in the member `crs` of GeoJSON 2008, by which GDAL and QGIS take them for what they are.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
 from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.styles import qml
 
+_LOCAL_FRAME = 'LOCAL_CS["local frame of the block",UNIT["metre",1]]'
 # Images with fewer verified matches hang loosely on the block.
 WEAK_MATCHES = 50
 
@@ -46,9 +48,10 @@ class Links:
 
 
 class GeoJson(Strategy):
-    """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches."""
+    """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches, and beside each its
+    style for QGIS."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -78,8 +81,12 @@ class GeoJson(Strategy):
                 _feature("Polygon", [_ring(contents, footprint.polygon_m)], {"image": names[i], "matches": ties[i]})
                 for i, footprint in sorted(block_footprints(contents.block).items())
             ]
+            head: dict[str, Any] = {"type": "FeatureCollection"}
+            if contents.geographic is None:
+                head["crs"] = {"type": "name", "properties": {"name": _LOCAL_FRAME}}
             for name, features in (("cameras", cameras), ("footprints", areas), ("pairs", links)):
-                write(partial / f"{name}.geojson", json.dumps({"type": "FeatureCollection", "features": features}))
+                write(partial / f"{name}.geojson", json.dumps({**head, "features": features}))
+                write(partial / f"{name}.qml", qml(name))
             count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
 

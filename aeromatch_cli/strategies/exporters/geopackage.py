@@ -1,7 +1,11 @@
-"""GeoPackage in the block's CRS: layers cameras, footprints and pairs, which QGIS and others open."""
+"""GeoPackage in the block's CRS: layers cameras, footprints and pairs, which QGIS and others open.
+
+The table layer_styles holds their styles, as QGIS keeps them in a database.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -13,6 +17,7 @@ from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
 from aeromatch_cli.strategies.exporters.geojson import WEAK_MATCHES, Links
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of
+from aeromatch_cli.strategies.exporters.styles import qml
 
 _LOCAL = "local"
 # In place of the hour of writing, so that the same block gives the same file.
@@ -20,9 +25,10 @@ _MADE = "2000-01-01T00:00:00.000Z"
 
 
 class GeoPackage(Strategy):
-    """Writes block.gpkg: camera positions, footprints and pairs with their verified matches; needs pyogrio."""
+    """Writes block.gpkg: camera positions, footprints and pairs with their verified matches, and styles for QGIS; needs
+    pyogrio."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["geopackage"] = "geopackage"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -56,8 +62,27 @@ class GeoPackage(Strategy):
                 {"image0": [names[a] for (a, _), _ in links.lines], "image1": [names[b] for (_, b), _ in links.lines],
                  "matches": [count for _, count in links.lines]},
             )  # fmt: skip
+            write_styles(path, ("cameras", *(("footprints",) if areas else ()), *(("pairs",) if links.lines else ())))
             count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
+
+
+def write_styles(path: Path, layers: Sequence[str]) -> None:
+    """The table by which QGIS finds the default style of each layer."""
+    from pyogrio import raw
+
+    fields: dict[str, list[Any]] = {
+        "f_table_catalog": [""] * len(layers), "f_table_schema": [""] * len(layers), "f_table_name": [*layers],
+        "f_geometry_column": ["geom"] * len(layers), "styleName": [*layers], "styleQML": [qml(one) for one in layers],
+        "styleSLD": [""] * len(layers), "useAsDefault": [True] * len(layers),
+        "description": ["aeromatch"] * len(layers), "owner": [""] * len(layers), "ui": [""] * len(layers),
+        "update_time": [_MADE] * len(layers),
+    }  # fmt: skip
+    columns = [np.array(values, dtype=None if isinstance(values[0], bool) else object) for values in fields.values()]
+    raw.write(
+        str(path), None, columns, list(fields), layer="layer_styles", driver="GPKG", geometry_type=None,
+        append=path.exists(), layer_options={"FID": "id"},
+    )  # fmt: skip
 
 
 def _writer() -> Any:

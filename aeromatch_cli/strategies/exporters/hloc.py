@@ -16,14 +16,14 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
 
 
 class Hloc(Strategy):
-    """Writes features.h5, matches.h5, pairs.txt and poses.txt (name, cam_from_world quaternion and translation);
-    needs h5py."""
+    """Writes features.h5, matches.h5, pairs.txt, poses.txt (name, cam_from_world quaternion and translation) and
+    world.json (CRS and origin that poses count from); needs h5py."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["hloc"] = "hloc"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -32,6 +32,7 @@ class Hloc(Strategy):
         solution = Solution.of(contents)
         names = {image.image_id: image.name for image in solution.images}
         with whole_folder(folder) as partial:
+            write_world(partial, contents.block)
             found = matched(contents)
             sizes = {}
             with h5py.File(partial / "features.h5", "w", track_order=True) as stream:

@@ -26,7 +26,7 @@ _ORI = "Ori-aeromatch"
 class MicMac(Strategy):
     """Writes Homol/ (tie points of every pair, both ways) and Ori-aeromatch/ (orientations and calibrations)."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["micmac"] = "micmac"
     binary: bool = Field(
         False, description="Write Homol as .dat, MicMac's default, instead of .txt (ExpTxt=1 in its commands)."
@@ -90,23 +90,30 @@ def _orientation(rotation: FloatArray, center_m: FloatArray, camera_id: str) -> 
 
 
 def _calibration(camera: Camera) -> str:
-    """Radial distortion in powers of pixels from the principal point, from the undistorted to the measured place."""
+    """Distortion in powers of pixels from the principal point, from the undistorted to the measured place: radial, or
+    Fraser's model (P1 is OpenCV's p2) where there is more."""
     values = parameters(camera)
-    f = (values["fx"] + values["fy"]) / 2.0
-    radial = values["k1"] / f**2, values["k2"] / f**4
+    f = values["fy"]
     middle = f"{values['cx']:.6f} {values['cy']:.6f}"
+    radial = (
+        f"<CDist>{middle}</CDist><CoeffDist>{values['k1'] / f**2:.12g}</CoeffDist>"
+        f"<CoeffDist>{values['k2'] / f**4:.12g}</CoeffDist>"
+    )
+    model = f"<ModRad>{radial}</ModRad>"
+    if values["p1"] or values["p2"] or values["fx"] != f:
+        more = (values["p2"] / f, values["p1"] / f, values["fx"] / f - 1.0, 0.0)
+        terms = "".join(
+            f"<{key}>{value:.12g}</{key}>" for key, value in zip(("P1", "P2", "b1", "b2"), more, strict=True)
+        )
+        model = f"<ModPhgrStd><RadialePart>{radial}</RadialePart>{terms}</ModPhgrStd>"
     return f"""<?xml version="1.0" ?>
 <ExportAPERO>
  <CalibrationInternConique>
-  <KnownConv>eConvApero_DistC2M</KnownConv>
+  <KnownConv>eConvApero_DistM2C</KnownConv>
   <PP>{middle}</PP>
   <F>{f:.6f}</F>
   <SzIm>{camera.width_px} {camera.height_px}</SzIm>
-  <CalibDistortion><ModRad>
-   <CDist>{middle}</CDist>
-   <CoeffDist>{radial[0]:.12g}</CoeffDist>
-   <CoeffDist>{radial[1]:.12g}</CoeffDist>
-  </ModRad></CalibDistortion>
+  <CalibDistortion>{model}</CalibDistortion>
  </CalibrationInternConique>
 </ExportAPERO>
 """

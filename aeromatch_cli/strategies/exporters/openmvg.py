@@ -17,7 +17,7 @@ from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
 
 # cereal's marks: a plain view, a new object, a new kind of object.
 _PLAIN, _NEW, _NEW_KIND = 1073741824, 2147483648, 2147483649
@@ -25,9 +25,10 @@ _SCALE = "1 0"
 
 
 class OpenMvg(Strategy):
-    """Writes sfm_data.json (views, intrinsics, poses) and matches/ (features, matches.f.txt, image_describer.json)."""
+    """Writes sfm_data.json (views, intrinsics, poses), matches/ (features, matches.f.txt, image_describer.json) and
+    world.json (CRS and origin that poses count from)."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["openmvg"] = "openmvg"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -41,6 +42,7 @@ class OpenMvg(Strategy):
             )
         numbers = {image.image_id: number for number, image in enumerate(solution.images)}
         with whole_folder(folder) as partial:
+            write_world(partial, contents.block)
             found = matched(contents)
             keypoints = 0
             for image, stem in zip(solution.images, stems, strict=True):
