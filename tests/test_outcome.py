@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 from conftest import Site, invoke
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
-from aeromatch_cli.cli.outcome import Outcome, schema
+from aeromatch_cli.cli.outcome import AnyOutcome, Error, Outcome, schema
 
 
 def test_the_file_is_up_to_date() -> None:
@@ -23,7 +23,6 @@ def test_the_file_is_up_to_date() -> None:
 def test_results_and_errors_fit_the_schema(site: Site) -> None:
     outcome = invoke("run", *site.options("--quiet", "--json"))
     found = Outcome.model_validate(outcome.facts)
-    assert found.stages is not None
     assert found.stages.match is not None
     assert found.stages.match.done == outcome.facts["stages"]["match"]["done"] > 0
     assert found.stages.consistency is not None
@@ -32,9 +31,34 @@ def test_results_and_errors_fit_the_schema(site: Site) -> None:
         == outcome.facts["stages"]["consistency"]["facts"]["verified_matches"]
     )
     for arguments in (("run", "nowhere.yaml"), ("pairs", "baseline", "--images", str(site.root / "absent"))):
-        error = Outcome.model_validate(invoke(*arguments, "--json").facts)
-        assert (error.exit_code in (2, 3), bool(error.error), error.stages) == (True, True, None)
+        error = Error.model_validate(invoke(*arguments, "--json").facts)
+        assert (error.exit_code in (2, 3), bool(error.error)) == (True, True)
     wrong = CliRunner().invoke(app, ["run", "--jobs", "many", "--json"])
-    assert Outcome.model_validate_json(wrong.stdout.splitlines()[-1]).exit_code == 2
+    assert Error.model_validate_json(wrong.stdout.splitlines()[-1]).exit_code == 2
     with pytest.raises(ValidationError):
         Outcome.model_validate(outcome.facts | {"more": 1})
+
+
+@pytest.mark.slow
+def test_every_other_command_fits_it(done_site: Site, rendered: Path, tmp_path: Path) -> None:
+    work, names = done_site.work, done_site.names()
+    commands: list[tuple[str, tuple[object, ...]]] = [
+        ("Checked", ("check", *done_site.options())),
+        ("Evaluated", ("evaluate", work, "--truth", rendered, "--no-mapping")),
+        ("Rendered", ("synth", tmp_path / "s", "--size", "64x48", "--images", 1, "--preset", "grass")),
+        ("Weights", ("weights", "list")),
+        ("Weights", ("weights", "verify")),
+        ("Shown", ("show", work)),
+        ("Shown", ("show", work, names[0])),
+        ("Shown", ("show", work, names[0], names[1])),
+        ("Shown", ("show", work / "images.csv")),
+        ("Compared", ("compare", work, work)),
+        ("Configured", ("config", "fusion")),
+        ("Listed", ("list",)),
+        ("Listed", ("list", "presets")),
+        ("Begun", ("init", tmp_path / "a.yaml", "--images", done_site.images)),
+        ("Error", ("show", tmp_path)),
+    ]
+    for kind, arguments in commands:
+        found = TypeAdapter(AnyOutcome).validate_python(invoke(*arguments, "--json").facts)
+        assert type(found).__name__ == kind, arguments

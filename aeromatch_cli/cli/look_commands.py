@@ -108,11 +108,10 @@ def list_(
     """List presets and strategies, one line each."""
 
     def call() -> Result:
-        from aeromatch_cli.config.overview import listing
+        from aeromatch_cli.config.overview import choices, listing
         from aeromatch_cli.stages.run import Result
 
-        lines = listing(family)
-        return Result(tuple(lines), {"lines": lines})
+        return Result(tuple(listing(family)), choices(family))
 
     guarded(call, "list", quiet=quiet, as_json=json_, log_file=None, context=context)
 

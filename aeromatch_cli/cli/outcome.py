@@ -9,7 +9,7 @@ import json
 import sys
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 
 class Facts(BaseModel):
@@ -130,23 +130,141 @@ class Stages(BaseModel):
     report: StageOutcome | None = None
 
 
-class Outcome(BaseModel):
-    """The last line of stdout of `aeromatch run` and of every stage with --json. NaN is null."""
+class Line(BaseModel):
+    """What the last line of every command holds. NaN is null."""
 
-    model_config = ConfigDict(extra="forbid", title="aeromatch --json")
+    model_config = ConfigDict(extra="forbid")
 
-    command: str | None = Field(None, description="The command; missing where the arguments cannot be parsed.")
     exit_code: int = Field(description="0: all is done; 1: some images or pairs failed; 2: settings or arguments; 3: "
                            "input or workspace; 130: interrupted.")  # fmt: skip
-    error: str | None = Field(None, description="What stopped the command; then there are no stages.")
-    workspace: str | None = Field(None, description="Folder of the results.")
-    failures: int | None = Field(None, description="Images and pairs that failed; failures.csv names them.")
-    stages: Stages | None = Field(None, description="What each stage did.")
+
+
+class Error(Line):
+    """Of every command that something has stopped."""
+
+    command: str | None = Field(None, description="The command; missing where the arguments cannot be parsed.")
+    error: str = Field(description="What stopped the command, and what to do.")
+
+
+class Outcome(Line):
+    """Of `run` and of every stage."""
+
+    command: Literal[
+        "run", "orient", "pairs", "enhance", "simulate", "extract", "match", "filter", "adjust", "export", "report"
+    ]
+    workspace: str = Field(description="Folder of the results.")
+    failures: int = Field(description="Images and pairs that failed; failures.csv names them.")
+    stages: Stages = Field(description="What each stage did.")
+
+
+class Checked(Line):
+    """Of `check`."""
+
+    command: Literal["check"]
+    warnings: list[str] = Field(description="What a person should look at.")
+    failures: int = Field(description="Images that cannot be read.")
+    estimate: dict[str, Any] = Field(description="Pairs, seconds, megabytes of memory and disk.")
+
+
+class Evaluated(Line):
+    """Of `evaluate`: the figures of WORK/evaluation/evaluation.json."""
+
+    model_config = ConfigDict(extra="allow")
+
+    command: Literal["evaluate"]
+    workspace: str
+    truth: str
+    truth_kind: Literal["rendered", "reference"]
+    images: int
+    totals: dict[str, float | None] = Field(description="Correct matches, correctness, recall ... of the whole block.")
+    conditions: list[dict[str, Any]] = Field(description="The same by class of view angle, overlap, texture ...")
+    consumer: dict[str, Any] = Field(description="Figures of pycolmap's mapping, or why it was not run.")
+
+
+class Rendered(Line):
+    """Of `synth`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    command: Literal["synth"]
+
+
+class Weights(Line):
+    """Of `weights list`, `verify` and `add`."""
+
+    command: Literal["weights list", "weights verify", "weights add"]
+    weights: list[str] | dict[str, str] | None = Field(None, description="Names in the folder; verify: name -> state.")
+    shipped: list[str] | dict[str, str] | None = Field(None, description="The same of those of the package.")
+    name: str | None = Field(None, description="Of the file that was added.")
+
+
+class Shown(Line):
+    """Of `show`: of a workspace, an image, a pair or a file."""
+
+    command: Literal["show"]
+    workspace: str | None = None
+    images: int | None = None
+    pairs: int | None = None
+    image: str | None = None
+    keypoints: int | None = None
+    partners: dict[str, int] | None = Field(None, description="Image -> verified matches.")
+    pair: list[str] | None = None
+    verified: int | None = Field(None, description="Matches of the pair.")
+    state: str | None = Field(None, description="verified, rejected, not verifiable.")
+    picture: str | None = Field(None, description="The file that was written.")
+    file: str | None = None
+
+
+class Compared(Line):
+    """Of `compare`; lists have the first workspace's figure and the second's."""
+
+    command: Literal["compare"]
+    settings: list[str]
+    pairs: list[int]
+    verified: list[int]
+    matches: list[int]
+
+
+class Configured(Line):
+    """Of `config`."""
+
+    command: Literal["config"]
+    settings: dict[str, Any]
+
+
+class Choice(BaseModel):
+    """A preset or a strategy."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    words: str
+    default: bool = False
+
+
+class Listed(Line):
+    """Of `list`."""
+
+    command: Literal["list"]
+    presets: list[Choice] = []
+    families: dict[str, list[Choice]]
+
+
+class Begun(Line):
+    """Of `init`."""
+
+    command: Literal["init"]
+    file: str
+    found: list[str]
+
+
+AnyOutcome = Outcome | Checked | Evaluated | Rendered | Weights | Shown | Compared | Configured | Listed | Begun | Error
 
 
 def schema() -> str:
     """JSON Schema (draft 2020-12) of the line."""
-    return json.dumps(Outcome.model_json_schema(), indent=1) + "\n"
+    found = {"title": "aeromatch --json", **TypeAdapter(AnyOutcome).json_schema()}
+    return json.dumps(found, indent=1) + "\n"
 
 
 if __name__ == "__main__":

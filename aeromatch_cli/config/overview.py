@@ -31,19 +31,33 @@ def listing(family: str = "") -> list[str]:
 
     Raises ConfigError where there is no such family.
     """
+    found = choices(family)
+    lines: list[str] = []
+    if "presets" in found:
+        lines += ["presets: aeromatch run PRESET", *_table({one["name"]: one["words"] for one in found["presets"]})]
+    for name, strategies in found["families"].items():
+        title = f"{name}: --set {name}={strategies[0]['name']}"
+        lines += ["", title, *_table({f"{s['name']} *" if s["default"] else s["name"]: s["words"] for s in strategies})]
+    return [*lines, "", f"* default (preset {DEFAULT_PRESET} adds a cascade)"] if not family else lines
+
+
+def choices(family: str = "") -> dict[str, Any]:
+    """The same for machines: presets [{name, words}], and families -> [{name, words, default}].
+
+    Raises ConfigError where there is no such family.
+    """
     if family and family not in (_PRESETS, *FAMILIES):
         hint = nearest(family, (_PRESETS, *FAMILIES), otherwise="")
         raise ConfigError(f"no family is called {family!r}: there are {', '.join((_PRESETS, *FAMILIES))}{hint}")
-    lines: list[str] = []
+    found: dict[str, Any] = {}
     if family in ("", _PRESETS):
-        lines += ["presets: aeromatch run PRESET", *_table(_purposes())]
-    for name, table in FAMILIES.items():
-        if family in ("", name):
-            chosen = _chosen(name)
-            title = f"{name}: --set {name}={next(iter(table))}"
-            marked = {key + (" *" if key in chosen else ""): first_sentence(table[key]) for key in table}
-            lines += ["", title, *_table(marked)]
-    return [*lines, "", f"* default (preset {DEFAULT_PRESET} adds a cascade)"] if not family else lines
+        found["presets"] = [{"name": name, "words": words} for name, words in _purposes().items()]
+    found["families"] = {
+        name: [{"name": key, "words": first_sentence(table[key]), "default": key in _chosen(name)} for key in table]
+        for name, table in FAMILIES.items()
+        if family in ("", name)
+    }
+    return found
 
 
 def _purposes() -> dict[str, str]:

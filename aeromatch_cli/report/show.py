@@ -177,7 +177,9 @@ def _image(work: _Work, image: Image, out: Path | None) -> Shown:
     target = out or workspace.root / "show" / f"{image_id}.png"
     write_picture(target, image_picture(read_pixels(work.folder / image.name, colour=True), keypoints, matched))
     lines.append(f"picture     {target}: keypoints in verified matches green, others red")
-    return Shown(lines, {"image": image.name, "keypoints": len(keypoints), "picture": str(target)}, target)
+    partners = {name: count for count, name, *_ in rows}
+    facts = {"image": image.name, "keypoints": len(keypoints), "partners": partners, "picture": str(target)}
+    return Shown(lines, facts, target)
 
 
 def _pose_words(pose: Pose | None, origin_m: Sequence[float]) -> Iterator[str]:
@@ -227,7 +229,7 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     target = out or workspace.root / "show" / f"{ids[0]}--{ids[1]}.png"
     write_picture(target, pair_picture(pixels, points, errors, dropped))
     lines.append(f"picture     {target}: green to yellow by error{', dropped ones red' if dropped is not None else ''}")
-    facts = {"pair": [image0.name, image1.name], "verified": count, "picture": str(target)}
+    facts = {"pair": [image0.name, image1.name], "verified": count, "state": verdict.state, "picture": str(target)}
     return Shown(lines, facts, target)
 
 
