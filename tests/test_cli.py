@@ -343,17 +343,32 @@ def test_help_of_synth_names_every_scene_and_flight() -> None:
 
 def test_progress_says_which_stage_of_how_many(capsys):
     progress = LineProgress(RUN_STAGES)
-    for label, total, counts in (("step first: match", 10, [7, 3]), ("first pass: match", 1, [1]), ("read", 1, [1])):
+    for label, total, counts in (
+        ("first pass: match", 1, [1]), ("step first: match", 10, [7, 3]), ("step guided: extract", 1, [1]),
+        ("read", 1, [1]),
+    ):  # fmt: skip
         progress.start(label, total)
         for count in counts:
             progress.advance(count)
     lines = capsys.readouterr().err.splitlines()
     assert [line.rpartition(",")[0] for line in lines] == [
+        "1/9 first pass: match: 100 % (1/1)",
         "4/9 step first: match: 70 % (7/10)",
         "4/9 step first: match: 100 % (10/10)",
-        "1/9 first pass: match: 100 % (1/1)",
+        "4/9 step guided: extract: 100 % (1/1)",  # it does not go back to the third
         "read: 100 % (1/1)",
     ]
+
+
+def test_the_time_to_the_end_is_estimated_from_the_stages_that_did_something(monkeypatch, capsys):
+    """Extraction takes 15 shares of 100, what follows 51: after half of it in 10 s (a stage may have further parts, so
+    that a half counts for a quarter), 10 / 3.75 x (11.25 + 51) s are left."""
+    clock = iter([0.0, 0.0, 10.0, 10.0])
+    monkeypatch.setattr("aeromatch_cli.cli.progress.time.monotonic", lambda: next(clock))
+    progress = LineProgress(RUN_STAGES)
+    progress.start("extract", 2)
+    progress.advance()
+    assert capsys.readouterr().err.endswith("10 s left; about 3 min to the end\n")
 
 
 def test_options_are_taken_from_the_environment(tmp_path, monkeypatch):

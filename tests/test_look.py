@@ -163,3 +163,15 @@ def test_init_writes_settings_for_what_it_sees(tmp_path: Path) -> None:
     assert again.code == 2
     assert "exists and is not replaced" in again.stderr
     assert invoke("init", tmp_path / "c.yaml", "--images", tmp_path / "none").code in (2, 3)
+
+
+def test_show_takes_the_workspace_of_the_environment(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AEROMATCH_WORKSPACE", str(done_site.work))
+    assert invoke("show", "--json").facts["workspace"] == str(done_site.work)
+    assert invoke("show", done_site.names()[0], "--json").facts["image"] == done_site.names()[0]
+
+
+def test_init_proposes_the_camera_file_that_lies_there(site: Site, tmp_path: Path) -> None:
+    out = site.root / "a.yaml"
+    assert "camera file" in invoke("init", out, "--images", site.images).stdout
+    assert yaml.safe_load(out.read_text())["block"]["cameras"] == "block.json"

@@ -69,3 +69,10 @@ def test_every_variable_of_the_guide_is_one() -> None:
 
     known = set(re.findall(r'envvar="(AEROMATCH_[A-Z_]+)"', Path(options.__file__).read_text()))
     assert known == set(re.findall(r"AEROMATCH_[A-Z_]+", GUIDE))
+
+
+def test_a_reader_that_leaves_early_stops_nothing(shell: dict[str, str]) -> None:
+    """`aeromatch list | head -1`, with the exit code of aeromatch itself."""
+    command = "{ aeromatch list; echo $? >&2; } | head -1"
+    done = subprocess.run(["sh", "-c", command], env=shell, capture_output=True, text=True, check=False)
+    assert (done.stderr.strip(), done.stdout.count("\n")) == ("0", 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -30,7 +31,13 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
 
 def show(
     context: typer.Context,
-    path: Annotated[Path, typer.Argument(metavar="WORK|FILE", help="Workspace, or a .npz, .json or .csv file of one.")],
+    path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="WORK|FILE",
+            help="Workspace, or a .npz, .json or .csv file of one; may be left out where AEROMATCH_WORKSPACE is set.",
+        ),
+    ] = None,
     images: Annotated[
         list[str] | None, typer.Argument(metavar="[IMAGE [IMAGE]]", help="One image, or the two of a pair.")
     ] = None,
@@ -44,15 +51,21 @@ def show(
     """Show a workspace, an image, a pair or a file, in words and as a picture."""
 
     def call() -> Result:
+        from aeromatch_cli.config import Settings
         from aeromatch_cli.report.show import show as shown
         from aeromatch_cli.stages.run import Result
 
         names = images or []
+        given = os.environ.get("AEROMATCH_WORKSPACE")
+        root = path or Path(given or Settings().workspace)
+        if path is not None and given and not path.exists():
+            # The first word is an image of the workspace that the environment names.
+            root, names = Path(given), [str(path), *names]
         if len(names) > 2:
             raise ConfigError(f"{len(names)} images: name one, or the two of a pair")
         if out is not None and out.suffix.lower() != ".png":
             raise ConfigError(f"--out {out}: the picture is a PNG, name it FILE.png")
-        found = shown(path, names, out, rejected=rejected)
+        found = shown(root, names, out, rejected=rejected)
         return Result(tuple(found.lines), found.facts)
 
     guarded(call, "show", quiet=quiet, as_json=json_, log_file=None, context=context)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +52,7 @@ def guarded(
         facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet)
         record.info("exit code %d after %.1f s", facts["exit_code"], time.monotonic() - started)
     if as_json:
-        typer.echo(json.dumps(_finite(facts), allow_nan=False))
+        _printed(json.dumps(_finite(facts), allow_nan=False))
     if facts["exit_code"]:
         raise typer.Exit(int(facts["exit_code"]))
 
@@ -91,9 +93,17 @@ def said(quiet: bool) -> Callable[[str], None]:
     def say(line: str) -> None:
         record.info("%s", line)
         if not quiet:
-            typer.echo(line)
+            _printed(line)
 
     return say
+
+
+def _printed(line: str) -> None:
+    """To stdout. Where its reader has left (`| head`), the work goes on and nothing more is said."""
+    try:
+        typer.echo(line)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _finite(value: Any) -> Any:

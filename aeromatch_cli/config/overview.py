@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli import DEFAULT_PRESET
+from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.blocks.pose_files.source import Source
@@ -24,6 +25,7 @@ _LOOKED_AT = 20
 # Files that may hold poses, by suffix: others are not opened.
 _POSE_SUFFIXES = (".csv", ".txt", ".json", ".geojson", ".xml", ".mrk", ".prj", ".ori", ".nvm", ".out", ".bin")
 _LARGEST_BYTES = 50_000_000
+_CAMERA_FILES = ("cameras.txt", "cameras.json", "cameras.yaml", "cameras.yml", "block.json")
 
 
 def listing(family: str = "") -> list[str]:
@@ -88,9 +90,12 @@ def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
     facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
     found = [f"{len(names)} images", *_seen(facts)]
     poses = list(_pose_files(images))
+    cameras = next(_camera_files(images), None)
     found += [f"pose file {path}: {title}" for path, title in poses]
-    text = _settings_text(_below(images, folder), facts, [(_below(p, folder), title) for p, title in poses], found)
-    return text, found
+    found += [f"camera file {cameras}"] if cameras else []
+    below = [(_below(path, folder), title) for path, title in poses]
+    camera_file = _below(cameras, folder) if cameras else "exif"
+    return _settings_text(_below(images, folder), facts, below, camera_file, found), found
 
 
 def _below(path: Path, folder: Path) -> str:
@@ -103,7 +108,7 @@ def _below(path: Path, folder: Path) -> str:
 def _seen(facts: list[ExifFacts]) -> Iterator[str]:
     """Cameras, positions and angles of the headers that were looked at."""
     cameras = Counter(
-        f"{' '.join(filter(None, (fact.make, fact.model))) or 'camera unknown'} {fact.width_px} x {fact.height_px}"
+        f"{' '.join(filter(None, (fact.make, fact.model))) or 'of unknown make'} {fact.width_px} x {fact.height_px}"
         for fact in facts
     )
     for camera, _ in cameras.most_common(5):
@@ -126,7 +131,21 @@ def _pose_files(images: Path) -> Iterator[tuple[Path, str]]:
                     break
 
 
-def _settings_text(images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], found: list[str]) -> str:
+def _camera_files(images: Path) -> Iterator[Path]:
+    """Files in the folder and beside it that --cameras takes."""
+    for folder in dict.fromkeys((images, images.parent)):
+        for name in _CAMERA_FILES:
+            path = folder / name
+            try:
+                if path.is_file() and read_camera_file(path).cameras:
+                    yield path
+            except ConfigError:
+                continue  # a file of that name that another program has written
+
+
+def _settings_text(
+    images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], cameras: str, found: list[str]
+) -> str:
     located = any(fact.latitude_deg is not None for fact in facts)
     chosen = poses[0][0] if poses else "exif" if located else "none"
     others = "".join(f"  # poses: {_scalar(path)}  # {title}\n" for path, title in poses[1:])
@@ -142,7 +161,7 @@ block:
   # A pose file of any program, exif (GPS and angles of the images), or none.
   poses: {_scalar(chosen)}
 {others}  # exif, folder (one camera per folder), or a file: COLMAP's cameras.txt, YAML, JSON.
-  cameras: exif
+  cameras: {_scalar(cameras)}
   # auto: the UTM zone of the positions, or what the pose file states.
   crs: auto
   # Metres, a DEM file, or auto: the terrain that the pictures show.
