@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +176,15 @@ def test_gon_beyond_a_full_turn_are_known(tmp_path: Path) -> None:
         ("x_pmatrix.txt", "A.jpg 1 2 3 4 5 6 7 8 9 10 11 12\n", "looks like Pix4D's projection matrices"),
         ("poses.xlsx", b"PK\x03\x04\0\0", "looks like an Excel workbook: save the sheet as CSV"),
         ("flight.pos", "% program : RTKLIB\n2200 1000.0 42 15 400 1 12\n", "looks like an RTKLIB solution"),
+        (
+            "geo.txt",
+            "A.jpg 1 2 3\nB.jpg 1 2 3\n",
+            "looks like ODM's geo.txt without its first line, which names the CRS",
+        ),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": []}', "looks like openMVG's sfm_data"),
+        ("cameras.sfm", '{"version": ["1"], "views": [], "intrinsics": []}', "looks like AliceVision's"),
+        ("a.geojson", '{"type": "FeatureCollection", "features": []}', "looks like GeoJSON"),
+        ("tracks.csv", "track,image,keypoint,x_px\n1,A.jpg,2,3.0\n", "looks like a list of tracks"),
         ("reference_lla.json", '{"latitude": 1, "longitude": 2, "altitude": 3}', "reconstruction.json has the poses"),
     ],
 )
@@ -237,7 +247,7 @@ def test_another_crs_than_the_files_is_refused(site: Site) -> None:
 
 def test_every_format_that_content_tells_is_tried_in_the_tests() -> None:
     """Formats above by folder name, and those of tests of their own."""
-    tried = {name.split("/")[0] for name in (*WORLD, *LOCAL)} | {"micmac", "patb", "dji-mrk", "metashape-given"}
+    tried = {name.split("/")[0] for name in (*WORLD, *LOCAL)} | {"micmac", "patb", "dji-mrk", "exiftool"}
     assert set(POSE_FORMATS) - tried <= {"columns", "pix4d", "table", "metashape-given"}
 
 
@@ -252,3 +262,32 @@ def test_metashape_accuracies_of_position_and_angles_are_used(tmp_path: Path) ->
     )
     row = read_pose_file(path).rows[0]
     assert (row.sigma_position_m, row.sigma_angle_deg) == (0.04, 2.0)
+
+
+@pytest.mark.parametrize("form", ["csv", "csv -n", "json"])
+def test_exiftools_tables(tmp_path: Path, form: str) -> None:
+    """Degrees, minutes and seconds, or numbers with a reference tag; angles by their maker's convention."""
+    if form == "csv":
+        text = (
+            "SourceFile,FileName,GPSLatitude,GPSLongitude,GPSAltitude,GimbalYawDegree,GimbalPitchDegree,GimbalRollDegree\n"
+            'imgs/a.jpg,a.jpg,"33 deg 30\' 36.00"" S","70 deg 15\' 0.00"" W",12.5 m Above Sea Level,+10.0,-90.0,0\n'
+        )
+    elif form == "csv -n":
+        text = (
+            "SourceFile,GPSLatitude,GPSLatitudeRef,GPSLongitude,GPSLongitudeRef,GPSAltitude,Yaw,Pitch,Roll,GPSXYAccuracy,"
+            "GPSZAccuracy\nimgs/a.jpg,33.51,S,70.25,W,12.5,10,0,0,0.04,0.05\n"
+        )
+    else:
+        tags = {
+            "SourceFile": "imgs/a.jpg", "EXIF:GPSLatitude": 33.51, "Composite:GPSLatitude": -33.51,
+            "EXIF:GPSLongitude": 70.25, "EXIF:GPSLongitudeRef": "W", "XMP:AbsoluteAltitude": "+12.5",
+            "EXIF:GPSAltitude": 99.0, "XMP:Yaw": 10, "XMP:Pitch": 0, "XMP:Roll": 0,
+        }  # fmt: skip
+        text = json.dumps([tags])
+    found = read_pose_file(write(tmp_path, "exif.json" if form == "json" else "exif.csv", text))
+    row = found.rows[0]
+    assert found.format == "ExifTool table"
+    assert row.image == "imgs/a.jpg"
+    np.testing.assert_allclose(row.position or (), (-33.51, -70.25, 12.5), atol=1e-9)
+    assert (row.attitude, row.forward) == (((10.0, -90.0, 0.0), True) if form == "csv" else ((10.0, 0.0, 0.0), False))
+    assert row.sigma_position_m == (0.05 if form == "csv -n" else None)

@@ -89,8 +89,7 @@ def test_a_fault_of_every_line_is_one_warning(tmp_path: Path) -> None:
         ("image,x,y,z\n", "no line follows"),
         ("image,omega_deg,phi_deg,kappa_deg\na,1,2,3\n", "no position"),
         ("image,x\na,1\n", "'y' is missing"),
-        ("image,lat,lon,height\na,1,2,3\n", "'alt' is missing.*'height' is not a height above ground"),
-        ("image,lat,lon,z\na,1,2,3\n", "name it 'alt'"),
+        ("image,lat,lon,agl\na,1,2,3\n", "'alt' is missing.*'agl' counts from the ground"),
         ("image,x,y,z,omega_deg,phi_deg\na,1,2,3,4,5\n", "'kappa_deg' is missing"),
         ("image,x,y,z,omega_deg,phi_deg,kapa_deg\na,1,2,3,4,5,6\n", "did you mean 'kappa_deg'"),
         ("image,x,y,z,lat,lon,alt\na,1,2,3,4,5,6\n", "two forms of position"),
@@ -158,3 +157,35 @@ def test_latitudes_beyond_90_degrees_are_longitudes(tmp_path: Path) -> None:
     path.write_text("image,lat,lon,alt\na,116,40,1\nb,40,116,1\nc,116,40,1\n")
     with pytest.raises(ConfigError, match="line 2, column lat: 116 is out of range"):
         read_poses(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("Filename,Easting,Northing,Height", "height is taken for the height z"),
+        ("Filename,Easting,Northing,Altitude", "alt is taken for the height z"),
+        ("Filename,Easting,Northing,Ellipsoidal height (m)", "ellipsoidal_height is taken for the height z"),
+        ("Filename,Lat,Lon,Elevation", "elevation is taken for the height alt"),
+        ("Filename,Easting,Northing,Z", ""),
+    ],
+)
+def test_heights_under_other_names(tmp_path: Path, header: str, said: str) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text(f"{header}\na.jpg,10,20,30\n")
+    found = read_poses(path)
+    assert found.rows[0].position == (10.0, 20.0, 30.0)
+    assert said in " ".join(found.warnings)
+    assert bool(found.warnings) == bool(said)
+
+
+def test_our_own_orientation_is_read_again(tmp_path: Path) -> None:
+    head = "image,x,y,z,omega_deg,phi_deg,kappa_deg,sigma_x_m,sigma_y_m,sigma_z_m,sigma_omega_deg,sigma_phi_deg,"
+    path = tmp_path / "orientation.csv"
+    path.write_text(
+        f"{head}sigma_kappa_deg,camera,frame\na.jpg,1,2,3,0,0,9,0.1,0.2,0.3,0.01,0.02,0.03,1,world\n"
+        "b.jpg,1,2,3,0,0,9,0.1,0.2,0.3,0.01,0.02,0.03,1,own 1\n"
+    )
+    found = read_poses(path)
+    assert (found.rows[0].sigma_position_m, found.rows[0].sigma_angle_deg) == (0.3, 0.03)
+    assert (found.rows[1].position, found.rows[1].attitude) == (None, None)
+    assert found.warnings == ("orientation.csv, line 3: in a frame of its own, treated as unposed: b.jpg",)

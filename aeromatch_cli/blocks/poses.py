@@ -9,8 +9,13 @@ Columns, in any order and case (aliases in brackets):
   yaw_deg pitch_deg roll_deg [yaw pitch roll]     yaw against grid north with x y z, true north with lat lon alt, or
   qw qx qy qz                   cam_from_world, relative to the grid, or no attitude at all
   camera                        name of the camera (optional)
-  sigma_position_m sigma_angle_deg                standard deviations (optional), or of the position for each axis
+  sigma_position_m sigma_angle_deg                standard deviations (optional), or for each axis
   sigma_x_m sigma_y_m sigma_z_m [sde sdn sdu, std_e std_n std_u]     as PPK results have them; the largest counts
+  sigma_omega_deg sigma_phi_deg sigma_kappa_deg   the largest counts
+  frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
+
+Beside x y or lat lon, a height under another name (altitude, ellipsoidal height, height, elevation) is taken and said;
+heights above ground (relative_altitude, agl) are refused.
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
 header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose horizontal
@@ -43,7 +48,11 @@ _ATTITUDES: dict[AttitudeKind, tuple[str, ...]] = {
 }
 _SIGMAS = ("sigma_position_m", "sigma_angle_deg")
 _AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
-_KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", *_SIGMAS, *_AXIS_SIGMAS)
+# What orientation.csv says of images whose place is arbitrary.
+_OWN_FRAME = "own"
+_ANGLE_SIGMAS = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
+_ALL_SIGMAS = (*_SIGMAS, *_AXIS_SIGMAS, *_ANGLE_SIGMAS)
+_KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", "frame", *_ALL_SIGMAS)
 _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
@@ -54,8 +63,11 @@ _ALIASES = {
     **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
 }
-# Columns that might be meant as z or alt, and might as well be heights above ground.
-_UNCLEAR_HEIGHTS = ("z", "alt", "height", "h", "elevation", "relative_altitude", "agl")
+# Columns that are taken for z or alt where there is none, the likeliest first.
+_OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "ellipsoidal_height", "ellipsoid_height", "orthometric_height",
+                  "height", "elevation", "h")  # fmt: skip
+# Heights above ground, or above where the flight began.
+_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "rel_alt")
 _BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 _LARGEST_LATITUDE_DEG = 90.0
 # So many latitudes that are none are no slip of the pen.
@@ -116,6 +128,7 @@ class _Layout:
     position_kind: PositionKind
     attitude_kind: AttitudeKind
     ignored: tuple[str, ...]
+    height: str = ""  # the column that is taken for z or alt under another name
 
 
 def read_poses(path: Path) -> PoseList:
@@ -138,6 +151,9 @@ def read_poses(path: Path) -> PoseList:
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
     rows, exchanged = _with_latitudes(path, rows)
     ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
+    if layout.height:
+        own = _POSITIONS[layout.position_kind][2]
+        ignored.append(f"{path.name}: {layout.height} is taken for the height {own}, which counts from the datum")
     warnings = [_fault(path, fault, images) for fault, images in faults.items()]
     return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings))
 
@@ -234,6 +250,7 @@ def _layout(path: Path, number: int, separator: str | None, columns: tuple[str, 
     twice = sorted({name for name in columns if name and columns.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
+    columns, height = _with_height(columns)
     unknown = tuple(name for name in columns if name and name not in _KNOWN)
     for name in unknown:
         near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
@@ -243,7 +260,19 @@ def _layout(path: Path, number: int, separator: str | None, columns: tuple[str, 
     if position is None:
         raise ConfigError(f"{where}: no position: add the columns x,y,z or lat,lon,alt")
     attitude = _form(where, "attitude", _ATTITUDES, columns, unknown)
-    return _Layout(separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown)
+    return _Layout(
+        separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown, height
+    )
+
+
+def _with_height(columns: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
+    """Columns in which z or alt stands for a height under another name, and that name, "" for none."""
+    for across, own in ((("x", "y"), "z"), (("lat", "lon"), "alt")):
+        if set(across) <= set(columns) and own not in columns and not set(columns) & set(_RELATIVE_HEIGHTS):
+            other = next((name for name in _OTHER_HEIGHTS if name in columns), "")
+            if other:
+                return tuple(own if name == other else name for name in columns), other
+    return columns, ""
 
 
 def _form(
@@ -259,9 +288,9 @@ def _form(
     if not present:
         return None
     missing = [name for name in forms[present[0]] if name not in columns]
-    heights = [name for name in columns if name in _UNCLEAR_HEIGHTS and missing[:1] in (["z"], ["alt"])]
-    if missing and (heights or missing not in (["z"], ["alt"])):
-        hint = f" (if {heights[0]!r} is not a height above ground, name it {missing[0]!r})" if heights else ""
+    relative = [name for name in columns if name in _RELATIVE_HEIGHTS and missing[:1] in (["z"], ["alt"])]
+    if missing and (relative or missing not in (["z"], ["alt"])):
+        hint = f" ({relative[0]!r} counts from the ground; if it does not, name it {missing[0]!r})" if relative else ""
         raise ConfigError(
             f"{where}: column {missing[0]!r} is missing: {what} needs {','.join(forms[present[0]])}{hint}"
         )
@@ -297,6 +326,9 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
     axes = [numbers((name,))[0] for name in _AXIS_SIGMAS if name in record]
+    turns = [value for name in _ANGLE_SIGMAS if name in record and (value := numbers((name,))[0]) is not None]
+    if sigmas[1] is None and turns:
+        sigmas[1] = max(turns)
     if sigmas[0] is None and axes and None not in axes:
         sigmas[0] = max(axis for axis in axes if axis is not None)
     across = _POSITIONS[layout.position_kind][:2]
@@ -304,9 +336,13 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     height = _POSITIONS[layout.position_kind][2]
     z = numbers((height,))[0] if height in record else None
     attitude = numbers(_ATTITUDES[layout.attitude_kind]) if layout.attitude_kind != "none" else ()
+    own_frame = record.get("frame", "").startswith(_OWN_FRAME)
     lacking = next((name for name, value in zip(across, (x, y), strict=True) if value is None), None)
     if lacking:
         faults.setdefault(f"no number in column {lacking}, treated as unposed", {})[number] = image
+    elif own_frame:
+        faults.setdefault("in a frame of its own, treated as unposed", {})[number] = image
+        x, attitude = None, ()
     elif layout.position_kind == "geographic" and x == 0.0 and y == 0.0:
         faults.setdefault("position (0, 0), treated as unposed", {})[number] = image
         x = None
@@ -348,6 +384,6 @@ def _number(path: Path, line: int, column: str, cell: str, decimal_comma: bool) 
     if math.isinf(value) or abs(value) > largest:
         limits = f" between {-largest:g} and {largest:g}" if largest < math.inf else ""
         raise ConfigError(f"{where}: {cell} is out of range: expected a number{limits}")
-    if column in (*_SIGMAS, *_AXIS_SIGMAS) and value <= 0:
+    if column in _ALL_SIGMAS and value <= 0:
         raise ConfigError(f"{where}: {cell} is out of range: a standard deviation is positive")
     return value

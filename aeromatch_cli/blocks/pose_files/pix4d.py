@@ -11,7 +11,6 @@ offset lies beside in *_offset.xyz.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from functools import partial
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.lenses import Nearest, brown
 from aeromatch_cli.blocks.pose_files.source import (
+    IMAGE,
     CameraShelf,
     Source,
     cells_of,
@@ -31,7 +31,6 @@ from aeromatch_cli.blocks.pose_files.source import (
 from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
 from aeromatch_cli.errors import ConfigError
 
-_IMAGE = re.compile(r".+\.(jpe?g|tiff?|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
 _COUNTS = (4, 6, 7, 9)
 _LINES_OF_IMAGE = 10
 
@@ -41,7 +40,7 @@ def is_geolocation(source: Source) -> bool:
     if "," not in record and ";" not in record:
         return False
     cells = cells_of(record)
-    return len(cells) in _COUNTS and bool(_IMAGE.fullmatch(cells[0])) and all(map(is_number, cells[1:]))
+    return len(cells) in _COUNTS and bool(IMAGE.fullmatch(cells[0])) and all(map(is_number, cells[1:]))
 
 
 def read_geolocation(source: Source, angles: str = "") -> PoseList:
@@ -123,7 +122,7 @@ def read_camera_parameters(source: Source) -> PoseList:
         part = records[start : start + _LINES_OF_IMAGE]
         line, head = part[0]
         name = head.rsplit(maxsplit=2)[0]
-        if len(part) < _LINES_OF_IMAGE or not _IMAGE.fullmatch(name):
+        if len(part) < _LINES_OF_IMAGE or not IMAGE.fullmatch(name):
             raise ConfigError(f"{source.at(line)}: an image has ten lines here, beginning with name, width and height")
         lens = _lens(source, head, part)
         key = known.setdefault(repr(lens), f"camera{len(known)}")

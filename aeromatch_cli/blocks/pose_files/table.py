@@ -11,6 +11,7 @@ from aeromatch_cli.blocks.pose_files import (
     blocks_exchange,
     colmap,
     dji,
+    exiftool,
     metashape,
     micmac,
     odm,
@@ -19,7 +20,7 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.source import Source
+from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, cells_of, is_number
 from aeromatch_cli.blocks.poses import PoseList, read_poses
 from aeromatch_cli.errors import ConfigError
 
@@ -60,6 +61,7 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
     "odm-shots": PoseFormat("ODM and WebODM shots.geojson", odm.read_shots, odm.is_shots),
     "transforms": PoseFormat("NeRF transforms.json", scenes.read_transforms, scenes.is_transforms),
     "opensfm-exif": PoseFormat("OpenSfM exif_overrides.json", opensfm.read_overrides, opensfm.is_overrides),
+    "exiftool": PoseFormat("ExifTool -csv or -json", exiftool.read_exiftool, exiftool.is_exiftool),
     "odm": PoseFormat("ODM geo.txt", odm.read_geo_txt, odm.is_geo_txt),
     "dji-mrk": PoseFormat("DJI *_Timestamp.MRK", dji.read_mrk, dji.is_mrk),
     "bundler": PoseFormat("Bundler .out with list.txt", scenes.read_bundler, scenes.is_bundler),
@@ -131,6 +133,8 @@ def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
     other = next((words for end, words in _OTHERS.items() if source.name.endswith(end)), "")
     if other:
         raise ConfigError(f"pose list {path} looks like {other}")
+    if words := _by_content(source):
+        raise ConfigError(f"pose list {path} looks like {words}")
     if source.tree is not None or source.xml is not None:
         kind = "JSON" if source.tree is not None else "XML"
         raise ConfigError(
@@ -138,6 +142,25 @@ def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
             "first line names the columns always is"
         )
     return read_poses(path)
+
+
+def _by_content(source: Source) -> str:
+    """What a file of no known format is, and what to do; "" where nothing tells."""
+    tree = source.tree
+    if isinstance(tree, dict):
+        if "sfm_data_version" in tree:
+            return "openMVG's sfm_data: give its COLMAP model (openMVG_main_openMVG2Colmap)"
+        if {"views", "intrinsics"} <= tree.keys():
+            return "AliceVision's or Meshroom's cameras: give the COLMAP model that its node ExportColmap writes"
+        if tree.get("type") == "FeatureCollection":
+            return "GeoJSON: export its table as CSV with the image names and the coordinates"
+    record = next((line for _, line in source.records()), "")
+    cells = cells_of(record)
+    if cells[0].lower() == "track" or (len(cells) == 1 and cells[0].startswith("OPENSFM_TRACKS_VERSION")):
+        return "a list of tracks, which are tie points: give the poses of the images"
+    if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
+        return "ODM's geo.txt without its first line, which names the CRS, such as EPSG:32633 or EPSG:4326: add it"
+    return ""
 
 
 def _checked(source: Source, found: PoseList) -> PoseList:

@@ -1,0 +1,113 @@
+"""Tables of ExifTool: `exiftool -csv` and `exiftool -json`, with or without -n and group names (-G).
+
+The same tags as in the images themselves: GPSLatitude, GPSLongitude, GPSAltitude (DJI's AbsoluteAltitude before it),
+the angles of the camera (`xmp.xmp_angles`) and their accuracies.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigma_m
+from aeromatch_cli.blocks.pose_files.source import Source, image_name
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
+from aeromatch_cli.errors import ConfigError
+
+_IMAGE = "SourceFile"
+_DEGREES = re.compile(r"(\d+(?:\.\d+)?)\s*deg\s*(\d+(?:\.\d+)?)'\s*(\d+(?:\.\d+)?)\"\s*([NSEWnsew]?)")
+# Groups whose tag counts before that of others: degrees with a sign.
+_FIRST = "Composite"
+# ExifTool names tags without their namespace: which maker's they are.
+_NAMESPACES = (
+    (re.compile(r"Gimbal(Yaw|Pitch|Roll)Degree|RtkStd(Lon|Lat|Hgt)"), "drone-dji"),
+    (re.compile(r"Camera(Yaw|Pitch|Roll)Degree"), "drone-parrot"),
+    (re.compile(r"Yaw|Pitch|Roll|GPS(XY|Z)Accuracy|IMU(Yaw|Pitch|Roll)Accuracy"), "Camera"),
+)
+
+
+def is_exiftool(source: Source) -> bool:
+    if isinstance(source.tree, list):
+        return bool(source.tree) and all(isinstance(item, dict) and _IMAGE in item for item in source.tree)
+    if isinstance(source.tree, dict):
+        return _IMAGE in source.tree
+    return bool(source.lines) and _IMAGE in source.lines[0].split(",")
+
+
+def read_exiftool(source: Source) -> PoseList:
+    """Raises ConfigError where no image has a position, naming what was looked for."""
+    rows, unposed = [], 0
+    for line, record in _records(source):
+        row = _row(line, record)
+        unposed += row.position is None
+        rows.append(row)
+    if unposed == len(rows):
+        raise ConfigError(
+            f"{source.path}: no image of this ExifTool table has GPSLatitude and GPSLongitude: write it by "
+            "`exiftool -csv -n -r IMGS`"
+        )
+    remarks = (f"{source.path.name}: {unposed} images have no GPS position there",) if unposed else ()
+    return PoseList(tuple(rows), "geographic", remarks, "ExifTool table")
+
+
+def _records(source: Source) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """Line and tags of every image."""
+    if source.tree is not None:
+        items = source.tree if isinstance(source.tree, list) else [source.tree]
+        yield from enumerate(items, start=1)
+        return
+    reader = csv.reader(source.lines)
+    names = next(reader)
+    for cells in reader:
+        if cells:
+            yield reader.line_num, dict(zip(names, cells, strict=False))
+
+
+def _row(line: int, record: Mapping[str, Any]) -> PoseRow:
+    tags: dict[str, Any] = {}
+    for name in sorted(record, key=lambda key: key.startswith(f"{_FIRST}:")):
+        if record[name] not in ("", "-", None):
+            tags[name.rpartition(":")[2]] = record[name]
+    latitude, longitude = (_degrees(tags, f"GPS{name}") for name in ("Latitude", "Longitude"))
+    height = _metres(tags.get("AbsoluteAltitude", tags.get("GPSAltitude")), tags.get("GPSAltitudeRef"))
+    xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
+    angles = xmp_angles(xmp)
+    known = latitude is not None and longitude is not None
+    return PoseRow(
+        image=image_name(str(record[_IMAGE])), line=line,
+        position=(latitude, longitude, height) if latitude is not None and longitude is not None else None,
+        position_kind="geographic",
+        attitude=(angles.yaw_deg, angles.pitch_deg, angles.roll_deg) if angles and known else None,
+        attitude_kind="yaw_pitch_roll" if angles and known else "none",
+        sigma_position_m=position_sigma_m(xmp), sigma_angle_deg=angle_sigma_deg(xmp),
+        forward=angles.convention == "gimbal" if angles and known else None, true_north=True,
+    )  # fmt: skip
+
+
+def _degrees(tags: Mapping[str, Any], name: str) -> float | None:
+    """Signed degrees of `52.5`, `52 deg 31' 11.64" N`; the reference tag counts where the value has no sign."""
+    value = tags.get(name)
+    match = _DEGREES.search(str(value))
+    if match:
+        degrees = float(match[1]) + float(match[2]) / 60.0 + float(match[3]) / 3600.0
+        side = match[4]
+    else:
+        number = tag_number(value)
+        if number is None:
+            return None
+        degrees, side = number, ""
+    side = (side or str(tags.get(f"{name}Ref", ""))[:1]).upper()
+    return -abs(degrees) if side in ("S", "W") else degrees
+
+
+def _metres(value: Any, reference: Any) -> float:
+    """Of `161.96`, `+161.96`, `161.96 m Above Sea Level`; NaN for none."""
+    words = str(value).split()
+    number = tag_number(words[0]) if words else None
+    if number is None:
+        return float("nan")
+    below = "below" in str(value).lower() or str(reference).strip() == "1" or "below" in str(reference).lower()
+    return -abs(number) if below else number
