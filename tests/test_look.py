@@ -14,6 +14,7 @@ from PIL import Image
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.report.pictures import image_picture, pair_picture
+from aeromatch_cli.report.tiles import aligned
 
 GRAY = np.full((60, 80, 3), 128, np.uint8)
 
@@ -175,3 +176,41 @@ def test_init_proposes_the_camera_file_that_lies_there(site: Site, tmp_path: Pat
     out = site.root / "a.yaml"
     assert "camera file" in invoke("init", out, "--images", site.images).stdout
     assert yaml.safe_load(out.read_text())["block"]["cameras"] == "block.json"
+
+
+def test_images_are_laid_on_each_other_by_the_plane_of_their_matches() -> None:
+    """The second picture is the first, moved by 12 and 5 pixels: laid on it, both are the same where both see."""
+    noise = np.random.default_rng(5).integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    big = np.kron(noise, np.ones((6, 6, 1), np.uint8))
+    first, second = big[:160, :220], big[5:165, 12:232]
+    places = np.random.default_rng(6).uniform(20, 140, (40, 2))
+    laid = aligned((first, second), (places, places - (12.0, 5.0)))
+    assert laid is not None
+    assert laid.other is not None
+    assert (laid.picture[20:140, 20:200] == laid.other[20:140, 20:200]).mean() > 0.99
+    assert (laid.picture[:4] == laid.other[:4]).all()  # what one alone sees does not change
+    assert aligned((first, second), (places[:3], places[:3])) is None
+
+
+@pytest.mark.slow
+def test_show_draws_steps_as_a_sheet_a_page_and_a_changing_picture(done_site: Site) -> None:
+    work, names = done_site.work, done_site.names()
+    shadow = done_site("run", "--set", "enhance=shadow")
+    assert shadow.code == 0
+    page = work / "image.html"
+    told = invoke("show", work, names[0], "--views", "--out", page)
+    assert told.code == 0
+    assert "; enhanced, shadow mask, view ground" in told.stdout
+    text = page.read_text()
+    assert text.count("<figure>") == text.count('src="data:image/jpeg') >= 4
+    assert "view ground-enhanced" in text
+    sheet = invoke("show", work, names[0], "--views", "--out", work / "image.png")
+    assert sheet.code == 0
+    with Image.open(work / "image.png") as picture:
+        assert picture.size[0] > 3 * 320
+    assert invoke("show", work, names[0], names[1], "--out", work / "pair.gif").code == 0
+    with Image.open(work / "pair.gif") as picture:
+        assert (picture.size, picture.n_frames) == ((320, 240), 2)
+    refused = invoke("show", work, names[0], "--out", work / "image.gif")
+    assert refused.code == 2
+    assert "name it FILE.png or FILE.html" in refused.stderr

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 EXAMPLES: Mapping[str, Sequence[str]] = {
     "show": (
         "aeromatch show WORK",
+        "aeromatch show WORK DJI_0001.JPG --views --out DJI_0001.html",
         "aeromatch show WORK DJI_0001.JPG DJI_0002.JPG --rejected",
+        "aeromatch show WORK DJI_0001.JPG DJI_0002.JPG --out pair.gif",
     ),
     "compare": ("aeromatch compare WORK1 WORK2", "aeromatch compare WORK1 WORK2 --json"),
     "config": ("aeromatch config", "aeromatch config fusion --set extract.keypoints=12000"),
@@ -42,8 +44,17 @@ def show(
         list[str] | None, typer.Argument(metavar="[IMAGE [IMAGE]]", help="One image, or the two of a pair.")
     ] = None,
     rejected: Annotated[bool, typer.Option("--rejected", help="Draw the matches that were dropped, too.")] = False,
+    views: Annotated[
+        bool, typer.Option("--views", help="Of an image: also its enhanced picture, masks and views.")
+    ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE.png", help="Picture (default: in the folder WORK/show).")
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="FILE.png (default: in the folder WORK/show), FILE.html, or of a pair FILE.gif, which lays one image "
+            "on the other in turns.",
+        ),
     ] = None,
     json_: Json = False,
     quiet: Quiet = False,
@@ -53,6 +64,7 @@ def show(
     def call() -> Result:
         from aeromatch_cli.config import Settings
         from aeromatch_cli.report.show import show as shown
+        from aeromatch_cli.report.tiles import SUFFIXES
         from aeromatch_cli.stages.run import Result
 
         names = images or []
@@ -63,9 +75,10 @@ def show(
             root, names = Path(given), [str(path), *names]
         if len(names) > 2:
             raise ConfigError(f"{len(names)} images: name one, or the two of a pair")
-        if out is not None and out.suffix.lower() != ".png":
-            raise ConfigError(f"--out {out}: the picture is a PNG, name it FILE.png")
-        found = shown(root, names, out, rejected=rejected)
+        wanted = SUFFIXES if len(names) == 2 else SUFFIXES[:2]
+        if out is not None and out.suffix.lower() not in wanted:
+            raise ConfigError(f"--out {out}: name it {' or '.join(f'FILE{suffix}' for suffix in wanted)}")
+        found = shown(root, names, out, rejected=rejected, views=views)
         return Result(tuple(found.lines), found.facts)
 
     guarded(call, "show", quiet=quiet, as_json=json_, log_file=None, context=context)

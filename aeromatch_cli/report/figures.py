@@ -115,7 +115,7 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     """Bars over about 24 equal classes with rounded limits. values: at least one. unit: what they count, a plural."""
     from matplotlib.ticker import MaxNLocator
 
-    axes = new_axes(7.0, 2.7, margins={"left": 0.085, "right": 0.965, "bottom": 0.2, "top": 0.96})
+    axes = new_axes(7.0, 2.7, margins={"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96})
     locator = MaxNLocator(24, steps=[1, 2, 5, 10], integer=True)
     edges = np.asarray(locator.tick_values(0, max(values) + 1))
     counts, _ = np.histogram(values, edges)

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
-from aeromatch_cli.data import Camera
+from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
 from aeromatch_cli.report.pair_viewer import drawable, pair_data
+from aeromatch_cli.report.places import ground_figures, point_figures
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
@@ -87,6 +89,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
+    adjusted = _adjusted_block(context)
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context, drawable(shown))
     drawn, keys = pair_data(context, shown, pictures)
@@ -105,6 +108,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         residuals=(_facts(context, "adjust").get("control") or {}).get("residuals", {}),
         block=_block_facts(context),
         map=_map(context, images, pairs, wrong, pictures),
+        fields=_ground_figures(context, adjusted),
         histograms=[
             histogram(counts, f"verified matches per {words}", unit)
             for counts, words, unit in (
@@ -112,7 +116,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
                 ([row.verified_matches for row in images], "image", "images"),
             )
             if any(counts)
-        ],
+        ]
+        + point_figures(adjusted),
         evaluation=evaluation_figures(context.workspace),
         previews=previews(context, pairs),
         error_limits_px=ERROR_LIMITS_PX,
@@ -303,6 +308,18 @@ def _metres(errors_m: Sequence[float]) -> str:
 def _settings_text(context: Context) -> str:
     path = context.workspace.config
     return path.read_text(encoding="utf-8") if path.is_file() else dump(context.settings)
+
+
+def _adjusted_block(context: Context) -> AdjustedBlock | None:
+    """Of the last adjustment; None where it found no points."""
+    known = _facts(context, "adjust").get("points") and context.workspace.adjusted.is_file()
+    return read_adjusted(context.workspace.adjusted) if known else None
+
+
+def _ground_figures(context: Context, adjusted: AdjustedBlock | None) -> list[tuple[str, str]]:
+    footprints = [footprint.polygon_m for footprint in block_footprints(context.block).values()]
+    centers = np.array([pose.center_m[:2] for pose in context.block.poses.values()]).reshape(-1, 2)
+    return ground_figures(centers[np.isfinite(centers).all(axis=1)], footprints, adjusted)
 
 
 def _map(

@@ -29,7 +29,7 @@ def image_picture(pixels: NDArray[Any], keypoints_px: FloatArray, matched: BoolA
     """RGB picture with every keypoint (K, 2), matched ones (K,) green and above the others."""
     import cv2
 
-    picture, ratio = _small(pixels)
+    picture, ratio = small(pixels)
     places = (np.asarray(keypoints_px, np.float64) + 0.5) * ratio - 0.5
     for chosen, colour in ((~matched, _RED), (matched, _GREEN)):
         for x, y in places[chosen]:
@@ -46,7 +46,7 @@ def pair_picture(
     """Both images side by side with matches (M, 2) each, by error (M,); dropped_px: red, below the others."""
     import cv2
 
-    sides = [_small(one) for one in pixels]
+    sides = [small(one) for one in pixels]
     offset = sides[0][0].shape[1] + _GAP_PX
     height = max(picture.shape[0] for picture, _ in sides)
     whole = np.full((height, offset + sides[1][0].shape[1], 3), 255, np.uint8)
@@ -74,8 +74,8 @@ def pair_picture(
     return whole
 
 
-def _small(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], FloatArray]:
-    """RGB picture of at most _SIDE_PX, and its pixels per stored pixel in x and y."""
+def small(pixels: NDArray[Any]) -> tuple[NDArray[np.uint8], FloatArray]:
+    """RGB picture (h, w, 3) of at most _SIDE_PX, and its pixels per stored pixel in x and y."""
     height, width = pixels.shape[:2]
     small = to_colour8(shrink(pixels, min(1.0, _SIDE_PX / max(width, height))))
     if small.ndim == 2:

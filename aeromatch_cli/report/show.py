@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.config import load
+from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
 from aeromatch_cli.formats.features import read_keypoints
@@ -20,10 +20,12 @@ from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verif
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
-from aeromatch_cli.report.pictures import image_picture, pair_picture, write_picture
+from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import STAGE_ORDER
+from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.workspace import Workspace, read_json
 
@@ -72,9 +74,15 @@ class _Work:
         return read_pairs(self.workspace.pairs) if self.workspace.pairs.is_file() else []
 
     @cached_property
+    def settings(self) -> Settings:
+        """Those of the last run, in this folder."""
+        found = load(str(self.workspace.config))
+        return found.model_copy(update={"workspace": str(self.workspace.root)})
+
+    @cached_property
     def folder(self) -> Path:
         """Of the images."""
-        return Path(load(str(self.workspace.config)).block.images)
+        return Path(self.settings.block.images)
 
     def image(self, text: str) -> Image:
         """By name, file name, stem or id. Raises ConfigError where none or several fit."""
@@ -102,8 +110,11 @@ class _Work:
         return None if found is None else FinalEntries(self.workspace)(pair.image_id0, found)
 
 
-def show(path: Path, names: Sequence[str], out: Path | None = None, *, rejected: bool = False) -> Shown:
-    """A file, or a workspace with up to two of its images. rejected: draw the matches that were dropped, too.
+def show(
+    path: Path, names: Sequence[str], out: Path | None = None, *, rejected: bool = False, views: bool = False
+) -> Shown:
+    """A file, or a workspace with up to two of its images. rejected: draw the matches that were dropped, too. views: of
+    an image also its enhanced picture, masks and views. out: a .png, .html or, of a pair, .gif.
 
     Raises ConfigError or InputError where there is no such thing.
     """
@@ -115,7 +126,7 @@ def show(path: Path, names: Sequence[str], out: Path | None = None, *, rejected:
     if not names:
         return _workspace(work)
     if len(names) == 1:
-        return _image(work, work.image(names[0]), out)
+        return _image(work, work.image(names[0]), out, views=views)
     first, second = sorted((work.image(name) for name in names), key=lambda image: image.image_id)
     if first.image_id == second.image_id:
         raise ConfigError(f"both names mean the image {first.name}: a pair has two")
@@ -147,7 +158,7 @@ def _workspace(work: _Work) -> Shown:
     return Shown(lines, {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)})
 
 
-def _image(work: _Work, image: Image, out: Path | None) -> Shown:
+def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown:
     workspace, image_id = work.workspace, image.image_id
     camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
@@ -175,8 +186,13 @@ def _image(work: _Work, image: Image, out: Path | None) -> Shown:
         if path.exists():
             lines.append(f"{what:<11} {path}")
     target = out or workspace.root / "show" / f"{image_id}.png"
-    write_picture(target, image_picture(read_pixels(work.folder / image.name, colour=True), keypoints, matched))
-    lines.append(f"picture     {target}: keypoints in verified matches green, others red")
+    picture = image_picture(read_pixels(work.folder / image.name, colour=True), keypoints, matched)
+    tiles = [Tile("keypoints: in verified matches green, others red", picture)]
+    if views:
+        tiles += tiles_of_image(steps_of_image(work.settings, image_id))
+    write_tiles(target, tiles, lines, image.name)
+    also = f"; {', '.join(tile.title for tile in tiles[1:])}" if views else ""
+    lines.append(f"picture     {target}: keypoints in verified matches green, others red{also}")
     partners = {name: count for count, name, *_ in rows}
     facts = {"image": image.name, "keypoints": len(keypoints), "partners": partners, "picture": str(target)}
     return Shown(lines, facts, target)
@@ -227,8 +243,16 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
     pixels = [read_pixels(work.folder / image.name, colour=True) for image in (image0, image1)]
     target = out or workspace.root / "show" / f"{ids[0]}--{ids[1]}.png"
-    write_picture(target, pair_picture(pixels, points, errors, dropped))
-    lines.append(f"picture     {target}: green to yellow by error{', dropped ones red' if dropped is not None else ''}")
+    words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
+    tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, errors, dropped))]
+    if target.suffix.lower() != ".png":
+        laid = aligned(pixels, points)
+        if laid is None and target.suffix.lower() == ".gif":
+            raise InputError(f"{image0.name} and {image1.name} have too few matches to lay them on each other")
+        tiles += [laid] if laid is not None else []
+        words = tiles[-1].title if target.suffix.lower() == ".gif" else f"{words}; {tiles[-1].title}"
+    write_tiles(target, tiles, lines, f"{image0.name} and {image1.name}")
+    lines.append(f"picture     {target}: {words}")
     facts = {"pair": [image0.name, image1.name], "verified": count, "state": verdict.state, "picture": str(target)}
     return Shown(lines, facts, target)
 

@@ -1,0 +1,147 @@
+"""Figures of the ground: how many images show a place, how many points lie there; and of the points: their errors, and
+how many images see them. No disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
+from aeromatch_cli.report.figures import COLOURS, histogram, new_axes, svg
+
+# Cells along the longer side of the ground: of the overlap count, and of the points, which are fewer.
+_FINE, _COARSE = 160, 40
+# A place that so many images show should have so many points.
+_WELL_SEEN, _FEW_POINTS = 3, 3
+_MORE_IMAGES = 10
+_WIDTH_IN, _HEIGHTS_IN = 7.0, (3.2, 7.0)
+_LARGEST_ERROR = 0.99  # quantile
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What is drawn of the world: corners (2,) in metres."""
+
+    low_m: FloatArray
+    high_m: FloatArray
+
+    @classmethod
+    def of(cls, centers_m: FloatArray, footprints: Sequence[FloatArray]) -> Ground:
+        """Cameras (N, 2) and half a footprint around them: views of the horizon would shrink all else."""
+        size = float(np.median([np.ptp(polygon, axis=0).max() for polygon in footprints]))
+        return cls(centers_m.min(axis=0) - 0.5 * size, centers_m.max(axis=0) + 0.5 * size)
+
+    def cells(self, longest: int) -> tuple[int, int]:
+        """Columns and rows."""
+        extent = self.high_m - self.low_m
+        columns, rows = np.maximum(np.rint(longest * extent / extent.max()), 1).astype(int)
+        return int(columns), int(rows)
+
+    def shown_by(self, footprints: Sequence[FloatArray], longest: int) -> IntArray:
+        """(rows, columns) of how many footprints hold the middle of a cell; row 0 in the south."""
+        import cv2
+
+        columns, rows = self.cells(longest)
+        count = np.zeros((rows, columns), np.int64)
+        scale = (columns, rows) / (self.high_m - self.low_m)
+        for polygon in footprints:
+            corners = (np.asarray(polygon, np.float64)[:, :2] - self.low_m) * scale - 0.5
+            inside = np.zeros((rows, columns), np.uint8)
+            # Far beyond the drawing OpenCV's fixed-point corners would overflow.
+            bounded = np.clip(corners, -20.0 * longest, 20.0 * longest)
+            cv2.fillPoly(inside, [np.rint(bounded * 256.0).astype(np.int32)], 1, shift=8)
+            count += inside
+        return count
+
+
+def ground_figures(
+    centers_m: FloatArray, footprints: Sequence[FloatArray], adjusted: AdjustedBlock | None
+) -> list[tuple[str, str]]:
+    """(SVG, remark) of the overlap count and, of an adjusted block, of its points per place. centers_m: (N, 2)."""
+    if not footprints or not len(centers_m):
+        return []
+    ground = Ground.of(centers_m, footprints)
+    count = ground.shown_by(footprints, _FINE)
+    seen = count > 0
+    share = 100.0 * (count >= _WELL_SEEN).sum() / max(1, seen.sum())
+    label = f"images that show a place ({_MORE_IMAGES}: or more)"
+    words = f"Three images and more show {share:.0f} % of the ground."
+    figures = [(_field(ground, np.minimum(count, _MORE_IMAGES), seen, label), words)]
+    if adjusted is not None and len(adjusted.points_m):
+        figures.append(_points_figure(ground, footprints, adjusted.points_m))
+    return figures
+
+
+def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: FloatArray) -> tuple[str, str]:
+    columns, rows = ground.cells(_COARSE)
+    edges = [np.linspace(ground.low_m[k], ground.high_m[k], n + 1) for k, n in enumerate((columns, rows))]
+    points = np.histogram2d(points_m[:, 1], points_m[:, 0], bins=(edges[1], edges[0]))[0]
+    well_seen = ground.shown_by(footprints, _COARSE) >= _WELL_SEEN
+    weak = well_seen & (points < _FEW_POINTS)
+    label = "points of the adjusted block per place, logarithmic"
+    share = 100.0 * weak.sum() / max(1, well_seen.sum())
+    words = (
+        f"Red: {weak.sum():,} of {well_seen.sum():,} places that three images and more show have fewer than "
+        f"{_FEW_POINTS} points ({share:.0f} %)."
+    )
+    return _field(ground, points, points > 0, label, weak), words
+
+
+def _field(ground: Ground, values: FloatArray, known: BoolArray, label: str, marked: BoolArray | None = None) -> str:
+    """Values (rows, columns) in colours where they are known; marked cells red."""
+    from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, Normalize
+
+    extent_m = ground.high_m - ground.low_m
+    height = float(np.clip(_WIDTH_IN * 0.8 * extent_m[1] / extent_m[0], *_HEIGHTS_IN))
+    axes = new_axes(_WIDTH_IN, height)
+    largest = float(values.max(initial=1.0))
+    logarithmic = marked is not None
+    norm = LogNorm(1.0, max(largest, 2.0)) if logarithmic else Normalize(0.0, max(largest, 1.0))
+    colours = [COLOURS[f"k{k}"] for k in range(6)]
+    scale = LinearSegmentedColormap.from_list("matches", colours)
+    where = {"extent": (ground.low_m[0], ground.high_m[0], ground.low_m[1], ground.high_m[1]), "origin": "lower"}
+    drawn = axes.imshow(np.ma.masked_where(~known, values), cmap=scale, norm=norm, interpolation="none", **where)
+    if marked is not None and marked.any():
+        red = ListedColormap([COLOURS["bad"]])
+        axes.imshow(np.ma.masked_where(~marked, marked.astype(float)), cmap=red, interpolation="none", **where)
+    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, pad=0.02)
+    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
+    axes.set_title(label, fontsize=10)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.grid(visible=False)
+    return svg(axes.figure, label, "field", {})
+
+
+def point_figures(adjusted: AdjustedBlock | None) -> list[str]:
+    """Of the points of an adjusted block: reprojection errors, and images per point."""
+    if adjusted is None or not len(adjusted.points_m):
+        return []
+    seen = np.zeros(len(adjusted.points_m), np.int64)
+    for track in adjusted.tracks.values():
+        seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
+    return [_errors_figure(adjusted.errors_px), histogram(seen.tolist(), "images that see a point", "points")]
+
+
+def _errors_figure(errors_px: FloatArray) -> str:
+    axes: Any = new_axes(7.0, 2.7, margins={"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96})
+    errors = errors_px[np.isfinite(errors_px)]
+    largest = max(float(np.quantile(errors, _LARGEST_ERROR)) if len(errors) else 1.0, 0.1)
+    counts, edges = np.histogram(np.minimum(errors, largest), 24, (0.0, largest))
+    bars = axes.bar(
+        edges[:-1], counts, 0.94 * (edges[1] - edges[0]), align="edge", color=COLOURS["accent"], linewidth=0
+    )
+    for bar in bars:
+        bar.set_gid("bar")
+    axes.set(
+        xlim=(0.0, largest), xlabel="mean reprojection error of a point, px (the last bar: and more)", ylabel="points"
+    )
+    axes.grid(visible=False, axis="x")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    titles = [
+        f"{low:.2f} to {high:.2f} px: {count:,} points"
+        for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
+    ]
+    return svg(axes.figure, "reprojection errors", "histogram", {"bar": titles})

@@ -1,0 +1,54 @@
+"""The report's figures of the ground, against footprints and points whose counts are known by construction."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.report.places import Ground, ground_figures, point_figures
+
+SQUARE = np.array([[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]])
+EAST, NORTH = np.array([50.0, 0.0]), np.array([0.0, 60.0])
+
+
+def block(points_m: np.ndarray, tracks: dict[str, np.ndarray], errors_px: np.ndarray) -> AdjustedBlock:
+    return AdjustedBlock({}, {}, points_m, errors_px, tracks)
+
+
+def test_overlap_counts_are_those_of_the_footprints() -> None:
+    """Three squares of 100 m, each 50 m further east: one, two, two and one of them see a column of 50 m."""
+    footprints = [SQUARE, SQUARE + EAST, SQUARE + 2.0 * EAST]
+    ground = Ground(np.array([0.0, 0.0]), np.array([200.0, 100.0]))
+    count = ground.shown_by(footprints, 40)
+    assert count.shape == (20, 40)
+    middles = count[10, [5, 15, 25, 35]]
+    assert middles.tolist() == [1, 2, 2, 1]
+    whole = ground.shown_by([SQUARE, SQUARE, SQUARE + NORTH], 40)
+    assert (whole[2, 10], whole[18, 10]) == (2, 3)  # row 0 lies in the south
+
+
+def test_places_that_lack_points_are_counted() -> None:
+    """Three footprints show the same square; points lie in its western half alone."""
+    rng = np.random.default_rng(3)
+    points = np.column_stack([rng.uniform(0, 50, 20000), rng.uniform(0, 100, 20000), np.zeros(20000)])
+    centers = np.array([[40.0, 50.0], [50.0, 50.0], [60.0, 50.0]])
+    found = ground_figures(centers, [SQUARE] * 3, block(points, {}, np.zeros(20000)))
+    assert len(found) == 2
+    assert found[0][1] == "Three images and more show 100 % of the ground."
+    share = re.search(r"\((\d+) %\)", found[1][1])
+    assert share is not None
+    assert 45 <= int(share[1]) <= 55
+    assert all(svg.startswith("<svg") and "<image" in svg for svg, _ in found)
+    assert ground_figures(centers, [], None) == []
+    assert len(ground_figures(centers, [SQUARE], None)) == 1
+
+
+def test_points_are_counted_by_the_images_that_see_them_and_by_their_error() -> None:
+    tracks = {name: np.array([[0, 0], [1, 1]]) for name in "abc"} | {"d": np.array([[0, 0]])}
+    found = point_figures(block(np.zeros((2, 3)), tracks, np.array([0.2, 0.4])))
+    assert "4 to 4: 1 point<" in found[1]
+    assert "3 to 3: 1 point<" in found[1]
+    assert sum(int(n) for n in re.findall(r"px: (\d+) points", found[0])) == 2
+    assert point_figures(None) == []
