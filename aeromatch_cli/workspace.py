@@ -38,6 +38,10 @@ class Workspace:
     features_of: Workspace | None = None
 
     @property
+    def lock(self) -> Path:
+        return self.root / ".lock"
+
+    @property
     def config(self) -> Path:
         return self.root / "config.yaml"
 
@@ -149,6 +153,43 @@ class Workspace:
                 f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
                 "use the version that wrote it, or choose another --workspace"
             )
+
+
+@contextlib.contextmanager
+def locked(workspace: Workspace, command: str, *, shared: bool) -> Iterator[None]:
+    """Holds a workspace for one command; shared: shards hold it together. A process that ends, or is killed, lets go.
+
+    Raises WorkspaceError where another command holds it. Where the system or the folder knows no locks (Windows, some
+    network file systems), nothing is held.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    path = workspace.lock
+    with translated_os_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        stream = path.open("a+", encoding="utf-8")
+    with stream:
+        try:
+            fcntl.flock(stream, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            stream.seek(0)
+            holder = stream.read().strip() or "another command"
+            raise WorkspaceError(
+                f"workspace {workspace.root} is in use by {holder}: wait until it ends, or choose another --workspace"
+            ) from None
+        except OSError:
+            yield
+            return
+        stream.truncate(0)
+        stream.write(f"`aeromatch {command}`, process {os.getpid()} on {socket.gethostname()}\n")
+        stream.flush()
+        try:
+            yield
+        finally:
+            stream.truncate(0)
 
 
 def _host() -> str:

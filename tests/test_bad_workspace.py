@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
-from conftest import IMAGES, contents
+from conftest import IMAGES, Site, contents
 
 from aeromatch_cli import workspace as workspace_module
 from aeromatch_cli.workspace import read_json
@@ -82,3 +85,24 @@ def test_workspace_inside_the_images_folder(site):
     assert other.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
     outcome = site("run", "--workspace", site.images)
     assert (outcome.code, "choose another --workspace" in outcome.stderr) == (2, True)
+
+
+@pytest.mark.slow
+def test_a_second_command_on_a_workspace_is_refused_until_the_first_ends(done_site: Site, tmp_path: Path) -> None:
+    """A process that holds the workspace, and is killed: the kernel lets go."""
+    holder = tmp_path / "hold.py"
+    holder.write_text(
+        "import sys, time\nfrom pathlib import Path\nfrom aeromatch_cli.workspace import Workspace, locked\n"
+        "with locked(Workspace(Path(sys.argv[1])), 'match', shared=sys.argv[2] == 'shard'):\n"
+        "    print('held', flush=True)\n    time.sleep(600)\n"
+    )
+    for kind, others in (("whole", (3, 3)), ("shard", (3, 0))):
+        command = [sys.executable, str(holder), str(done_site.work), kind]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "held\n"
+            found = done_site("filter"), done_site("filter", "--shard", "1/2")
+            process.kill()
+        assert tuple(outcome.code for outcome in found) == others
+        assert f"is in use by `aeromatch match`, process {process.pid} on " in found[0].stderr
+        assert done_site("filter").code == 0

@@ -10,6 +10,7 @@ from make_images import write_image
 from numpy.typing import NDArray
 from PIL import Image as Picture
 
+from aeromatch_cli.blocks.exif import exif_or_reason
 from aeromatch_cli.data import Camera, FloatArray, Pose, View
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import distort, normalise, project, undistort
@@ -417,3 +418,28 @@ def test_strips_make_the_same_reduced_picture(scale, monkeypatch):
     # An area filter in two steps is a little wider than one in one.
     off = (found - wanted[:height, :width])[1:-1, 1:-1]
     assert off.std() < (0.2 * wanted.std() if scale == 0.07 else 1e-3)
+
+
+def _claiming(path: Path, width: int, height: int) -> Path:
+    """A PNG of some bytes whose header states a size."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b""))
+    return path
+
+
+def test_a_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    path = _claiming(tmp_path / "bomb.png", 60_000, 60_000)
+    with pytest.raises(ItemError, match="has 3,600 megapixels; more than 1,074 are not decoded"):
+        read_pixels(path, colour=False)
+    assert "3,600 megapixels" in str(exif_or_reason(path))
+    with pytest.raises(ItemError, match="3,600 megapixels"):
+        read_mask(path, 40, 30)
+    # A mapping camera's frame is no such thing: it is cut off, and the decoder says so.
+    with pytest.raises(ItemError, match="cannot decode"):
+        read_pixels(_claiming(tmp_path / "large.png", 26_460, 17_004), colour=False)

@@ -27,6 +27,7 @@ from aeromatch_cli.blocks.xmp import (
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import tiff
+from aeromatch_cli.images.tiff import check_pixels
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
@@ -94,6 +95,7 @@ def read_exif(path: Path) -> ExifFacts:
     width_px, height_px = header.size_px
     if width_px < 1 or height_px < 1:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
+    check_pixels(path, width_px, height_px)
     tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)

@@ -211,6 +211,11 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 `stage`, `item`, `reason`: every image or pair that failed.
 
+### .lock
+
+Held by the command that works on the workspace (shards hold it together), and empty where none does. The system lets go
+of it when a process ends, however it ends.
+
 ### report/index.html
 
 The page that a person looks at; one file that needs no network.

@@ -66,6 +66,7 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
     import cv2
 
+    _check_size(path)
     try:
         data = path.read_bytes()
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
@@ -76,6 +77,21 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     if fault := _jpeg_fault(data):
         raise ItemError(f"image {path} is {fault}")
     return np.asarray(pixels)
+
+
+def _check_size(path: Path) -> None:
+    """Raises ItemError for a picture that is too large to decode, by its header: a file of some kilobytes may claim
+    any size."""
+    from PIL import Image
+
+    # Pillow's own guard refuses a mapping camera's frame; nothing is decoded here.
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        with Image.open(path) as picture:
+            width, height = picture.size
+    except (OSError, ValueError, SyntaxError):
+        return  # the decoder says what is wrong with it
+    tiff.check_pixels(path, width, height)
 
 
 def _jpeg_fault(data: bytes) -> str:

@@ -15,6 +15,17 @@ from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
 
 SUFFIXES = frozenset({".tif", ".tiff"})
+# OpenCV decodes no more (CV_IO_MAX_IMAGE_PIXELS). The largest aerial cameras have half as many.
+MAX_PIXELS = 1 << 30
+
+
+def check_pixels(path: Path, width_px: int, height_px: int) -> None:
+    """Raises ItemError for a picture that is too large to decode: a file of some kilobytes may claim any size."""
+    if width_px * height_px > MAX_PIXELS:
+        raise ItemError(
+            f"image {path} has {width_px * height_px / 1e6:,.0f} megapixels; more than {MAX_PIXELS / 1e6:,.0f} are not "
+            "decoded: cut it into parts, or reduce it"
+        )
 
 
 def tiff_size(path: Path) -> tuple[int, int]:
@@ -30,6 +41,8 @@ def read_tiff(path: Path, part: tuple[int, int, int, int] | None = None) -> tupl
     first of two; a band of transparency is none of them. Raises ItemError.
     """
     with _opened(path) as source:
+        if part is None:
+            check_pixels(path, source.width, source.height)
         window = None if part is None else ((part[1], part[1] + part[3]), (part[0], part[0] + part[2]))
         extra = _transparency(source)
         shown = [index for index in source.indexes if index != extra]

@@ -32,6 +32,7 @@ from aeromatch_cli.orientation.adjusting import (
 from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import quiet_pycolmap
 from aeromatch_cli.orientation.results import arrays, figures, image_numbers, sigmas_of, tracks_of
+from aeromatch_cli.orientation.spread import take_poses, thinned
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
 _WORTH_AGAIN = 0.1
@@ -173,19 +174,27 @@ def _refined(
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
-        before = model.compute_mean_reprojection_error()
+        thin = thinned(model)
+        moved = model if thin is None else thin
+        moved.update_point_3d_errors()
+        before = moved.compute_mean_reprojection_error()
         given = positions_m, sigmas_m
         if kind == "positions":
-            placement = adjusted(pycolmap, model, cameras, *given, observed["ups"], _COST_TOLERANCE, work.held)
+            placement = adjusted(pycolmap, moved, cameras, *given, observed["ups"], _COST_TOLERANCE, work.held)
             level_deg, factor = placement.level_sigma_deg, placement.sigma_factor
-            used = [i for i, agrees in zip(image_numbers(model), placement.agreeing, strict=True) if agrees]
+            used = [i for i, agrees in zip(image_numbers(moved), placement.agreeing, strict=True) if agrees]
         else:
-            used = adjust_in_place(pycolmap, model, cameras, *given, attitudes, _COST_TOLERANCE, work.held)
-        model.update_point_3d_errors()
-        made_roughly = number == 0 and _found(kind)
-        if not made_roughly and model.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before:
+            used = adjust_in_place(pycolmap, moved, cameras, *given, attitudes, _COST_TOLERANCE, work.held)
+        moved.update_point_3d_errors()
+        settled = moved.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before
+        settled = settled and not (number == 0 and _found(kind))
+        if settled and thin is None:
             break
+        if thin is not None:
+            take_poses(model, thin)
         model = _triangulated(pycolmap, model, work.folder, rough=False)
+        if settled:
+            break
     unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
     # Precision rests on these. An adjustment bends a weak block to its positions: that they fit shows nothing better.
     sigmas_m = max(factor, 1.0) * sigmas_m

@@ -37,7 +37,7 @@ from aeromatch_cli.workspace import (
     write_text,
 )
 
-VERSION = 15
+VERSION = 16
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.

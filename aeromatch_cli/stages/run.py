@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.workspace import Workspace, read_json, remove_stale_temporaries, translated_os_errors
+from aeromatch_cli.workspace import Workspace, locked, read_json, remove_stale_temporaries, translated_os_errors
 
 log = logging.getLogger("aeromatch")
 
@@ -78,14 +79,17 @@ def execute(
     part = Shard.parse(shard) if shard else None
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
-    try:
-        with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
-            return _repairing(command, settings, executor, part, overwrite, _Said(say))
-    except BaseException:
-        # Workers are stopped in the middle of what they write.
-        if command != "check":
-            remove_stale_temporaries(Path(settings.workspace))
-        raise
+    with ExitStack() as stack:
+        if command != "check" and Path(settings.block.images or ".").is_dir():
+            stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
+        try:
+            with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
+                return _repairing(command, settings, executor, part, overwrite, _Said(say))
+        except BaseException:
+            # Workers are stopped in the middle of what they write.
+            if command != "check":
+                remove_stale_temporaries(Path(settings.workspace))
+            raise
 
 
 class _Said:
