@@ -173,6 +173,12 @@ class Executor:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         self.close(cancel=error is not None)
 
+    def limit(self, jobs: int) -> None:
+        """At most so many workers from now on. The others end."""
+        if jobs < self.jobs:
+            self.close()
+            self.jobs = jobs
+
     def close(self, *, cancel: bool = False) -> None:
         if self._pool is not None:
             workers = list((getattr(self._pool, "_processes", None) or {}).values())

@@ -168,6 +168,17 @@ Jobs = Annotated[
         help="Worker processes (default 0: one per core).",
     ),
 ]
+Memory = Annotated[
+    str | None,
+    typer.Option(
+        "--memory",
+        metavar="8GB",
+        envvar="AEROMATCH_MEMORY",
+        show_envvar=False,
+        rich_help_panel=_WORK,
+        help="Memory for all workers together; fewer run side by side where it needs that (default: no limit).",
+    ),
+]
 ExecutorName = Annotated[
     str | None,
     typer.Option(

@@ -23,6 +23,7 @@ from aeromatch_cli.cli.options import (
     LogFile,
     Masks,
     MaxSize,
+    Memory,
     Overwrite,
     PoseFormat,
     Poses,
@@ -143,6 +144,7 @@ def stage_command(name: str) -> Callable[..., None]:
         set_: Set = None,
         max_size: MaxSize = None,
         jobs: Jobs = None,
+        memory: Memory = None,
         executor: ExecutorName = None,
         shard: ShardText = None,
         overwrite: Overwrite = False,
@@ -153,7 +155,7 @@ def stage_command(name: str) -> Callable[..., None]:
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
         block |= {"pose_format": pose_format, "masks": masks, "gcp": gcp, "max_size_px": max_size}
-        run = {"jobs": jobs, "executor": executor, "keep_images": keep_images or None}
+        run = {"jobs": jobs, "memory": memory, "executor": executor, "keep_images": keep_images or None}
 
         def call() -> Result:
             from aeromatch_cli.config import load

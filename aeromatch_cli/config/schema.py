@@ -122,6 +122,11 @@ class RunSettings(_Section):
         description="Where tasks run: in this process, in worker processes, or on a dask cluster (extra `cluster`).",
     )
     jobs: int = Field(0, ge=0, description="Number of worker processes; 0 = one per core. Larger: faster, more memory.")
+    memory: str = Field(
+        "",
+        description="Memory that all workers together may use, such as 8GB: fewer of them run side by side where they "
+        "would need more. Empty: no limit.",
+    )
     keep_images: bool = Field(False, description="Also keep enhanced and simulated pictures in the workspace.")
 
 

@@ -16,17 +16,13 @@ from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
+from aeromatch_cli.stages.memory import worker_mb
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.strategies.orienters import FirstPass
 
-# Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per pixel of the source or of its views
-# together, whichever are more: a view of a turned or tilted image is larger than the image.
-_BASE_MB = 350.0
-_BYTES_PER_PIXEL = 12.0
-_TILE_MB = 700.0
 _BYTES_PER_DESCRIPTOR = 170.0
 _BYTES_PER_MATCH = 60.0
 # How many pairs are tried, and how much smaller the picture is with which a worker gets ready.
@@ -222,8 +218,6 @@ def _estimate(
     seconds_pair = _mean([tried.seconds for tried in pairs])
     descriptors = max((len(tried.features.descriptors) for tried in images.values() if tried.features), default=0)
     matches = _mean([tried.matches for tried in pairs])
-    megapixels = largest_px / 1e6
-    memory_mb = _BASE_MB + _BYTES_PER_PIXEL * megapixels + min(_TILE_MB, _TILE_MB * megapixels / 4.0)
     disk = count * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
     # Workers start side by side; the pairs of one image are one task.
     starts = sum(max((tried.start_s for tried in group), default=0.0) for group in (images.values(), pairs))
@@ -236,7 +230,7 @@ def _estimate(
         "seconds_per_image": round(seconds_image, 3) if images else None,
         "seconds_per_pair": round(seconds_pair, 4),
         "seconds": round(seconds, 1) if images else None,
-        "memory_mb": round(memory_mb * jobs),
+        "memory_mb": round(worker_mb(largest_px / 1e6) * jobs),
         "disk_mb": round(disk / 1e6, 1),
         "disk_free_mb": round(shutil.disk_usage(_existing(context.workspace.root)).free / 1e6),
     }

@@ -18,6 +18,7 @@ from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import orientation_lines
+from aeromatch_cli.stages.memory import budget_mb, jobs_within
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
@@ -57,7 +58,7 @@ def prepare(
     given_lines = [*([f"poses            {found.recognised}"] if found.recognised else []), *as_given.given_lines()]
     for line in given_lines:
         say(line)
-    known = [*found.warnings, *as_given.warnings]
+    known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.block)]
     for warning in known:
         log.warning("warning: %s", warning)
     given = _context(settings, workspace, executor, found, shard, overwrite)
@@ -116,6 +117,17 @@ def _with_ground(context: Context, found: BlockRead) -> Context:
     return replace(context, block=with_gsd(block, found.gsd_before_m))
 
 
+def _within_memory(settings: Settings, executor: Executor, block: Block) -> list[str]:
+    """Fewer workers where the memory budget asks for that, and what is said of it."""
+    budget = budget_mb(settings.run.memory)
+    if budget is None or executor.kind == "serial":
+        return []
+    network = settings.extract.name == "learned" or bool(settings.cascade)
+    jobs, remark = jobs_within(budget, executor.jobs, block.images, network=network)
+    executor.limit(jobs)
+    return [remark] if remark else []
+
+
 def _context(
     settings: Settings,
     workspace: Workspace,
@@ -146,6 +158,7 @@ def _check_settings(settings: Settings) -> None:
     """Raise ConfigError for strategies that do not go together, and for files that they need (weights, pair lists):
     now, and not after hours of extraction.
     """
+    budget_mb(settings.run.memory)
     if isinstance(settings.pairs, Similar) and not isinstance(settings.orient, FirstPass):
         raise ConfigError(
             "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "

@@ -1,0 +1,57 @@
+"""Memory: what a worker needs for the images of a block, and how many workers a budget allows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from aeromatch_cli.data import Image
+from aeromatch_cli.errors import ConfigError
+
+# Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per pixel of the source or of its views
+# together, whichever are more: a view of a turned or tilted image is larger than the image.
+_BASE_MB = 350.0
+_BYTES_PER_PIXEL = 12.0
+_TILE_MB = 700.0
+_TILE_MEGAPIXELS = 4.0
+# PyTorch and the layers of a network.
+_NETWORK_MB = 900.0
+# This process itself, with the block and the rows that it gathers.
+_PARENT_MB = 400.0
+_UNITS = {"MB": 1.0, "GB": 1e3, "MIB": 1.048576, "GIB": 1073.741824, "M": 1.0, "G": 1e3}
+
+
+def worker_mb(megapixels: float, *, network: bool = False) -> float:
+    """Peak of one worker. megapixels: of the image, or of all its views, whichever are more."""
+    tile = min(_TILE_MB, _TILE_MB * megapixels / _TILE_MEGAPIXELS)
+    return _BASE_MB + _BYTES_PER_PIXEL * megapixels + tile + (_NETWORK_MB if network else 0.0)
+
+
+def budget_mb(text: str) -> float | None:
+    """Megabytes of "8GB", "512MB", "8 GiB"; None for no budget. Raises ConfigError."""
+    if not text.strip():
+        return None
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", text)
+    unit = _UNITS.get(match[2].upper()) if match else None
+    if match is None or unit is None or not float(match[1]) > 0.0:
+        raise ConfigError(f"memory {text!r}: write a number with its unit, such as 8GB or 6000MB")
+    return float(match[1]) * unit
+
+
+def jobs_within(budget: float, jobs: int, images: Iterable[Image], *, network: bool) -> tuple[int, str]:
+    """How many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer."""
+    largest = max(images, key=lambda image: image.width_px * image.height_px, default=None)
+    if largest is None:
+        return jobs, ""
+    megapixels = largest.width_px * largest.height_px / 1e6
+    need = worker_mb(megapixels, network=network)
+    most = int((budget - _PARENT_MB) / need)
+    if most >= jobs:
+        return jobs, ""
+    each = f"each needs about {need:.0f} MB for images of {megapixels:.0f} megapixels"
+    if most >= 1:
+        return most, f"memory: {most} of {jobs} workers, as {each}"
+    return 1, (
+        f"memory: one worker needs about {need:.0f} MB for images of {megapixels:.0f} megapixels, and this program "
+        f"{_PARENT_MB:.0f} MB; {budget:.0f} MB may not do: give more, or smaller images"
+    )

@@ -1,0 +1,61 @@
+"""The memory budget: how many workers it allows, and what is said."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import Site
+
+from aeromatch_cli.data import Image
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.stages.memory import budget_mb, jobs_within, worker_mb
+
+
+def image(width: int, height: int) -> Image:
+    return Image("a", "a.jpg", width, height, "1")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("8GB", 8000.0), ("512 MB", 512.0), ("1GiB", 1073.741824), ("2.5g", 2500.0), ("", None)]
+)
+def test_budgets_are_read(text: str, expected: float | None) -> None:
+    assert budget_mb(text) == expected
+
+
+@pytest.mark.parametrize("text", ["8", "GB", "-1GB", "0GB", "8TBB"])
+def test_budgets_that_are_none(text: str) -> None:
+    with pytest.raises(ConfigError, match="write a number with its unit, such as 8GB"):
+        budget_mb(text)
+
+
+def test_workers_fit_the_budget() -> None:
+    """12 megapixels need 350 + 144 + 700 MB: three workers and the program itself fit into 4 GB."""
+    assert worker_mb(12.0) == pytest.approx(1194.0)
+    jobs, remark = jobs_within(4000.0, 8, [image(4000, 3000), image(40, 30)], network=False)
+    assert jobs == 3
+    assert remark == "memory: 3 of 8 workers, as each needs about 1194 MB for images of 12 megapixels"
+    assert jobs_within(64000.0, 8, [image(4000, 3000)], network=False) == (8, "")
+    assert jobs_within(64000.0, 8, [], network=False) == (8, "")
+    assert jobs_within(4000.0, 8, [image(4000, 3000)], network=True)[0] == 1
+    jobs, remark = jobs_within(1000.0, 8, [image(12000, 9000)], network=False)
+    assert jobs == 1
+    assert "give more, or smaller images" in remark
+
+
+def test_an_executor_keeps_to_its_limit() -> None:
+    with Executor("processes", 3) as executor:
+        assert len(executor.run(abs, [-1, -2, -3], "count")) == 3
+        executor.limit(1)
+        executor.limit(2)  # no more than before
+        assert executor.jobs == 1
+        assert [outcome.value for outcome in executor.run(abs, [-1, -2], "count")] == [1, 2]
+
+
+@pytest.mark.slow
+def test_a_run_says_how_many_workers_it_uses(site: Site) -> None:
+    told = site("pairs", "--jobs", "4", "--memory", "1200MB", "--executor", "processes")
+    assert told.code == 0
+    assert "memory: 2 of 4 workers" in told.stderr
+    wrong = site("pairs", "--memory", "8")
+    assert wrong.code == 2
+    assert "such as 8GB" in wrong.stderr
