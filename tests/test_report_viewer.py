@@ -108,7 +108,7 @@ def test_a_browser_draws_the_pair_that_the_address_names(full: Context, tmp_path
     page_of(replace(full))
     address = full.workspace.report.resolve().as_uri()
     drawn = {}
-    for key in ("", "#pair=0,2"):
+    for key in ("", "#pair=b.jpg,a.png"):
         command = [
             str(BROWSER),
             "--headless",
@@ -121,6 +121,6 @@ def test_a_browser_draws_the_pair_that_the_address_names(full: Context, tmp_path
         assert "CONSOLE" not in done.stderr  # neither an error of a script nor a refused resource
         drawn[key] = done.stdout.split('<dialog id="pair-viewer"')[1].split("</dialog>")[0]
     assert drawn[""].count('class="tie') == 0
-    assert drawn["#pair=0,2"].startswith(' open=""')
-    assert drawn["#pair=0,2"].count('class="tie e1"') == 60
-    assert "60 of 80 matches verified, 60 drawn; verified" in drawn["#pair=0,2"]
+    assert drawn["#pair=b.jpg,a.png"].startswith(' open=""')
+    assert drawn["#pair=b.jpg,a.png"].count('class="tie e1"') == 60
+    assert "60 of 80 matches verified, 60 drawn; verified" in drawn["#pair=b.jpg,a.png"]

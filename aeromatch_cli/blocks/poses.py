@@ -18,9 +18,9 @@ Beside x y or lat lon, a height under another name (altitude, ellipsoidal height
 heights above ground (relative_altitude, agl) are refused.
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
-header behind # is accepted); a decimal comma is accepted where the separator is another. A line whose horizontal
-coordinates are empty or NaN leaves its image without pose and is reported; heights may be empty or missing, see
-`observations.oriented`; every other defect is a ConfigError.
+header behind # is accepted); a decimal comma is accepted where the separator is another, or in quotes. A line whose
+horizontal coordinates are empty or NaN leaves its image without pose and is reported; heights may be empty or missing,
+see `observations.oriented`; every other defect is a ConfigError.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def read_poses(path: Path) -> PoseList:
         if row.image in lines_of:
             raise ConfigError(
                 f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
-                "keep one of the two lines"
+                "keep one of the two lines, or write the paths relative to the images folder"
             )
         lines_of[row.image] = number
         rows.append(row)
@@ -319,10 +319,9 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     image = re.sub(r"^(\./)+", "", record["image"].replace("\\", "/"))
     if not image:
         raise ConfigError(f"{path}, line {number}, column image: empty: name the image")
-    decimal_comma = layout.separator != ","
 
     def numbers(names: tuple[str, ...]) -> tuple[float | None, ...]:
-        return tuple(_number(path, number, name, record[name], decimal_comma) for name in names)
+        return tuple(_number(path, number, name, record[name]) for name in names)
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
     axes = [numbers((name,))[0] for name in _AXIS_SIGMAS if name in record]
@@ -364,15 +363,16 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         camera=record.get("camera", ""),
         sigma_position_m=sigmas[0],
         sigma_angle_deg=sigmas[1],
+        numbered=image.isdigit(),
     )
 
 
-def _number(path: Path, line: int, column: str, cell: str, decimal_comma: bool) -> float | None:
+def _number(path: Path, line: int, column: str, cell: str) -> float | None:
     """The value of a cell, None where it is empty or NaN. Raises ConfigError where it is no number or out of range."""
     where = f"{path}, line {line}, column {column}"
     if cell.lower() in _BLANKS:
         return None
-    if decimal_comma and cell.count(",") == 1 and "." not in cell:
+    if cell.count(",") == 1 and "." not in cell:  # beside commas as separators it stands in quotes
         cell = cell.replace(",", ".")
     try:
         value = float(cell)

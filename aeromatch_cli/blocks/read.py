@@ -185,7 +185,10 @@ def block_inputs(
 def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object]) -> str:
     if lists.pose_list is None:
         return ""
-    return f"{lists.pose_list.format}: {len(rows)} of {len(headers)} images"
+    own = lists.pose_list.cameras if lists.cameras == EXIF and lists.camera_file is None else {}
+    with_camera = sum(row.camera in own for row in rows.values())
+    cameras = f", {with_camera} with its camera" if with_camera else ""
+    return f"{lists.pose_list.format}: {len(rows)} of {len(headers)} images{cameras}"
 
 
 def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: Mapping[str, str]) -> tuple[Image, ...]:
@@ -251,7 +254,7 @@ def _cameras_of_poses(
         {**others.cameras, **found.cameras},
         {**others.camera_ids, **found.camera_ids},
         others.reasons,
-        (f"cameras of the pose file are used for {len(found.camera_ids)} of {len(facts)} images", *others.warnings),
+        others.warnings,
         {**others.focal_sigmas, **found.focal_sigmas},
     )
 

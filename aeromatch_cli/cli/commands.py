@@ -37,7 +37,15 @@ _FLIGHTS = "nadir, oblique, sweep, orbit, two-flights, mixed"
 
 def evaluate(
     context: typer.Context,
-    work: Annotated[Path, typer.Argument(metavar="WORK", help="Workspace that `aeromatch run` wrote.")],
+    work: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WORK",
+            envvar="AEROMATCH_WORKSPACE",
+            show_envvar=False,
+            help="Workspace that `aeromatch run` wrote.",
+        ),
+    ],
     truth: Annotated[
         Path,
         typer.Option(

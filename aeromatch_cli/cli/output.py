@@ -52,7 +52,7 @@ def guarded(
         facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet)
         record.info("exit code %d after %.1f s", facts["exit_code"], time.monotonic() - started)
     if as_json:
-        _printed(json.dumps(_finite(facts), allow_nan=False))
+        printed(json.dumps(_finite(facts), allow_nan=False))
     if facts["exit_code"]:
         raise typer.Exit(int(facts["exit_code"]))
 
@@ -66,19 +66,19 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
     try:
         result = call()
     except AeromatchError as error:
-        typer.echo(f"error: {error}", err=True)
+        printed(f"error: {error}", err=True)
         record.error("error: %s", error)
         record.debug("stopped by", exc_info=True)
         return {"error": str(error), "exit_code": error.exit_code}
     except KeyboardInterrupt:
         _forget_interrupt()
-        typer.echo("interrupted; run the same command again to resume", err=True)
+        printed("interrupted; run the same command again to resume", err=True)
         record.error("interrupted")
         return {"error": "interrupted", "exit_code": EXIT_INTERRUPTED}
     except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
         frame = traceback.extract_tb(error.__traceback__)[-1]
         text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
-        typer.echo(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
+        printed(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
         record.error("error: %s", text, exc_info=True)
         return {"error": text, "exit_code": AeromatchError.exit_code}
     say = said(quiet)
@@ -93,17 +93,17 @@ def said(quiet: bool) -> Callable[[str], None]:
     def say(line: str) -> None:
         record.info("%s", line)
         if not quiet:
-            _printed(line)
+            printed(line)
 
     return say
 
 
-def _printed(line: str) -> None:
-    """To stdout. Where its reader has left (`| head`), the work goes on and nothing more is said."""
+def printed(line: str, *, err: bool = False) -> None:
+    """To stdout or stderr. Where its reader has left (`| head`), the work goes on and nothing more is said."""
     try:
-        typer.echo(line)
+        typer.echo(line, err=err)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), (sys.stderr if err else sys.stdout).fileno())
 
 
 def _finite(value: Any) -> Any:

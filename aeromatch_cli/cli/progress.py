@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import typer
+from aeromatch_cli.cli.output import printed
 
 if TYPE_CHECKING:
     from aeromatch_cli.executor import Progress
@@ -96,7 +96,7 @@ class LineProgress:
             left = (time.monotonic() - self._started) / self._count * (self._total - self._count)
             whole = self._course.left_s(self._count / max(self._total, 1))
             end = "" if whole is None else f"; about {_words(whole)} to the end"
-            typer.echo(f"{self._label}: {percent} % ({self._count}/{self._total}), {_words(left)} left{end}", err=True)
+            printed(f"{self._label}: {percent} % ({self._count}/{self._total}), {_words(left)} left{end}", err=True)
 
     def stop(self) -> None:
         """Nothing to clean up."""

@@ -12,6 +12,7 @@ from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.blocks.pose_files.source import Source
+from aeromatch_cli.blocks.poses import read_poses
 from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.config.faults import nearest
 from aeromatch_cli.config.load import differences_of_preset, preset_names
@@ -129,6 +130,17 @@ def _pose_files(images: Path) -> Iterator[tuple[Path, str]]:
                 if known.recognises is not None and known.recognises(source):
                     yield path, known.title
                     break
+            else:
+                if path.suffix.lower() in (".csv", ".txt") and _names_columns(path):
+                    yield path, POSE_FORMATS["columns"].title
+
+
+def _names_columns(path: Path) -> bool:
+    """Whether it is a list whose first line names an image and a position."""
+    try:
+        return bool(read_poses(path).rows)
+    except ConfigError:
+        return False
 
 
 def _camera_files(images: Path) -> Iterator[Path]:

@@ -89,6 +89,7 @@ def refine(folder: Path) -> None:
             work = _Work(pycolmap, folder, task["cameras"], frozenset(lenses))
             model, observed = _refined(work, model, group["kind"], observed, attitudes)
         model.update_point_3d_errors()
+        _once_per_image(model)
         _drop_weak_points(model)
         drop_weak_images(model)
         if not image_numbers(model):
@@ -254,6 +255,24 @@ def _weak_images(model: Any) -> set[int]:
         if len(seen) > 2:
             strong.update(seen)
     return {number for number in image_numbers(model) if strong[number] < _FEW_OBSERVATIONS}
+
+
+def _once_per_image(model: Any) -> None:
+    """Of two keypoints of an image that see one point the nearer to its projection stays: merged tracks have both."""
+    for number, point in list(model.points3D.items()):
+        images = [element.image_id for element in point.track.elements]
+        if len(set(images)) == len(images):
+            continue
+        off: dict[int, list[tuple[float, int]]] = {}
+        for element in point.track.elements:
+            image = model.images[element.image_id]
+            seen = image.project_point(point.xyz)
+            apart = np.inf if seen is None else float(np.linalg.norm(image.points2D[element.point2D_idx].xy - seen))
+            off.setdefault(element.image_id, []).append((apart, element.point2D_idx))
+        for image_id, places in off.items():
+            for _, keypoint in sorted(places)[1:]:
+                if number in model.points3D:
+                    model.delete_observation(image_id, keypoint)
 
 
 def _drop_weak_points(model: Any) -> None:

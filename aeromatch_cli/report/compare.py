@@ -14,6 +14,7 @@ from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER
 from aeromatch_cli.report.show import opened
+from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.workspace import read_json
 
@@ -38,7 +39,11 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
     one, two = _side(first), _side(second)
     lines = [f"first       {first}", f"second      {second}"]
     apart = differing(one.settings, two.settings)
-    changed = [f"{key}: {old} and {new}" for key, old, new in apart if key.partition(".")[0] not in _OUTWARD]
+    changed = [
+        f"{key}: {said_value(old)} and {said_value(new)}"
+        for key, old, new in apart
+        if key.partition(".")[0] not in _OUTWARD
+    ]
     lines += [f"setting     {words}" for words in changed] or ["settings    the same"]
     lines.append(_counts("images", len(one.images), len(two.images)))
     for words, names in (

@@ -89,7 +89,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
-    adjusted = _adjusted_block(context)
+    # Without a verified pair what is on file is of other keypoints.
+    adjusted = _adjusted_block(context) if any(row.state == "verified" for row in pairs) else None
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context, drawable(shown))
     drawn, keys = pair_data(context, shown, pictures)
@@ -219,7 +220,10 @@ def notices(
             found.append(Notice("warn", title, text, items))
     lost = sum(row.state == NOT_JUDGED for row in pairs)
     if lost:
-        text = "No matches on file: the match stage failed there or has not run."
+        text = (
+            "No matches of the present keypoints are on file: the match stage failed there, or keypoints were found "
+            "again since. Run aeromatch match and then aeromatch filter, or aeromatch run."
+        )
         found.append(Notice("warn", _counted(lost, "pair was not judged", "pairs were not judged"), text))
     return found
 

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
-from aeromatch_cli.report.figures import COLOURS, histogram, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, new_axes, svg
 
-# Cells along the longer side of the ground: of the overlap count, and of the points, which are fewer.
-_FINE, _COARSE = 160, 40
-# A place that so many images show should have so many points.
-_WELL_SEEN, _FEW_POINTS = 3, 3
+# Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
+_FINE, _COARSE = 160, (6, 40)
+# A place that so many images show should have so many points; on average it has as many times more.
+_WELL_SEEN, _FEW_POINTS, _AVERAGE = 3, 3, 5.0
 _MORE_IMAGES = 10
 _WIDTH_IN, _HEIGHTS_IN = 7.0, (3.2, 7.0)
 _LARGEST_ERROR = 0.99  # quantile
+_MANY_IMAGES = 20
+_MARGINS = {"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96}
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,11 @@ def ground_figures(
 
 
 def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: FloatArray) -> tuple[str, str]:
-    columns, rows = ground.cells(_COARSE)
+    longest = int(np.clip(np.sqrt(len(points_m) / (_FEW_POINTS * _AVERAGE)), *_COARSE))
+    columns, rows = ground.cells(longest)
     edges = [np.linspace(ground.low_m[k], ground.high_m[k], n + 1) for k, n in enumerate((columns, rows))]
     points = np.histogram2d(points_m[:, 1], points_m[:, 0], bins=(edges[1], edges[0]))[0]
-    well_seen = ground.shown_by(footprints, _COARSE) >= _WELL_SEEN
+    well_seen = ground.shown_by(footprints, longest) >= _WELL_SEEN
     weak = well_seen & (points < _FEW_POINTS)
     label = "points of the adjusted block per place, logarithmic"
     share = 100.0 * weak.sum() / max(1, well_seen.sum())
@@ -107,7 +110,10 @@ def _field(ground: Ground, values: FloatArray, known: BoolArray, label: str, mar
     if marked is not None and marked.any():
         red = ListedColormap([COLOURS["bad"]])
         axes.imshow(np.ma.masked_where(~marked, marked.astype(float)), cmap=red, interpolation="none", **where)
-    axes.figure.colorbar(drawn, ax=axes, shrink=0.85, pad=0.02)
+    bar = axes.figure.colorbar(drawn, ax=axes, shrink=0.85, pad=0.02)
+    if logarithmic:
+        bar.ax.yaxis.set_major_formatter("{x:,.0f}")
+        bar.ax.yaxis.set_minor_formatter("")
     axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
     axes.set_title(label, fontsize=10)
     axes.ticklabel_format(useOffset=False, style="plain")
@@ -122,11 +128,25 @@ def point_figures(adjusted: AdjustedBlock | None) -> list[str]:
     seen = np.zeros(len(adjusted.points_m), np.int64)
     for track in adjusted.tracks.values():
         seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
-    return [_errors_figure(adjusted.errors_px), histogram(seen.tolist(), "images that see a point", "points")]
+    return [_errors_figure(adjusted.errors_px), _images_figure(seen)]
+
+
+def _images_figure(seen: IntArray) -> str:
+    """Points by the number of images that see them."""
+    numbers, counts = np.unique(np.minimum(seen, _MANY_IMAGES), return_counts=True)
+    axes: Any = new_axes(7.0, 2.7, margins=_MARGINS)
+    for bar in axes.bar(numbers, counts, 0.9, color=COLOURS["accent"], linewidth=0):
+        bar.set_gid("bar")
+    label = f"images that see a point ({_MANY_IMAGES}: or more)"
+    axes.set(xlabel=label, ylabel="points", xticks=range(int(numbers[0]), int(numbers[-1]) + 1))
+    axes.grid(visible=False, axis="x")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    titles = [f"{number} images: {count:,} points" for number, count in zip(numbers, counts, strict=True)]
+    return svg(axes.figure, "images that see a point", "histogram", {"bar": titles})
 
 
 def _errors_figure(errors_px: FloatArray) -> str:
-    axes: Any = new_axes(7.0, 2.7, margins={"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96})
+    axes: Any = new_axes(7.0, 2.7, margins=_MARGINS)
     errors = errors_px[np.isfinite(errors_px)]
     largest = max(float(np.quantile(errors, _LARGEST_ERROR)) if len(errors) else 1.0, 0.1)
     counts, edges = np.histogram(np.minimum(errors, largest), 24, (0.0, largest))

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import Settings, load
-from aeromatch_cli.data import Camera, FloatArray, Image, Pair, Pose
+from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
+from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
@@ -26,11 +27,13 @@ from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tile
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
-from aeromatch_cli.stages.rows import check_features
+from aeromatch_cli.stages.rows import check_features, stale_image
 from aeromatch_cli.workspace import Workspace, read_json
 
 # Partners that are listed one by one.
 _LISTED = 30
+# Pairs that are looked at to tell whether matches are of the present keypoints.
+_TRIED = 50
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,11 @@ class _Work:
     @cached_property
     def pairs(self) -> list[Pair]:
         return read_pairs(self.workspace.pairs) if self.workspace.pairs.is_file() else []
+
+    @cached_property
+    def adjusted(self) -> AdjustedBlock | None:
+        """Of the last adjustment."""
+        return read_adjusted(self.workspace.adjusted) if self.workspace.adjusted.is_file() else None
 
     @cached_property
     def settings(self) -> Settings:
@@ -124,6 +132,8 @@ def show(
         return Shown(list(_file_lines(path)), {"file": str(path)})
     work = _Work(path)
     if not names:
+        if out is not None or views or rejected:
+            raise ConfigError("a workspace as a whole has no picture: name an image, or the two of a pair")
         return _workspace(work)
     if len(names) == 1:
         return _image(work, work.image(names[0]), out, views=views)
@@ -152,10 +162,22 @@ def _workspace(work: _Work) -> Shown:
     written = set(stages.get("export", {}).get("facts", {}))
     folders = sorted(workspace.export("x").parent.glob("[!.]*"))
     lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
+    if stale := _stale(work):
+        lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")
     return Shown(lines, {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)})
+
+
+def _stale(work: _Work) -> str:
+    """An image whose matches point into keypoints that are gone, "" where there is none among some pairs."""
+    every = max(1, len(work.pairs) // _TRIED)
+    for pair in work.pairs[::every]:
+        entry = read_verified_row(work.workspace.verified(pair.image_id0)).get(pair.image_id1)
+        if entry is not None and (image_id := stale_image(work.workspace, pair.image_id0, entry)):
+            return work.images[image_id].name
+    return ""
 
 
 def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown:
@@ -163,7 +185,13 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
     lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in camera.params)}")
-    lines += [f"pose        {words}" for words in _pose_words(pose, read_json(workspace.block)["origin_m"])]
+    origin_m = read_json(workspace.block)["origin_m"]
+    adjusted = work.adjusted.poses.get(image_id) if work.adjusted is not None else None
+    lines += [f"pose        {words}" for words in _pose_words(pose, origin_m)]
+    if adjusted is not None:
+        sigmas = float(np.mean(adjusted.sigmas_m)), float(np.mean(adjusted.sigmas_deg))
+        known = Pose(adjusted.center_m, adjusted.rotation, *sigmas)
+        lines += [f"adjusted    {words}" for words in _pose_words(known, origin_m)]
     keypoints = work.keypoints_px(image_id)
     rows = []
     matched = np.zeros(len(keypoints), dtype=bool)

@@ -24,7 +24,7 @@ from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 from aeromatch_cli.workspace import (
@@ -221,10 +221,13 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
         else 0 for image in context.block.images
     }  # fmt: skip
     usual = float(np.median(list(keypoints.values())))
+    unread = {item: why for stage, item, why in gather_failures(context.workspace) if stage == "extract"}
     reasons = {}
     for image_id in outside:
         count = keypoints[image_id]
-        if count <= _FEW_KEYPOINTS * usual:
+        if image_id in unread:
+            reasons[image_id] = f"no features: {unread[image_id]}"
+        elif count <= _FEW_KEYPOINTS * usual:
             reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: no texture, or blurred"
         elif not pairs[image_id]:
             reasons[image_id] = "in no pair: it overlaps no other image"

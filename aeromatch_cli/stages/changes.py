@@ -47,7 +47,7 @@ def changed_words(config: Path, settings: Settings) -> str:
     ]
     if not changed:
         return ""
-    named = ", ".join(f"{key} {_said(old)} -> {_said(new)}" for key, old, new in changed[:_NAMED])
+    named = ", ".join(f"{key} {said_value(old)} -> {said_value(new)}" for key, old, new in changed[:_NAMED])
     more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
     first = min((_FIRST_STAGE[_section(key)] for key, *_ in changed), key=_ORDER.index)
     return f"{named}{more}: what depends on it is made again, from {first} on"
@@ -62,7 +62,7 @@ def _resolved(value: Any) -> Any:
     return str(Path(value).resolve()) if isinstance(value, str) and "/" in value and Path(value).exists() else value
 
 
-def _said(value: Any) -> str:
+def said_value(value: Any) -> str:
     """A value as the command line writes it; steps and filters by their names."""
     if value is None:
         return "-"

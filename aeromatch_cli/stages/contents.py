@@ -28,7 +28,7 @@ def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
     if not pairs:
         raise InputError(
             "no pair is matched and filtered with the present settings and inputs; "
-            "run `aeromatch filter` first (`aeromatch run` does everything), and see failures.csv"
+            "run `aeromatch match` and then `aeromatch filter` (`aeromatch run` does everything), and see failures.csv"
         )
     return replace(context, pairs=tuple(pairs)), outdated
 

@@ -70,7 +70,8 @@ def prepare(
     if pairs is not None:
         report.items = report.skipped = len(pairs)
     else:
-        pairs = settings.pairs(context.block)
+        with executor.step("pairs"):
+            pairs = settings.pairs(context.block)
         report.items = report.done = len(pairs)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     oriented_lines = orientation_lines(oriented.facts, found.block, context.block)

@@ -187,7 +187,11 @@ def _run_all(context: Context) -> list[StageReport]:
             report.run(context)
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
         reports += [adjust.run(context), consistency.run(context), export.run(context)]
-        reports.append(_current_page(context) or report.run(context))
+        page = _current_page(context)
+        if page is None:
+            with context.executor.step("report"):
+                page = report.run(context)
+        reports.append(page)
     return reports
 
 
@@ -265,5 +269,7 @@ def _check(context: Context, oriented: StageReport, first: StageReport, said: _S
     found = check.run(context, time.perf_counter() - first.started, oriented=settled)
     lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
+    for _, item, reason in failures:
+        log.error("failed: %s: %s", item, reason)
     facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
-    return Result((*lines, *(f"failed: {item}: {reason}" for _, item, reason in failures)), facts, failures)
+    return Result(tuple(lines), facts, failures)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.lenses import Nearest, of_colmap
-from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, numbers, rotation_row
+from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, numbers, rotation_row, world_beside
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import from_quaternion
@@ -46,7 +47,15 @@ def read_model(source: Source) -> PoseList:
     if not rows:
         raise ConfigError(f"{images.path}: the model has no image")
     known = f", {len(cameras.found)} cameras" if cameras.found else ""
-    return PoseList(rows, "grid", tuple(cameras.remarks), f"COLMAP {images.path.name}{known}", None, cameras.found)
+    crs, origin_m = world_beside(source)  # of a model that this program has exported
+    if crs is not None:
+        rows = tuple(
+            replace(row, position=(row.position[0] + origin_m[0], row.position[1] + origin_m[1],
+                                   row.position[2] + origin_m[2]))
+            for row in rows if row.position is not None
+        )  # fmt: skip
+        known += f", {crs} by world.json"
+    return PoseList(rows, "grid", tuple(cameras.remarks), f"COLMAP {images.path.name}{known}", crs, cameras.found)
 
 
 def _text_rows(source: Source, cameras: CameraShelf) -> Iterator[PoseRow]:

@@ -24,6 +24,8 @@ def described_crs(where: str, text: str) -> tuple[str | None, PositionKind]:
     if code.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
         return None, "grid"
     crs = _crs(where, code)
+    if crs.is_bound:  # a CRS that is written with its shift to WGS84 (TOWGS84)
+        crs = crs.source_crs
     if crs.is_geographic:
         return None, "geographic"
     if crs.is_geocentric:

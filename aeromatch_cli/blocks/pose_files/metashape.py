@@ -30,6 +30,7 @@ from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
+_ACCURACIES = ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y", "accuracy_x/y/z", "accuracy")
 # Geocentric coordinates of a place on the ground, and of nothing else.
 _EARTH_M = (6.2e6, 6.6e6)
 
@@ -70,8 +71,15 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
     words += ["/".join(angles)] if any(row.attitude for row in rows) else ["positions"]
-    remarks = (f"{source.path.name}: {disabled} cameras are not enabled there; they are used",) if disabled else ()
-    return PoseList(tuple(rows), kind or "grid", remarks, f"Metashape reference, {', '.join(words)}{system}", crs)
+    remarks = [f"{source.path.name}: {disabled} cameras are not enabled there; they are used"] if disabled else []
+    if 0 < used_estimated < len(rows):
+        remarks.append(
+            f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
+            "the given one is used"
+        )
+    return PoseList(
+        tuple(rows), kind or "grid", tuple(remarks), f"Metashape reference, {', '.join(words)}{system}", crs
+    )
 
 
 def _column(cell: str) -> str:
@@ -107,8 +115,8 @@ def _row(
     (x, y, z), from_estimate = triple(("x", "y", "z"))
     attitude, _ = triple(angles)
     whole = all(math.isfinite(v) for v in attitude)
-    sigmas = [v for name in ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y") if (v := value(name)) > 0.0]
-    turns = [v for name in angles if (v := value(f"accuracy_{name}")) > 0.0]
+    sigmas = [v for name in _ACCURACIES if (v := value(name)) > 0.0]
+    turns = [v for name in (*angles, "/".join(angles)) if (v := value(f"accuracy_{name}")) > 0.0]
     kind: PositionKind = "geographic" if geographic else "grid"
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,

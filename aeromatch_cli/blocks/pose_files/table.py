@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, cells_of, is_number
+from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, cells_of, is_number, world_beside
 from aeromatch_cli.blocks.poses import PoseList, read_poses
 from aeromatch_cli.errors import ConfigError
 
@@ -38,7 +38,11 @@ class PoseFormat:
 
 
 def _named_columns(source: Source) -> PoseList:
-    return read_poses(source.path)
+    """orientation.csv of this program counts in the CRS that its neighbours name."""
+    found = read_poses(source.path)
+    crs, _ = world_beside(source)
+    own = source.name == "orientation.csv" and found.position_kind == "grid" and crs is not None
+    return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else found
 
 
 # In the order in which they are tried: those that nothing else looks like first.
@@ -141,7 +145,7 @@ def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
             f"pose list {path} is {kind} of a kind that is not read: docs/input.md lists those that are; a CSV whose "
             "first line names the columns always is"
         )
-    return read_poses(path)
+    return _named_columns(source)
 
 
 def _by_content(source: Source) -> str:
@@ -172,7 +176,7 @@ def _checked(source: Source, found: PoseList) -> PoseList:
         if row.image in lines:
             raise ConfigError(
                 f"{source.path}, line {row.line}, column image: {row.image!r} stands in line {lines[row.image]} "
-                "already: keep one of the two lines"
+                "already: keep one of the two lines, or write the paths relative to the images folder"
             )
         lines[row.image] = row.line
     return found

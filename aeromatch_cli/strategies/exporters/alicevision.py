@@ -26,7 +26,7 @@ class AliceVision(Strategy):
     """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat, matches/0.matches.txt and world.json (CRS
     and origin that poses count from)."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["alicevision"] = "alicevision"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -78,7 +78,8 @@ def _sfm(solution: Solution, views: dict[str, int]) -> dict[str, Any]:
 def _intrinsic(camera: Camera) -> dict[str, Any]:
     """Brown's model by a focal length in millimetres of a sensor 36 mm wide."""
     values, sensor_mm = parameters(camera), 36.0
-    middle = (camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0
+    # AliceVision adds half the size to it, in the frame of the features.
+    middle = camera.width_px / 2.0, camera.height_px / 2.0
     return {
         "width": str(camera.width_px), "height": str(camera.height_px), "sensorWidth": f"{sensor_mm}",
         "sensorHeight": f"{sensor_mm * camera.height_px / camera.width_px:.15g}", "type": "brown",

@@ -5,6 +5,7 @@ The table layer_styles holds their styles, as QGIS keeps them in a database.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -100,9 +101,11 @@ def _writer() -> Any:
         if not geometries:  # without ground there are no footprints
             return
         columns = [np.array(values, dtype=object if isinstance(values[0], str) else None) for values in fields.values()]
-        raw.write(
-            str(path), np.array([to_wkb(one) for one in geometries], dtype=object), columns, list(fields), layer=layer,
-            driver="GPKG", geometry_type=kind, crs=crs, append=path.exists(),
-        )  # fmt: skip
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*crs.*was not provided", UserWarning)  # a local block has none
+            raw.write(
+                str(path), np.array([to_wkb(one) for one in geometries], dtype=object), columns, list(fields),
+                layer=layer, driver="GPKG", geometry_type=kind, crs=crs, append=path.exists(),
+            )  # fmt: skip
 
     return write_layer

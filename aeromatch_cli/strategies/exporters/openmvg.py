@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
@@ -32,14 +32,13 @@ class OpenMvg(Strategy):
     name: Literal["openmvg"] = "openmvg"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, or two images have one name without suffix."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where two images have one name without
+        suffix."""
         solution = Solution.of(contents)
         stems = [PurePosixPath(image.name).stem for image in solution.images]
         if len(set(stems)) < len(stems):
             twice = next(stem for stem in stems if stems.count(stem) > 1)
-            raise WorkspaceError(
-                f"openMVG names features by file names, and several images are called {twice}: rename them"
-            )
+            raise ItemError(f"openMVG names features by file names, and several images are called {twice}: rename them")
         numbers = {image.image_id: number for number, image in enumerate(solution.images)}
         with whole_folder(folder) as partial:
             write_world(partial, contents.block)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
-from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary
 
 
@@ -82,7 +81,7 @@ def matched(contents: ExportContents, *, adjusted_tracks: bool = False) -> Match
         rows = [np.column_stack([np.full(len(t), place[i]), t]) for i, t in found.items()]
         table = np.concatenate([np.zeros((0, 3), np.int64), *rows])
         order = np.lexsort((table[:, 1], table[:, 0], table[:, 2]))
-        image_idx, keypoint, track = _once_per_image(contents, table[order], ids).T
+        image_idx, keypoint, track = table[order].T
         return Matched(pairs, ids, track, image_idx, keypoint, contents.adjusted.points_m, counts)
     image_idx, keypoint, track = _joined(pairs, place)
     points = np.full((int(track.max(initial=-1)) + 1, 3), np.nan)
@@ -115,29 +114,6 @@ def _joined(
     _, track = np.unique(label[good], return_inverse=True)
     order = np.lexsort((nodes[good, 0], track))
     return nodes[good, 0][order], nodes[good, 1][order], track[order]
-
-
-def _once_per_image(contents: ExportContents, table: IntArray, ids: Sequence[str]) -> IntArray:
-    """Of rows (image, keypoint, point), sorted by point and image, one for each image and point: where an image has
-    two, the keypoint that lies nearest to the point's projection."""
-    adjusted = contents.adjusted
-    if not len(table) or adjusted is None:
-        return table
-    same = (table[1:, [0, 2]] == table[:-1, [0, 2]]).all(axis=1)
-    twice = np.concatenate([[False], same]) | np.concatenate([same, [False]])
-    off_px = np.zeros(len(table))
-    cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in contents.block.images}
-    for image in np.unique(table[twice, 0]):
-        rows = np.flatnonzero(twice & (table[:, 0] == image))
-        image_id = ids[image]
-        pose, places = adjusted.poses[image_id], np.asarray(contents.keypoints_px(image_id), np.float64)
-        points = adjusted.points_m[table[rows, 2]]
-        seen = project(cameras[image_id], pose.rotation, pose.center_m, points)
-        off_px[rows] = np.nan_to_num(np.linalg.norm(places[table[rows, 1]] - seen, axis=1), nan=np.inf)
-    nearest = np.lexsort((table[:, 1], off_px, table[:, 0], table[:, 2]))
-    ordered = table[nearest]
-    first = np.concatenate([[True], (ordered[1:, [0, 2]] != ordered[:-1, [0, 2]]).any(axis=1)])
-    return ordered[first]
 
 
 def keypoints_of(contents: ExportContents) -> dict[str, FloatArray]:
