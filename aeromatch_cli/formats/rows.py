@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -117,10 +118,18 @@ def _verified_entry(row: _Row, p: int, image_id1: str, fingerprint: str) -> Veri
     return VerifiedEntry(image_id1, fingerprint, int(row["matches_in"][p]), matches, verdict, row.features(p))
 
 
-def row_fingerprints(path: Path) -> dict[str, str]:
-    """image_id1 -> fingerprint of a matches or verified row; empty when absent or broken."""
-    if not path.exists():
+def row_fingerprints(path: Path) -> Mapping[str, str]:
+    """image_id1 -> fingerprint of a matches or verified row; empty when absent or broken. Read once as long as the file
+    is not written again."""
+    try:
+        return _cached_fingerprints(path, path.stat().st_mtime_ns)
+    except FileNotFoundError:
         return {}
+
+
+@lru_cache(maxsize=1 << 16)
+def _cached_fingerprints(path: Path, stamp: int) -> Mapping[str, str]:
+    del stamp  # only tells rewritten files apart
     try:
         arrays = load_arrays(path, ("image_id1", "fingerprint"))
         with readable(path, *ARCHIVE_FAULTS):

@@ -176,8 +176,10 @@ def image_footprint(
     return Footprint(polygon, ground_z, middle, gsd, tilt_deg(pose.world_rotation))
 
 
-def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FACTOR) -> dict[str, Footprint]:
-    """Footprints by image_id of every image that has an attitude and sees ground; empty without a ground."""
+@functools.lru_cache(maxsize=8)
+def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FACTOR) -> Mapping[str, Footprint]:
+    """Footprints by image_id of every image that has an attitude and sees ground; empty without a ground. Made once of
+    a block: ask for it, do not change it."""
     if block.ground is None:
         return {}
     found = {}

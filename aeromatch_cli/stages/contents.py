@@ -23,6 +23,8 @@ _Verified = Callable[[Context], Judged]
 def with_current_pairs(context: Context) -> tuple[Context, list[Pair]]:
     """The context with the pairs whose results are up to date, and the other pairs. InputError where none is left."""
     outdated = outdated_pairs(context)
+    if not outdated and context.pairs:
+        return context, outdated
     absent = {(pair.image_id0, pair.image_id1) for pair in outdated}
     pairs = [p for p in context.pairs if (p.image_id0, p.image_id1) not in absent]
     if not pairs:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,8 @@ class Context:
     # Filled on demand; `dataclasses.replace` starts them anew, so that they never outlive what they were made from.
     known_fingerprints: dict[tuple[str, frozenset[str]], str] = field(default_factory=dict, init=False, repr=False)
     known_tasks: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    # What matches and verdicts of a pair must carry, by what is asked for and the pair.
+    known_pairs: dict[tuple[str, str, str], str] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def observed(self) -> Observed:
@@ -117,14 +119,14 @@ class Context:
     def lacks_attitude(self, image_id: str) -> bool:
         """Whether an image, or one that it is paired with, has no attitude: north-up views of both cannot be
         compared then, the source images can."""
-        ids = (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))
+        ids = (image_id, *(other for other, _ in self._paired.get(image_id, ())))
         poses = [self.pose(i) for i in ids]
         return any(pose is None or pose.world_rotation is None for pose in poses)
 
     def neighbours(self, image_id: str) -> tuple[Neighbour, ...]:
         """Where else the ground of an image is looked at from: the images it is paired with that have an attitude."""
         found = []
-        for other_id, overlap in _paired(self.pairs).get(image_id, ()):
+        for other_id, overlap in self._paired.get(image_id, ()):
             pose = self.pose(other_id)
             if pose is not None and pose.world_rotation is not None:
                 camera = self.block.camera(self.image_by_id[other_id])
@@ -134,11 +136,27 @@ class Context:
     def same_illumination(self, image_id: str, minutes: float) -> bool:
         """Whether an image and all that it is paired with are known to be taken within so many minutes."""
         images = self.image_by_id
-        times = [images[i].time for i in (image_id, *(other for other, _ in _paired(self.pairs).get(image_id, ())))]
+        times = [images[i].time for i in (image_id, *(other for other, _ in self._paired.get(image_id, ())))]
         if minutes <= 0.0 or not all(times):
             return False
         taken, *others = (datetime.fromisoformat(time) for time in times)
         return all(abs((other - taken).total_seconds()) <= 60.0 * minutes for other in others)
+
+    @cached_property
+    def _paired(self) -> Mapping[str, Sequence[tuple[str, float]]]:
+        """image_id -> the other image and the overlap of each of its pairs, in the order of the ids."""
+        found: dict[str, list[tuple[str, float]]] = {}
+        for pair in self.pairs:
+            found.setdefault(pair.image_id0, []).append((pair.image_id1, pair.overlap))
+            found.setdefault(pair.image_id1, []).append((pair.image_id0, pair.overlap))
+        return {image_id: sorted(others) for image_id, others in found.items()}
+
+    def once_per_pair(self, what: str, pair: Pair, make: Callable[[], str]) -> str:
+        """A fingerprint of a pair, made once per command."""
+        key = what, pair.image_id0, pair.image_id1
+        if key not in self.known_pairs:
+            self.known_pairs[key] = make()
+        return self.known_pairs[key]
 
     def geometry_fingerprint(self, image_id: str, needs: frozenset[str]) -> str:
         """What strategies with these `needs` read of one image's geometry."""
@@ -164,16 +182,6 @@ class Context:
                 for n in self.neighbours(image_id)
             ]
         return fingerprint(parts)
-
-
-@lru_cache(maxsize=4)
-def _paired(pairs: tuple[Pair, ...]) -> Mapping[str, Sequence[tuple[str, float]]]:
-    """image_id -> the other image and the overlap of each of its pairs, in the order of the ids."""
-    found: dict[str, list[tuple[str, float]]] = {}
-    for pair in pairs:
-        found.setdefault(pair.image_id0, []).append((pair.image_id1, pair.overlap))
-        found.setdefault(pair.image_id1, []).append((pair.image_id0, pair.overlap))
-    return {image_id: sorted(others) for image_id, others in found.items()}
 
 
 @lru_cache(maxsize=4)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Features, Image
-from aeromatch_cli.formats.features import features_fingerprint, write_features
+from aeromatch_cli.formats.features import known_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.stages import enhance, simulate
@@ -115,14 +115,14 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 
 
 def _is_done(task: ExtractTask) -> bool:
-    if features_fingerprint(task.path) != task.fingerprint:
+    if known_fingerprint(task.path) != task.fingerprint:
         return False
     return not task.keep_images or (enhance.is_done(task.views.enhance) and simulate.is_done(task.views))
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:
     """Those of the images whose features on file are the ones that the present settings and inputs give."""
-    return {i for i in set(image_ids) if features_fingerprint(context.workspace.features(i)) == wanted(context, i)}
+    return {i for i in set(image_ids) if known_fingerprint(context.workspace.features(i)) == wanted(context, i)}
 
 
 def wanted(context: Context, image_id: str) -> str:

@@ -30,7 +30,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
-from aeromatch_cli.workspace import Workspace, fingerprint, stable_hash, write_atomically
+from aeromatch_cli.workspace import Workspace, fingerprint, read_json, stable_hash, write_atomically
 
 # Keypoints (K, 2) of an image, stored pixels, and their colours (K, 3) where the extractor kept them.
 Side = tuple[FloatArray, NDArray[np.uint8] | None]
@@ -66,6 +66,10 @@ def pair_seed(context: Context, pair: Pair) -> int:
 
 def pair_fingerprint(context: Context, pair: Pair) -> str:
     """What the verdict on a pair must carry: the chain, the matches, the geometry that the chain reads, the seed."""
+    return context.once_per_pair("filter", pair, lambda: _pair_fingerprint(context, pair))
+
+
+def _pair_fingerprint(context: Context, pair: Pair) -> str:
     chain = context.settings.filter
     needs = frozenset[str]().union(*(strategy.needs for strategy in chain))
     sides = [context.geometry_fingerprint(i, needs) for i in (pair.image_id0, pair.image_id1)]
@@ -178,9 +182,17 @@ def run(context: Context) -> StageReport:
     report.done = sum(result.done for result in results)
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
-    root = components(context)
-    report.facts = summarise(context, root)
+    report.facts = _facts_on_file(context, report) or summarise(context, components(context))
     return report.write(context.workspace, context.shard)
+
+
+def _facts_on_file(context: Context, report: StageReport) -> dict[str, Any]:
+    """Those of the last run, where nothing was made now and the verdicts are the same ones; else nothing."""
+    last = context.workspace.stage_report(report.stage, context.shard.label if context.shard else "")
+    if report.done or report.failures or context.overwrite or not last.is_file():
+        return {}
+    found = read_json(last)
+    return dict(found["facts"]) if found.get("fingerprint") == report.fingerprint and not found["failed"] else {}
 
 
 def outdated_pairs(context: Context) -> list[Pair]:

@@ -56,6 +56,10 @@ def pair_fingerprint(context: Context, pair: Pair) -> str:
     """What the matches of a pair must carry: matcher, both images' features, and their geometry."""
     if context.union is not None:
         return context.union.matches.get((pair.image_id0, pair.image_id1), "")
+    return context.once_per_pair("match", pair, lambda: _pair_fingerprint(context, pair))
+
+
+def _pair_fingerprint(context: Context, pair: Pair) -> str:
     matcher = matcher_of(context, pair)
     sides = [
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))

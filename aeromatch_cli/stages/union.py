@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches
-from aeromatch_cli.formats.features import features_fingerprint, read_joined, read_keypoints, write_joined
+from aeromatch_cli.formats.features import known_fingerprint, read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
     MatchEntry,
     VerifiedEntry,
@@ -97,7 +97,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
         image_id = image.image_id
         own = [step for step, ready in usable if image_id in ready]
         wanted = context.union.features[image_id]
-        if own and (context.overwrite or features_fingerprint(context.workspace.features(image_id)) != wanted):
+        if own and (context.overwrite or known_fingerprint(context.workspace.features(image_id)) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
