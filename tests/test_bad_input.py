@@ -196,7 +196,7 @@ def test_pose_list_with_defects(site, change, code, words):
         ("", "is empty"),
         ("nothing,of,this\n1,2,3\n", "no header with a column 'image'"),
         ("image,x,y,z\na.jpg,1,2\n", "line 2: 3 values, but the header names 4 columns"),
-        ("image,x,y,height\na.jpg,1,2,3\n", "column 'z' is missing"),
+        ("image,x,y,agl\na.jpg,1,2,3\n", "column 'z' is missing"),
         ("image,x,y,z\n", "no line follows the header"),
         ("\0\0\0", "binary"),
     ],

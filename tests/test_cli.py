@@ -125,7 +125,7 @@ def test_commands_that_need_an_earlier_one_say_so(site):
     outcome = site("filter")
     assert (outcome.code, "run `aeromatch match` first" in outcome.stderr) == (3, True)
     outcome = site("export")
-    assert (outcome.code, "run `aeromatch filter` first" in outcome.stderr) == (3, True)
+    assert (outcome.code, "run `aeromatch match` and then `aeromatch filter`" in outcome.stderr) == (3, True)
     assert not (site.work / "export").exists()
     assert site("match").code == 0
     assert site("filter").code == 0
@@ -147,7 +147,7 @@ def test_outdated_results_are_not_used(done_site):
             assert done_site(command, *options).code == 3
     assert done_site("match", *more).code == 0
     outcome = done_site("export", *more)
-    assert (outcome.code, "run `aeromatch filter` first" in outcome.stderr) == (3, True)
+    assert (outcome.code, "run `aeromatch match` and then `aeromatch filter`" in outcome.stderr) == (3, True)
     assert done_site("filter", *more).code == 0
     assert done_site("export", *more).code == 0
 

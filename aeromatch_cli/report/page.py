@@ -38,7 +38,7 @@ from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import WEAK_MATCHES, components, summarise
+from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import fingerprint, read_json, write_text
@@ -84,7 +84,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     environment.filters["number"] = number
     source = resources.files("aeromatch_cli.report") / "page.html.jinja"
     template = environment.from_string(source.read_text(encoding="utf-8"))
-    facts = summarise(context, components(context, final_pairs), final_pairs)
+    facts = summarise(context, final_pairs)
     wrong = {i: float(angle) for i, angle in _facts(context, "orient").get("wrong_attitudes", {}).items()}
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -181,8 +181,9 @@ def run(context: Context) -> StageReport:
     report.failures.extend(unexplained(context, missing, "match"))
     report.done = sum(result.done for result in results)
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
-    report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
-    report.facts = _facts_on_file(context, report) or summarise(context, components(context))
+    ids = sorted(image.image_id for image in context.block.images)
+    report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs), ids)
+    report.facts = _facts_on_file(context, report) or summarise(context)
     return report.write(context.workspace, context.shard)
 
 
@@ -220,15 +221,15 @@ def verified_pairs(context: Context) -> Judged:
             yield pair, entry
 
 
-def summarise(
-    context: Context, root: Mapping[str, str], verified: Callable[[Context], Judged] = verified_pairs
-) -> dict[str, Any]:
-    """States of the pairs, verified matches, connected components (root: see `components`) and weakly tied images.
+def summarise(context: Context, verified: Callable[[Context], Judged] = verified_pairs) -> dict[str, Any]:
+    """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and weakly tied
+    images.
 
     verified: where the verified matches come from.
     """
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()
+    links: list[tuple[str, str]] = []
     matches = 0
     for pair, entry in verified(context):
         states[entry.verdict.state] += 1
@@ -236,21 +237,19 @@ def summarise(
             count = len(entry.matches.indices)
             matches += count
             ties.update({pair.image_id0: count, pair.image_id1: count})
-    sizes = Counter(root.values())
-    weak = sorted(image.image_id for image in context.block.images if ties[image.image_id] < WEAK_MATCHES)
+            links.append((pair.image_id0, pair.image_id1))
+    ids = [image.image_id for image in context.block.images]
     return {
         "pairs": dict(sorted(states.items())),
         "verified_matches": matches,
-        "components": sorted(sizes.values(), reverse=True),
-        "weakly_tied": weak,
+        "components": sorted(Counter(components(ids, links).values()).values(), reverse=True),
+        "weakly_tied": sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
     }
 
 
-def components(context: Context, verified: Callable[[Context], Judged] = verified_pairs) -> dict[str, str]:
-    """image_id -> the image that stands for all those that verified pairs connect with it. verified: as in
-    `summarise`.
-    """
-    parent = {image.image_id: image.image_id for image in context.block.images}
+def components(ids: Iterable[str], links: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Image -> the image that stands for all those that links connect with it."""
+    parent = {image_id: image_id for image_id in ids}
 
     def root(image_id: str) -> str:
         while parent[image_id] != image_id:
@@ -258,8 +257,7 @@ def components(context: Context, verified: Callable[[Context], Judged] = verifie
             image_id = parent[image_id]
         return image_id
 
-    for pair, entry in verified(context):
-        if entry.verdict.state == "verified":
-            roots = sorted((root(pair.image_id0), root(pair.image_id1)))
-            parent[roots[1]] = roots[0]
+    for id0, id1 in links:
+        first, second = sorted((root(id0), root(id1)))
+        parent[second] = first
     return {image_id: root(image_id) for image_id in parent}

@@ -159,7 +159,7 @@ def _by_content(source: Source) -> str:
         if tree.get("type") == "FeatureCollection":
             return "GeoJSON: export its table as CSV with the image names and the coordinates"
     record = next((line for _, line in source.records()), "")
-    cells = cells_of(record)
+    cells = cells_of(record) or [""]
     if cells[0].lower() == "track" or (len(cells) == 1 and cells[0].startswith("OPENSFM_TRACKS_VERSION")):
         return "a list of tracks, which are tie points: give the poses of the images"
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
