@@ -117,7 +117,7 @@ def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) 
     try:
         size = int(width), int(height)
         values = tuple(float(value) for value in params)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: width, height and params must be numbers ({error})") from error
     if min(size) < 1 or not all(math.isfinite(value) for value in values):
         raise ConfigError(f"{where}: width and height must be positive and all params finite")

@@ -57,7 +57,7 @@ def xmp_properties(packet: Any, notes: list[str]) -> dict[str, str]:
         return {}
     try:
         root = fromstring(packet.strip(b"\0 \r\n\t"))
-    except (ParseError, DefusedXmlException, ValueError):
+    except (ParseError, DefusedXmlException, ValueError, LookupError):
         notes.append("XMP block is malformed")
         return {}
     properties: dict[str, str] = {}

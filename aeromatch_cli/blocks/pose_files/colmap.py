@@ -100,7 +100,7 @@ def _binary_rows(source: Source, cameras: CameraShelf) -> Iterator[PoseRow]:
             (points,) = struct.unpack_from("<Q", raw, end + 1)
             place = end + 9 + 24 * points
             yield _row(source, row, pose, str(camera), name, cameras)
-    except (struct.error, ValueError, UnicodeDecodeError) as error:
+    except (struct.error, ValueError, OverflowError) as error:
         raise ConfigError(f"{source.path}, byte {place}: not COLMAP's images.bin ({error})") from error
 
 
@@ -123,6 +123,6 @@ def _cameras(images: Source) -> CameraShelf:
             place += 8 * _PARAMETERS[model]
             known = _MODEL_IDS.get(model)
             cameras.add(str(identifier), of_colmap(known, width, height, parameters) if known else Nearest(None))
-    except (struct.error, KeyError) as error:
+    except (struct.error, KeyError, ValueError, OverflowError) as error:
         raise ConfigError(f"{found.path}, byte {place}: not COLMAP's cameras.bin ({error!r})") from error
     return cameras

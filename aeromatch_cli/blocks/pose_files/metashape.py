@@ -215,7 +215,7 @@ def _sensor(sensor: Any) -> lenses.Nearest | None:
         size = sensor.find("resolution") if size is None else size
         width, height = int(size.get("width")), int(size.get("height"))
         f = facts["f"]
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         return None
     focal = f + facts.get("b1", 0.0), f
     middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)

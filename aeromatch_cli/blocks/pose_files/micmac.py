@@ -81,7 +81,7 @@ def _lens(calibration: Any) -> Nearest | None:
         center = np.array(principal if model is None else _values(model, ".//CDist", 2))
         radial = [] if model is None else [float(item.text) for item in model.iter("CoeffDist")]
         p1, p2, b1, b2 = (float(calibration.findtext(f".//{name}") or 0.0) for name in ("P1", "P2", "b1", "b2"))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     powers = [term * focal ** (2 * k) for k, term in enumerate(radial, 1)]
     middle = np.array(principal) + 0.5

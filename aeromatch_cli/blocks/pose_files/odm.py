@@ -85,7 +85,7 @@ def read_shots(source: Source) -> PoseList:
             longitude, latitude, height = (float(v) for v in feature["geometry"]["coordinates"][:3])
             rotation = rotation_of_vector(facts["rotation"]) if "rotation" in facts else None
             name = str(facts["filename"])
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise ConfigError(f"{where}: not a shot with filename and coordinates ({error!r})") from error
         if rotation is not None:
             place = np.array([latitude]), np.array([longitude])

@@ -39,7 +39,7 @@ def read_reconstruction(source: Source) -> PoseList:
             try:
                 rotation = rotation_of_vector(shot["rotation"])
                 translation = np.array([float(v) for v in shot["translation"]]).reshape(3)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise ConfigError(
                     f"{source.path}, shot {name!r}: rotation or translation is missing ({error!r})"
                 ) from error
@@ -82,7 +82,7 @@ def _reference(source: Source, part: Any) -> tuple[float, float, float] | None:
         return None
     try:
         values = tuple(float(found[key]) for key in ("latitude", "longitude", "altitude"))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{source.path}: reference_lla lacks latitude, longitude or altitude ({error!r})") from error
     return (values[0], values[1], values[2]) if any(values) else None
 
@@ -104,7 +104,7 @@ def _camera(entry: Any) -> Nearest | None:
         if model == "fisheye":
             f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
             return fisheye((width, height), (f, f), middle, (float(entry["k1"]), float(entry["k2"])))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
     return Nearest(None)
 
@@ -128,7 +128,7 @@ def read_overrides(source: Source) -> PoseList:
             place = float(gps["latitude"]), float(gps["longitude"]), float(gps.get("altitude", "nan"))
             angles = tuple(float(opk[key]) for key in ("omega", "phi", "kappa")) if isinstance(opk, dict) else None
             sigma = float(gps["dop"]) if "dop" in gps else None
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ConfigError(f"{source.path}, image {name!r}: gps or opk is incomplete ({error!r})") from error
         rows.append(
             PoseRow(

@@ -92,7 +92,7 @@ def read_transforms(source: Source) -> PoseList:
         try:
             matrix = np.array(frame["transform_matrix"], dtype=np.float64).reshape(-1, 4)[:3]
             name = str(frame["file_path"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ConfigError(f"{where}: no file_path and transform_matrix of 4 x 4 ({error!r})") from error
         turn = np.linalg.inv(applied)
         center = turn[:3, :3] @ (matrix[:, 3] / scale) + turn[:3, 3]
@@ -114,7 +114,7 @@ def _lens(facts: dict[str, Any]) -> Nearest | None:
         middle = float(facts.get("cx", width / 2.0)), float(facts.get("cy", height / 2.0))
         radial = [float(facts.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4")]
         tangential = float(facts.get("p1", 0.0)), float(facts.get("p2", 0.0))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+    except (KeyError, TypeError, ValueError, OverflowError, ZeroDivisionError):
         return None
     if not math.isfinite(fx):
         return None

@@ -92,7 +92,7 @@ class Source:
             return None
         try:
             return fromstring(self.text.encode("utf-8") if "encoding" not in self.text[:100] else self.raw)
-        except (ParseError, DefusedXmlException, ValueError):
+        except (ParseError, DefusedXmlException, ValueError, LookupError):
             return None
 
     def records(self, comment: str = "#") -> Iterator[tuple[int, str]]:

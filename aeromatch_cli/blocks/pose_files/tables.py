@@ -168,6 +168,10 @@ def read_inpho(source: Source) -> PoseList:
         elif key == "$CAMERA_ID":
             camera = value
         elif key == "$EXT_ORI":
+            if len(lines) < place + 5:
+                raise ConfigError(
+                    f"{source.at(line)}: four lines follow $EXT_ORI: focal length and centre, and a matrix"
+                )
             following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
             center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
             photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])

@@ -1,0 +1,254 @@
+"""Damaged input for every reader: what people's files become, and what a hostile one may hold.
+
+Each case takes a sound file and damages it: bytes are flipped, parts are cut, repeated or moved, numbers become words,
+infinities, or numbers of absurd size, quotes and brackets get lost. A reader may refuse it by the project's own errors,
+and must not raise, hang or fill the memory otherwise. `scripts/fuzz` runs as many cases as are asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import re
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_features import random_features
+from make_images import DJI_XMP, gps_tags, write_image
+from make_pose_files import LOCAL, WORLD, patb, write_micmac
+
+from aeromatch_cli.blocks.camera_files import read_camera_file
+from aeromatch_cli.blocks.control import read_control
+from aeromatch_cli.blocks.exif import read_exif
+from aeromatch_cli.blocks.pose_files import read_pose_file
+from aeromatch_cli.config import load
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, Image, Matches, Pair, Pose, Verdict
+from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
+from aeromatch_cli.formats.dropped import read_dropped, write_dropped
+from aeromatch_cli.formats.features import read_features, write_features
+from aeromatch_cli.formats.rows import (
+    MatchEntry,
+    VerifiedEntry,
+    read_match_row,
+    read_verified_row,
+    write_match_row,
+    write_verified_row,
+)
+from aeromatch_cli.formats.tables import (
+    cameras_text,
+    images_text,
+    pairs_text,
+    poses_text,
+    read_cameras,
+    read_images,
+    read_pairs,
+    read_poses,
+)
+from aeromatch_cli.images.files import read_mask, read_pixels
+from aeromatch_cli.workspace import read_json
+
+CAMERA = Camera("PINHOLE", 40, 30, (9.0, 9.0, 19.5, 14.5))
+# A case that takes longer is a fault, seconds.
+SLOWEST_S = 10.0
+_TOKENS = (
+    b"nan", b"inf", b"-1e308", b"1e999", b"", b"0", b"-0", b"9" * 400, b"x", b"\xff\xfe", b"\0", b"'", b'"', b"<", b"{",
+    b"[", b"../../../etc/passwd", b"\xe2\x80\xae", b"1,5", b"18446744073709551616", b"-2147483649", b"&amp;",
+    b"!!python",
+)  # fmt: skip
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Reader:
+    """read: raises AeromatchError alone. sound: file names and contents that it reads."""
+
+    read: Callable[[Path], object]
+    sound: Mapping[str, bytes]
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """One to four faults."""
+    for _ in range(int(rng.integers(1, 5))):
+        data = _FAULTS[rng.integers(len(_FAULTS))](data, rng)
+    return data
+
+
+def _flipped(data: bytes, rng: np.random.Generator) -> bytes:
+    found = np.frombuffer(data, np.uint8).copy()
+    if len(found):
+        places = rng.integers(0, len(found), max(1, int(len(found) * 0.002)))
+        found[places] ^= rng.integers(1, 256, len(places), dtype=np.uint8)
+    return found.tobytes()
+
+
+def _cut(data: bytes, rng: np.random.Generator) -> bytes:
+    return data[: rng.integers(0, len(data) + 1)]
+
+
+def _without_part(data: bytes, rng: np.random.Generator) -> bytes:
+    first, last = sorted(rng.integers(0, len(data) + 1, 2).tolist())
+    return data[:first] + data[last:]
+
+
+def _part_twice(data: bytes, rng: np.random.Generator) -> bytes:
+    first, last = sorted(rng.integers(0, len(data) + 1, 2).tolist())
+    return data[:last] + data[first:]
+
+
+def _line_moved(data: bytes, rng: np.random.Generator) -> bytes:
+    lines = data.split(b"\n")
+    line = lines.pop(int(rng.integers(len(lines))))
+    lines.insert(int(rng.integers(len(lines) + 1)), line)
+    return b"\n".join(lines)
+
+
+def _number_replaced(data: bytes, rng: np.random.Generator) -> bytes:
+    found = list(_NUMBER.finditer(data[:200_000]))
+    if not found:
+        return data
+    match = found[rng.integers(len(found))]
+    return data[: match.start()] + _TOKENS[rng.integers(len(_TOKENS))] + data[match.end() :]
+
+
+def _token_inserted(data: bytes, rng: np.random.Generator) -> bytes:
+    place = int(rng.integers(0, len(data) + 1))
+    return data[:place] + _TOKENS[rng.integers(len(_TOKENS))] + data[place:]
+
+
+_FAULTS = (_flipped, _cut, _without_part, _part_twice, _line_moved, _number_replaced, _number_replaced, _token_inserted)
+
+
+def _archive(write: Callable[..., object], *value: Any) -> bytes:
+    with tempfile.TemporaryFile() as stream:
+        write(stream, *value)
+        stream.seek(0)
+        return stream.read()
+
+
+def _texts(files: Mapping[str, str | bytes]) -> dict[str, bytes]:
+    return {name: text if isinstance(text, bytes) else text.encode() for name, text in files.items()}
+
+
+def readers() -> dict[str, Reader]:
+    """Every reader of files that come from outside, or that a fault of the disk may change."""
+    rng = np.random.default_rng(0)
+    kept = Matches(
+        rng.integers(0, 99, (30, 2)).astype(np.int32), rng.random(30).astype(np.float32), np.zeros((30, 2), np.int16)
+    )
+    verdict = Verdict(np.ones(30, bool), "verified", model_kind="E", errors_px=np.zeros(30, np.float32))
+    features = random_features(40)
+    pose = AdjustedPose(np.zeros(3), np.eye(3), np.ones(3), np.ones(3))
+    block = AdjustedBlock(
+        {"1": CAMERA}, {"a": pose}, np.zeros((3, 3)), np.zeros(3),
+        {"a": np.array([[0, 1]], np.int32)},
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as scratch:
+        image = write_image(Path(scratch) / "a.jpg", gps=gps_tags(52.0, 13.0, 100.0), xmp=DJI_XMP).read_bytes()
+        png = write_image(Path(scratch) / "a.png").read_bytes()
+        tif = write_image(Path(scratch) / "a.tif").read_bytes()
+        ori = {"Orientation-A.jpg.xml": next(write_micmac(Path(scratch)).glob("*.xml")).read_bytes()}
+    camera = '{"1": {"model": "OPENCV", "width": 40, "height": 30, "params": [9, 9, 20, 15, 0, 0, 0, 0]}}'
+    control = (
+        "EPSG:32633\n390951.2 5818970.1 34.0 512.3 390.8 a.jpg north\n390952.2 5818971.1 34.0 51.3 39.8 a.jpg s check\n"
+    )
+    images = (Image("a", "a.jpg", 40, 30, "1"),)
+    settings = (
+        "preset: fusion\nblock: {images: imgs, poses: exif, crs: auto}\nextract: {keypoints: 500}\nexport: colmap\n"
+    )
+    tables = _texts(
+        {
+            "images.csv": images_text(images, {"a": "f"}),
+            "cameras.csv": cameras_text({"1": CAMERA}),
+            "poses.csv": poses_text({"a": Pose(np.ones(3), np.eye(3), 1.0, 1.0)}),
+            "pairs.csv": pairs_text([Pair("a", "b", 0.5, 3.0, "overlap")]),
+        }
+    )
+    by_name: dict[str, Callable[[Path], object]] = {
+        "images.csv": read_images, "cameras.csv": read_cameras, "poses.csv": read_poses, "pairs.csv": read_pairs,
+    }  # fmt: skip
+    return {
+        "poses": Reader(read_pose_file, _texts({**WORLD, **LOCAL, "patb.ori": patb(transposed=False), **ori})),
+        "cameras": Reader(
+            read_camera_file,
+            _texts({"c.json": camera, "c.yaml": camera, "cameras.txt": "1 OPENCV 40 30 9 9 20 15 0 0 0 0\n"}),
+        ),
+        "control": Reader(
+            lambda path: read_control(str(path), images, "EPSG:32633", (391000.0, 5818000.0, 0.0)),
+            _texts({"gcp_list.txt": control}),
+        ),
+        "settings": Reader(lambda path: load(str(path)), _texts({"a.yaml": settings})),
+        "exif": Reader(read_exif, {"a.jpg": image, "a.png": png, "a.tif": tif}),
+        "pixels": Reader(lambda path: read_pixels(path, colour=True), {"a.jpg": image, "a.png": png, "a.tif": tif}),
+        "masks": Reader(lambda path: read_mask(path, 40, 30), {"a.png": png}),
+        "features": Reader(read_features, {"a.npz": _archive(write_features, features, "f")}),
+        "matches": Reader(read_match_row, {"a.npz": _archive(write_match_row, [MatchEntry("b", "f", "s", kept)])}),
+        "verified": Reader(
+            read_verified_row, {"a.npz": _archive(write_verified_row, [VerifiedEntry("b", "f", 40, kept, verdict)])}
+        ),
+        "adjusted": Reader(read_adjusted, {"adjusted.npz": _archive(write_adjusted, block)}),
+        "dropped": Reader(read_dropped, {"d.npz": _archive(write_dropped, {("a", "b"): ("f", np.arange(3))}, 15)}),
+        "tables": Reader(lambda path: by_name[path.name](path), tables),
+        "json": Reader(read_json, {"a.json": b'{"facts": {"images": 3}, "failures": [["a", "b"]]}'}),
+    }
+
+
+def faults(reader: Reader, cases: int, seed: int, folder: Path) -> Iterator[tuple[str, bytes, str]]:
+    """File name, content and what happened, of every case that ends in anything but the project's own errors."""
+    names = sorted(reader.sound)
+    for case in range(cases):
+        rng = np.random.default_rng((seed, case))
+        name = names[case % len(names)]
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for beside, content in reader.sound.items():  # what lies beside it in the same folder
+            if Path(beside).parent == Path(name).parent:
+                (folder / beside).write_bytes(content)
+        data = damaged(reader.sound[name], rng)
+        path.write_bytes(data)
+        started = time.monotonic()
+        try:
+            with contextlib.suppress(AeromatchError):
+                reader.read(path)
+        except Exception:  # noqa: BLE001 - this is what is looked for
+            yield name, data, traceback.format_exc(limit=-3)
+        if time.monotonic() - started > SLOWEST_S:
+            yield name, data, f"took {time.monotonic() - started:.0f} s"
+
+
+def main() -> None:
+    table = readers()
+    parser = argparse.ArgumentParser(
+        prog="scripts/fuzz", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("readers", nargs="*", help=f"of {', '.join(table)}; all by default")
+    parser.add_argument("--cases", type=int, default=20_000, help="of each reader (default 20000)")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if unknown := set(args.readers) - table.keys():
+        parser.error(f"no such reader: {', '.join(sorted(unknown))}")
+    whole = 0
+    for name in args.readers or table:
+        started, seen = time.monotonic(), dict[str, int]()
+        with tempfile.TemporaryDirectory() as scratch:
+            for file, data, what in faults(table[name], args.cases, args.seed, Path(scratch)):
+                last = what.strip().splitlines()[-1]
+                seen[last] = seen.get(last, 0) + 1
+                if seen[last] == 1:
+                    print(f"{name} {file}: {what}\n{data[:300]!r}\n", file=sys.stderr)
+        whole += sum(seen.values())
+        print(
+            f"{name}: {args.cases} cases, {sum(seen.values())} faults, {time.monotonic() - started:.0f} s", flush=True
+        )
+    sys.exit(1 if whole else 0)
+
+
+if __name__ == "__main__":
+    main()
