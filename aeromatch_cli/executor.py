@@ -34,6 +34,8 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 # glibc gives the large arrays of every image back to the system and faults them in again for the next one: 40 % of
 # the time of SIFT. Workers keep them instead; their peak grows by a tenth (measured on 12 megapixels).
 _KEPT_BYTES = str(4_000_000_000)
+# How often a task is given to another dask worker.
+_DASK_RETRIES = 3
 _WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {
     "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
     "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
@@ -158,8 +160,12 @@ def guarded(function: Callable[[T], R], task: T) -> Outcome[R]:
 class Executor:
     """Runs tasks; keeps its workers between stages. Use as a context manager."""
 
-    def __init__(self, kind: str = "serial", jobs: int = 0, progress: Progress | None = None) -> None:
+    def __init__(
+        self, kind: str = "serial", jobs: int = 0, progress: Progress | None = None, scheduler: str = ""
+    ) -> None:
+        """scheduler: address of a dask scheduler; "" for a local cluster."""
         self.kind = kind
+        self._scheduler = scheduler or os.environ.get("DASK_SCHEDULER_ADDRESS", "")
         self.jobs = 1 if kind == "serial" else jobs or available_cores()
         self.progress = progress or SilentProgress()
         self._tried = 0
@@ -314,17 +320,41 @@ class Executor:
             raise ConfigError(
                 "run.executor=dask needs the extra: pip install 'aeromatch[cluster]', or use --executor processes"
             ) from None
-        if self._client is None:
-            # DASK_SCHEDULER_ADDRESS names a cluster; without it a local one is started.
-            address = os.environ.get("DASK_SCHEDULER_ADDRESS")
-            local = {} if address else {"n_workers": self.jobs, "threads_per_worker": 1, "dashboard_address": None}
-            self._client = Client(address, **local)
-            self._client.run(single_threaded)
-        futures = self._client.map(guarded, [function] * len(tasks), tasks, pure=False)
+        client = self._dask_client(Client)
+        # A worker that is lost takes its task with it: that is given to another one, so many times.
+        futures = client.map(guarded, [function] * len(tasks), tasks, pure=False, retries=_DASK_RETRIES)
         places = {future.key: index for index, future in enumerate(futures)}
+        outcomes: dict[int, Outcome[R]] = {}
         for future in as_completed(futures):
-            self._advance(places[future.key])
-        return list(self._client.gather(futures))
+            index = places[future.key]
+            if future.status == "finished":
+                outcomes[index] = future.result()
+            elif future.status == "error" and not isinstance(error := future.exception(), WorkspaceError):
+                outcomes[index] = Outcome(None, f"its dask worker was lost ({type(error).__name__})")
+            elif future.status == "error":
+                raise error
+            else:
+                raise WorkspaceError(
+                    f"the dask scheduler {client.scheduler.address} is lost: start it again, and run the same command, "
+                    "which goes on"
+                )
+            self._advance(index)
+        return [outcomes[index] for index in range(len(tasks))]
+
+    def _dask_client(self, connect: Callable[..., Any]) -> Any:
+        if self._client is None:
+            local = {"n_workers": self.jobs, "threads_per_worker": 1, "dashboard_address": None}
+            try:
+                self._client = connect(self._scheduler or None, **({"timeout": "10s"} if self._scheduler else local))
+            except (OSError, ValueError) as error:
+                raise ConfigError(
+                    f"no dask scheduler answers at {self._scheduler}: start one (`dask scheduler`), or leave out "
+                    f"--scheduler ({error})"
+                ) from None
+            self._client.run(single_threaded)
+            if self._scheduler and self._client.dashboard_link:
+                log.info("dask dashboard at %s", self._client.dashboard_link)
+        return self._client
 
 
 def available_cores() -> int:

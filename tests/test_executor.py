@@ -1,15 +1,19 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from conftest import heed_interrupts
+from make_slow import slow_square
 
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
@@ -222,3 +226,49 @@ def test_workers_that_cannot_start_are_an_error_and_no_endless_loop(tmp_path: Pa
     )
     assert done.returncode != 0
     assert "use --executor serial" in done.stderr
+
+
+@pytest.fixture
+def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """A dask scheduler and two workers as processes of their own: its address, and the workers."""
+    pytest.importorskip("distributed")
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": paths, "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
+
+    def started(*arguments: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", *arguments], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+            text=True,
+        )  # fmt: skip
+
+    scheduler = started("distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard")
+    assert scheduler.stderr is not None
+    address = next(m[0] for line in scheduler.stderr if (m := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
+    worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+    workers = [started(*worker), started(*worker)]
+    try:
+        yield address, workers
+    finally:
+        for process in (*workers, scheduler):
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.slow
+def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, list[subprocess.Popen[str]]]) -> None:
+    address, workers = cluster
+    with Executor("dask", scheduler=address) as executor:
+        assert [o.value for o in executor.run(slow_square, [3], "first")] == [9]
+        killer = threading.Timer(1.0, workers[0].kill)
+        killer.start()
+        outcomes = executor.run(slow_square, list(range(20)), "squares")
+        killer.join()
+    assert [outcome.value for outcome in outcomes] == [number**2 for number in range(20)]
+    assert workers[0].wait(10) != 0
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_does_not_answer_is_named() -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):
+        Executor("dask", scheduler="tcp://127.0.0.1:9").run(slow_square, [1], "x")

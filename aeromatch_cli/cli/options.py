@@ -190,6 +190,17 @@ ExecutorName = Annotated[
         help="Where tasks run (default processes).",
     ),
 ]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        envvar="AEROMATCH_SCHEDULER",
+        show_envvar=False,
+        rich_help_panel=_WORK,
+        help="Dask scheduler to use, such as tcp://10.0.0.1:8786 (sets --executor dask).",
+    ),
+]
 ShardText = Annotated[
     str | None,
     typer.Option(

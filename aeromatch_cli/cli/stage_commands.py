@@ -28,6 +28,7 @@ from aeromatch_cli.cli.options import (
     PoseFormat,
     Poses,
     Quiet,
+    Scheduler,
     Set,
     ShardText,
     WorkspaceDir,
@@ -146,6 +147,7 @@ def stage_command(name: str) -> Callable[..., None]:
         jobs: Jobs = None,
         memory: Memory = None,
         executor: ExecutorName = None,
+        scheduler: Scheduler = None,
         shard: ShardText = None,
         overwrite: Overwrite = False,
         keep_images: KeepImages = False,
@@ -156,6 +158,7 @@ def stage_command(name: str) -> Callable[..., None]:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
         block |= {"pose_format": pose_format, "masks": masks, "gcp": gcp, "max_size_px": max_size}
         run = {"jobs": jobs, "memory": memory, "executor": executor, "keep_images": keep_images or None}
+        run |= {"scheduler": scheduler, "executor": executor or ("dask" if scheduler else None)}
 
         def call() -> Result:
             from aeromatch_cli.config import load

@@ -121,6 +121,11 @@ class RunSettings(_Section):
         "processes",
         description="Where tasks run: in this process, in worker processes, or on a dask cluster (extra `cluster`).",
     )
+    scheduler: str = Field(
+        "",
+        description="Address of a dask scheduler, such as tcp://10.0.0.1:8786, with executor=dask. Empty: what "
+        "DASK_SCHEDULER_ADDRESS names, else a local cluster.",
+    )
     jobs: int = Field(0, ge=0, description="Number of worker processes; 0 = one per core. Larger: faster, more memory.")
     memory: str = Field(
         "",

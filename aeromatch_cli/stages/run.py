@@ -83,7 +83,8 @@ def execute(
         if command != "check" and Path(settings.block.images or ".").is_dir():
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
-            with Executor(settings.run.executor, settings.run.jobs, progress) as executor:
+            run = settings.run
+            with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 return _repairing(command, settings, executor, part, overwrite, _Said(say))
         except BaseException:
             # Workers are stopped in the middle of what they write.
