@@ -73,8 +73,9 @@ def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8
 
 
 def features_fingerprint(path: Path) -> str | None:
-    """Fingerprint recorded in a feature file, None when the file is absent or broken."""
+    """Fingerprint recorded in a feature file, None when the file is absent or any of its arrays is broken."""
     try:
+        check_sums(path)
         return str(load_arrays(path, ("fingerprint",))["fingerprint"])
     except BrokenFileError:
         return None
@@ -89,6 +90,15 @@ def known_fingerprint(path: Path) -> str | None:
 def _cached_fingerprint(path: Path, stamp: int) -> str | None:
     del stamp  # only tells rewritten files apart
     return features_fingerprint(path)
+
+
+def check_sums(path: Path) -> None:
+    """Compare all contents with the archive's checksums (CRC-32), also those that no stage reads any more because what
+    follows is up to date. Raises BrokenFileError.
+    """
+    with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(path) as archive:
+        if name := archive.testzip():
+            raise BrokenFileError(str(path), f"{name} contradicts its checksum")
 
 
 def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:

@@ -18,7 +18,7 @@ from aeromatch_cli.data import (
     Verdict,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.features import ARCHIVE_FAULTS, load_arrays
+from aeromatch_cli.formats.features import ARCHIVE_FAULTS, check_sums, load_arrays
 from aeromatch_cli.formats.reading import readable
 
 # Features of rows that earlier versions wrote.
@@ -119,8 +119,9 @@ def _verified_entry(row: _Row, p: int, image_id1: str, fingerprint: str) -> Veri
 
 
 def row_fingerprints(path: Path) -> Mapping[str, str]:
-    """image_id1 -> fingerprint of a matches or verified row; empty when absent or broken. Read once as long as the file
-    is not written again."""
+    """image_id1 -> fingerprint of a matches or verified row; empty when absent or any array is broken. Read once
+    as long as the file is not written again.
+    """
     try:
         return _cached_fingerprints(path, path.stat().st_mtime_ns)
     except FileNotFoundError:
@@ -131,6 +132,7 @@ def row_fingerprints(path: Path) -> Mapping[str, str]:
 def _cached_fingerprints(path: Path, stamp: int) -> Mapping[str, str]:
     del stamp  # only tells rewritten files apart
     try:
+        check_sums(path)
         arrays = load_arrays(path, ("image_id1", "fingerprint"))
         with readable(path, *ARCHIVE_FAULTS):
             return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}

@@ -115,9 +115,10 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 
 
 def _is_done(task: ExtractTask) -> bool:
-    if known_fingerprint(task.path) != task.fingerprint:
+    source = task.views.enhance
+    if known_fingerprint(task.path) != task.fingerprint or not source.workspace.views(source.image_id).is_file():
         return False
-    return not task.keep_images or (enhance.is_done(task.views.enhance) and simulate.is_done(task.views))
+    return not task.keep_images or (enhance.is_done(source) and simulate.is_done(task.views))
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:

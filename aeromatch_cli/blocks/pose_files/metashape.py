@@ -215,10 +215,10 @@ def _sensor(sensor: Any) -> lenses.Nearest | None:
         size = sensor.find("resolution") if size is None else size
         width, height = int(size.get("width")), int(size.get("height"))
         f = facts["f"]
+        middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         return None
     focal = f + facts.get("b1", 0.0), f
-    middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
     radial = [facts.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)]
     tangential = facts.get("p2", 0.0), facts.get("p1", 0.0)
     return lenses.brown((width, height), focal, middle, radial, tangential, facts.get("b2", 0.0))

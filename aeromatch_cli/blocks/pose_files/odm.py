@@ -83,6 +83,8 @@ def read_shots(source: Source) -> PoseList:
         facts = _properties(feature)
         try:
             longitude, latitude, height = (float(v) for v in feature["geometry"]["coordinates"][:3])
+            if not (-90.0 <= latitude <= 90.0 and -360.0 <= longitude <= 360.0):
+                raise ValueError(f"{latitude:g}, {longitude:g} is no place on Earth")
             rotation = rotation_of_vector(facts["rotation"]) if "rotation" in facts else None
             name = str(facts["filename"])
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:

@@ -82,19 +82,23 @@ def is_transforms(source: Source) -> bool:
 def read_transforms(source: Source) -> PoseList:
     """Raises ConfigError naming the frame."""
     tree = source.tree
-    applied, scale = np.eye(4), float(tree.get("applied_scale", 1.0))
-    if "applied_transform" in tree:
-        applied[:3] = np.array(tree["applied_transform"], dtype=np.float64)[:3, :4]
+    applied = np.eye(4)
+    try:
+        scale = float(tree.get("applied_scale", 1.0))
+        if "applied_transform" in tree:
+            applied[:3] = np.array(tree["applied_transform"], dtype=np.float64).reshape(-1, 4)[:3]
+        turn = np.linalg.inv(applied)
+    except (TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
+        raise ConfigError(f"{source.path}: applied_transform or applied_scale is malformed ({error})") from error
     rows: list[PoseRow] = []
     cameras = CameraShelf(source.path.name)
     for count, frame in enumerate(tree["frames"], start=1):
         where = f"{source.path}, frame {count}"
         try:
-            matrix = np.array(frame["transform_matrix"], dtype=np.float64).reshape(-1, 4)[:3]
+            matrix = np.array(frame["transform_matrix"], dtype=np.float64).reshape(-1, 4)[:3].reshape(3, 4)
             name = str(frame["file_path"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ConfigError(f"{where}: no file_path and transform_matrix of 4 x 4 ({error!r})") from error
-        turn = np.linalg.inv(applied)
         center = turn[:3, :3] @ (matrix[:, 3] / scale) + turn[:3, 3]
         world_from_photo = turn[:3, :3] @ matrix[:, :3]
         lens = _lens(tree | frame)
