@@ -34,7 +34,9 @@ def test_results_and_errors_fit_the_schema(site: Site) -> None:
         error = Error.model_validate(invoke(*arguments, "--json").facts)
         assert (error.exit_code in (2, 3), bool(error.error)) == (True, True)
     wrong = CliRunner().invoke(app, ["run", "--jobs", "many", "--json"])
-    assert Error.model_validate_json(wrong.stdout.splitlines()[-1]).exit_code == 2
+    stated = Error.model_validate_json(wrong.stdout.splitlines()[-1])
+    assert (stated.exit_code, stated.command) == (2, "run")
+    assert stated.error.startswith("Invalid value for '--jobs'")
     with pytest.raises(ValidationError):
         Outcome.model_validate(outcome.facts | {"more": 1})
 

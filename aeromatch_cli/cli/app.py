@@ -35,8 +35,7 @@ class _Commands(TyperGroup):
                 and "--json" in given
                 and not isinstance(stop.__context__, typer.Exit)
             ):
-                facts = {"error": "wrong arguments; stderr says which", "exit_code": stop.code}
-                typer.echo(json.dumps(facts))
+                typer.echo(json.dumps(_wrong_arguments(stop.__context__) | {"exit_code": stop.code}))
             raise
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
@@ -44,6 +43,18 @@ class _Commands(TyperGroup):
         written = list(args)  # parsing uses them up
         options["obj"] = {ARGUMENTS: written}
         return super().make_context(info_name, args, *rest, **options)
+
+
+def _wrong_arguments(error: BaseException | None) -> dict[str, Any]:
+    """error: what the parser raised; its message names the argument, its context the command."""
+    message = getattr(error, "format_message", lambda: "wrong arguments; stderr says which")()
+    context = getattr(error, "ctx", None)
+    known = (
+        {}
+        if context is None or context.parent is None
+        else {"command": context.command_path.removeprefix(f"{context.find_root().command_path} ")}
+    )
+    return known | {"error": message}
 
 
 app = typer.Typer(

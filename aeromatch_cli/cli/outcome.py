@@ -142,7 +142,7 @@ class Line(BaseModel):
 class Error(Line):
     """Of every command that something has stopped."""
 
-    command: str | None = Field(None, description="The command; missing where the arguments cannot be parsed.")
+    command: str | None = Field(None, description="The command; missing where none is recognised.")
     error: str = Field(description="What stopped the command, and what to do.")
 
 
