@@ -8,7 +8,6 @@ import json
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from PIL import Image as PilImage
 from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a fixture
 
 from aeromatch_cli.report import pair_viewer, thumbnails
-from aeromatch_cli.report.pair_viewer import PairData, drawable
+from aeromatch_cli.report.pair_viewer import PairData
 from aeromatch_cli.report.rows import PairRow, gather
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.stages.context import Context
@@ -31,7 +30,7 @@ def stored(page: str) -> dict[str, object]:
 
 
 def pair_data(context: Context, rows: list[PairRow]) -> tuple[PairData, dict[tuple[str, str], str]]:
-    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context, drawable(rows)))
+    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context))
 
 
 def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Context) -> None:  # noqa: F811
@@ -43,35 +42,72 @@ def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Contex
     for uri, width, height in data.pictures:
         picture = PilImage.open(io.BytesIO(base64.b64decode(uri.partition("base64,")[2])))
         assert picture.size == (width, height)
-    table = np.frombuffer(base64.b64decode(data.pairs["0,1"]), np.uint8).reshape(-1, 5)
+    table = np.frombuffer(base64.b64decode(data.pairs["0,1"][0]), np.uint8).reshape(-1, 5)
     points = features().keypoints_px[:60].astype(np.float64) + 0.5
     assert np.abs(table[:, :2] - points / [WIDTH, HEIGHT] * 255.0).max() <= 0.5
     # EXIF 6: a quarter turn clockwise, so x is counted from the lower edge.
     assert np.abs(table[:, 2] - (HEIGHT - points[:, 1]) / HEIGHT * 255.0).max() <= 0.5
     assert np.abs(table[:, 3] - points[:, 0] / WIDTH * 255.0).max() <= 0.5
     assert (table[:, 4] == 1).all()  # 0.72 px: above 0.5, up to 1
-    rejected = np.frombuffer(base64.b64decode(data.pairs["0,2"]), np.uint8).reshape(-1, 5)
+    rejected = np.frombuffer(base64.b64decode(data.pairs["0,2"][0]), np.uint8).reshape(-1, 5)
     assert (len(rejected), set(rejected[:, 4])) == (12, {9})
 
 
-def test_a_large_block_has_pictures_of_its_worst_pairs_alone(
-    full: Context,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(thumbnails, "MAX_IMAGES", 2)
-    rows = gather(full)[0]
-    data, keys = pair_data(full, [rows[1], rows[0], rows[3]])
-    assert (list(keys), len(data.pictures)) == ([("a", "c")], 2)
+def test_a_pair_has_some_of_its_matches(full: Context, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setattr(pair_viewer, "MAX_MATCHES", 10)
-    assert len(base64.b64decode(pair_data(full, rows[:1])[0].pairs["0,1"])) == 50
+    data, _ = pair_data(full, gather(full)[0])
+    assert len(base64.b64decode(data.pairs["0,1"][0])) == 50
+    assert data.pairs["0,1"][1:] == (60, 80, "verified")
+    assert data.pairs["0,2"][1:] == (0, 12, "rejected")
+
+
+@pytest.fixture
+def large(full: Context, monkeypatch: pytest.MonkeyPatch) -> Context:  # noqa: F811
+    """Three pictures are a large block here."""
+    monkeypatch.setattr(thumbnails, "MAX_IMAGES", 2)
+    monkeypatch.setattr(pair_viewer, "MAX_IMAGES", 2)
+    return full
+
+
+def test_pictures_and_pairs_of_a_large_block_lie_beside_the_page(large: Context) -> None:
+    found = stored(page_of(large))
+    folder = large.workspace.report.parent
+    assert (len(found["names"]), found["pairs"], found["beside"]) == (3, {}, [0, 1])  # type: ignore[arg-type]
+    for uri, width, height in found["pictures"]:  # type: ignore[attr-defined]
+        with PilImage.open(folder / uri) as picture:
+            assert picture.size == (width, height)
+    scripts = {path.name: path.read_text() for path in (folder / "pairs").iterdir()}
+    assert sorted(scripts) == ["0.js", "1.js"]
+    added = json.loads(scripts["0.js"].removeprefix("addPairs(").removesuffix(");\n"))
+    assert {key: pair[1:] for key, pair in added.items()} == {"0,1": [60, 80, "verified"], "0,2": [0, 12, "rejected"]}
+
+
+def test_pictures_beside_the_page_are_made_once_and_stale_files_go(large: Context) -> None:
+    page_of(large)
+    folder = large.workspace.report.parent
+    before = {path: path.stat().st_mtime_ns for path in (folder / "pictures").iterdir()}
+    (folder / "pictures" / "old.jpg").write_bytes(b"")
+    (folder / "pairs" / "9.js").write_text("")
+    next(iter(before)).write_bytes(b"cut")
+    page_of(large)
+    after = {path: path.stat().st_mtime_ns for path in (folder / "pictures").iterdir()}
+    assert after.keys() == before.keys()
+    assert sum(after[path] == before[path] for path in before) == len(before) - 1
+    assert sorted(path.name for path in (folder / "pairs").iterdir()) == ["0.js", "1.js"]
+
+
+def test_a_thumbnail_is_the_raster_as_stored(full: Context) -> None:  # noqa: F811
+    pictures = thumbnails.thumbnails(full)
+    assert pictures["b"].shape[:2] == (HEIGHT, WIDTH)  # although viewers turn it
+    assert pictures.link("b")[1:] == (HEIGHT, WIDTH)
 
 
 def test_rows_name_their_pair_and_nothing_ends_the_script(full: Context) -> None:  # noqa: F811
     page = page_of(full)
     # a-c is rejected, b-c has fewest matches.
-    assert re.findall(r'<tr data-pair="([0-9,]+)"', page) == ["0,1", "2,1", "0,2"]
-    assert set(stored(page)) == {"pictures", "pairs"}
-    hostile = pair_viewer.PairData([("</script><b>", 1, 1)])
+    assert re.findall(r'<tr data-pair="([0-9,]+)"', page) == ["0,2", "1,2", "0,1"]
+    assert set(stored(page)) == {"names", "pictures", "pairs", "beside"}
+    hostile = pair_viewer.PairData(pictures=[("</script><b>", 1, 1)])
     assert "<" not in hostile.text()
     assert json.loads(hostile.text())["pictures"][0][0] == "</script><b>"
 
@@ -80,7 +116,7 @@ def test_without_readable_images_the_page_is_as_before(full: Context) -> None:  
     for path in Path(full.settings.block.images).rglob("*.*"):
         path.unlink()
     page = page_of(full)
-    assert stored(page) == {"pictures": [], "pairs": {}}
+    assert stored(page) == {"names": [], "pictures": [], "pairs": {}, "beside": []}
     assert "A click on a row" not in page
 
 
@@ -104,11 +140,20 @@ def test_the_sketch_shows_the_ground_where_its_cameras_see_it(full: Context) -> 
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-def test_a_browser_draws_the_pair_that_the_address_names(full: Context, tmp_path: Path) -> None:  # noqa: F811
-    page_of(replace(full))
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_a_browser_draws_the_pair_that_the_address_names(
+    full: Context,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    size: str,
+) -> None:
+    if size == "large":
+        monkeypatch.setattr(thumbnails, "MAX_IMAGES", 2)
+        monkeypatch.setattr(pair_viewer, "MAX_IMAGES", 2)
+    page_of(full)
     address = full.workspace.report.resolve().as_uri()
     drawn = {}
-    for key in ("", "#pair=b.jpg,a.png"):
+    for key in ("", "#pair=b.jpg,a.png", "#pair=b.jpg,z.png"):
         command = [
             str(BROWSER),
             "--headless",
@@ -120,7 +165,9 @@ def test_a_browser_draws_the_pair_that_the_address_names(full: Context, tmp_path
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
         assert "CONSOLE" not in done.stderr  # neither an error of a script nor a refused resource
         drawn[key] = done.stdout.split('<dialog id="pair-viewer"')[1].split("</dialog>")[0]
-    assert drawn[""].count('class="tie') == 0
+        if "z.png" in key:
+            assert "no picture of z.png" in done.stdout
+    assert drawn[""].count('class="tie') == drawn["#pair=b.jpg,z.png"].count('class="tie') == 0
     assert drawn["#pair=b.jpg,a.png"].startswith(' open=""')
     assert drawn["#pair=b.jpg,a.png"].count('class="tie e1"') == 60
     assert "60 of 80 matches verified, 60 drawn; verified" in drawn["#pair=b.jpg,a.png"]

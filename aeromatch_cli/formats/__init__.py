@@ -218,7 +218,12 @@ of it when a process ends, however it ends.
 
 ### report/index.html
 
-The page that a person looks at; one file that needs no network.
+The page that a person looks at; it needs no network.
+
+### report/pictures/, report/pairs/
+
+Of blocks of more than 300 images: reduced pictures (JPEG, as viewers show them) and the matches of pairs, which the page
+loads when a pair is drawn. Up to 300 images all of it is in the page.
 
 ### evaluation/
 

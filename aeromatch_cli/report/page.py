@@ -22,7 +22,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
-from aeromatch_cli.report.pair_viewer import drawable, pair_data
+from aeromatch_cli.report.pair_viewer import pair_data
 from aeromatch_cli.report.places import ground_figures, point_figures
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
@@ -92,8 +92,9 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     # Without a verified pair what is on file is of other keypoints.
     adjusted = _adjusted_block(context) if any(row.state == "verified" for row in pairs) else None
     shown = _worst_pairs(pairs)
-    pictures = thumbnails(context, drawable(shown))
-    drawn, keys = pair_data(context, shown, pictures)
+    pictures = thumbnails(context)
+    drawn, keys = pair_data(context, pairs, pictures)
+    drawn.write_beside(context.workspace.report.parent / "pairs")
     return template.render(
         version=__version__,
         colours=COLOURS,
@@ -125,6 +126,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         pairs=shown,
         pair_data=drawn.text(),
         pair_keys=keys,
+        pairs_beside=bool(drawn.beside),
         has_steps=any(row.steps for row in pairs),
         settled=settled_words(_facts(context, "match")) if context.settings.cascade else "",
         pair_count=len(pairs),

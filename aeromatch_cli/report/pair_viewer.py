@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,11 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.report.figures import evenly_chosen
-from aeromatch_cli.report.previews import DrawnMatches, error_classes, jpeg_uri, turned, turned_points
+from aeromatch_cli.report.previews import DrawnMatches, error_classes, turned_points
 from aeromatch_cli.report.rows import PairRow
+from aeromatch_cli.report.thumbnails import MAX_IMAGES, Thumbnails
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.workspace import write_text
 
 MAX_MATCHES = 80
 # Places are stored as so many steps of a picture's width and height.
@@ -24,32 +27,52 @@ _STEPS = 255
 
 @dataclass
 class PairData:
-    """pictures: one of each image, a data URI with its width and height. pairs: of "i,j", numbers of pictures, the
-    matches: five bytes each, x0 y0 x1 y1 in _STEPS of the picture's sides and the class of the error, as base64."""
+    """names and pictures: of each image; a picture is a data URI or a file beside the page, with its width and height.
+    pairs: of "i,j", numbers of images, the matches, how many are verified, how many were compared, and the state.
+    Matches are five bytes each, x0 y0 x1 y1 in _STEPS of the picture's sides and the class of the error, as base64.
+    Of "i,j" i is the smaller one. beside: the pairs of these first images are in files beside the page, pairs/<i>.js.
+    """
 
+    names: list[str] = field(default_factory=list)
     pictures: list[tuple[str, int, int]] = field(default_factory=list)
-    pairs: dict[str, str] = field(default_factory=dict)
+    pairs: dict[str, tuple[str, int, int, str]] = field(default_factory=dict)
+    beside: list[int] = field(default_factory=list)
 
     def text(self) -> str:
         """For a script element: JSON in which no tag can begin."""
-        return json.dumps(vars(self), separators=(",", ":")).replace("<", "\\u003c")
+        return _json(vars(self) | ({"pairs": {}} if self.beside else {}))
+
+    def write_beside(self, folder: Path) -> None:
+        """pairs/<i>.js, which add the pairs to the page: a page that is a local file may load scripts, but no data.
+        Those of an earlier report are replaced."""
+        rows: dict[str, dict[str, tuple[str, int, int, str]]] = {}
+        for key, pair in self.pairs.items() if self.beside else ():
+            rows.setdefault(f"{key.partition(',')[0]}.js", {})[key] = pair
+        for path in sorted(folder.glob("*.js")):
+            if path.name not in rows:
+                path.unlink(missing_ok=True)
+        for name, row in rows.items():
+            write_text(folder / name, f"addPairs({_json(row)});\n")
+
+
+def _json(value: object) -> str:
+    text = json.dumps(value, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def pair_data(
-    context: Context, rows: Sequence[PairRow], pictures: Mapping[str, NDArray[np.uint8]]
+    context: Context, rows: Sequence[PairRow], pictures: Thumbnails
 ) -> tuple[PairData, dict[tuple[str, str], str]]:
-    """What can be drawn of the pairs, in their order, and under which key of PairData.pairs each is.
-
-    pictures: image_id -> reduced picture as stored.
-    """
-    data, number_of = PairData(), {}
-    for image_id, stored in pictures.items():
-        number_of[image_id] = len(data.pictures)
-        picture = turned(stored, context.image_by_id[image_id].exif_orientation)
-        data.pictures.append((jpeg_uri(picture, quality=70), picture.shape[1], picture.shape[0]))
+    """What can be drawn of the pairs, and under which key of PairData.pairs each is."""
+    data = PairData()
+    number_of = {image_id: number for number, image_id in enumerate(pictures)}
+    for image_id in pictures:
+        data.names.append(context.image_by_id[image_id].name)
+        data.pictures.append(pictures.link(image_id))
     drawn = DrawnMatches(context.workspace)
     keys: dict[tuple[str, str], str] = {}
-    for row in drawable(rows):
+    # One row of files after the other: each is read once.
+    for row in sorted(drawable(rows), key=lambda row: (row.image_id0, row.image_id1)):
         ids = row.image_id0, row.image_id1
         if ids[0] in number_of and ids[1] in number_of:
             try:
@@ -57,7 +80,11 @@ def pair_data(
             except WorkspaceError:
                 continue  # its files have gone: the row stays, without a picture
             keys[ids] = f"{number_of[ids[0]]},{number_of[ids[1]]}"
-            data.pairs[keys[ids]] = _table(context, ids, places, errors_px)
+            data.pairs[keys[ids]] = (
+                _table(context, ids, places, errors_px), int(row.verified), int(row.matches_in or 0), row.state,
+            )  # fmt: skip
+    if len(pictures) > MAX_IMAGES:
+        data.beside = sorted({int(key.partition(",")[0]) for key in data.pairs})
     return data, keys
 
 

@@ -9,7 +9,7 @@ import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from html import escape
 from typing import Any
 
@@ -63,14 +63,18 @@ def chosen_previews(pairs: Sequence[PairRow]) -> list[tuple[str, PairRow]]:
     return result + [("Rejected pair", row) for row in rejected[:MAX_REJECTED_PREVIEWS]]
 
 
+# Files of images kept in memory.
+_KEPT = 300
+
+
 class DrawnMatches:
-    """The matches of pairs as they are drawn; every file is read once."""
+    """The matches of pairs as they are drawn; every file is read once, where pairs of an image follow each other."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace, self._final = workspace, FinalEntries(workspace)
-        self._keypoints = cache(lambda image_id: read_keypoints(workspace.features(image_id))[0])
-        self._verified = cache(lambda image_id: read_verified_row(workspace.verified(image_id)))
-        self._matched = cache(lambda image_id: read_match_row(workspace.matches(image_id)))
+        self._keypoints = lru_cache(_KEPT)(lambda image_id: read_keypoints(workspace.features(image_id))[0])
+        self._verified = lru_cache(_KEPT)(lambda image_id: read_verified_row(workspace.verified(image_id)))
+        self._matched = lru_cache(_KEPT)(lambda image_id: read_match_row(workspace.matches(image_id)))
 
     def of(self, row: PairRow) -> tuple[tuple[FloatArray, FloatArray], FloatArray | None]:
         """Stored pixels (M, 2) of either image, and errors (M,): verified matches with theirs, of a rejected pair those

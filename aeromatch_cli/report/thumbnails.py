@@ -2,51 +2,150 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink
-from aeromatch_cli.report.previews import to_colour8
-from aeromatch_cli.report.rows import PairRow
+from aeromatch_cli.report.previews import to_colour8, turned
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.workspace import write_atomically
 
+# The page holds the pictures of at most so many images; those of a larger block are files beside it.
 MAX_IMAGES = 300
-# Longest side of a picture, for at most so many images.
-_SIDES_PX = ((40, 480), (120, 320), (MAX_IMAGES, 240))
+FOLDER = "pictures"
+# Longest side of a picture, for at most so many images, and for more.
+_SIDES_PX = ((40, 480), (120, 320))
+_SIDE_PX = 240
+_QUALITY = 70
+_THREADS = 2
 _JPEG_SUFFIXES = frozenset({".jpg", ".jpeg"})
+# EXIF Orientation that takes a turned picture back; the others are their own inverse.
+_INVERSE = {6: 8, 8: 6}
 
 
-def thumbnails(context: Context, rows: Sequence[PairRow]) -> dict[str, NDArray[np.uint8]]:
-    """image_id -> picture (h, w) or (h, w, 3) as stored, of the images of the first rows, MAX_IMAGES of them at most;
-    without those that cannot be read any more."""
-    wanted: dict[str, None] = {}
-    for row in rows:
-        new = {row.image_id0, row.image_id1} - wanted.keys()
-        if len(wanted) + len(new) <= MAX_IMAGES:
-            wanted |= dict.fromkeys(sorted(new))
-    side_px = next(side for most, side in _SIDES_PX if len(wanted) <= most)
-    found = {}
-    for image_id in wanted:
-        try:
-            found[image_id] = _small(context.image_path(context.image_by_id[image_id]), side_px)
-        except ItemError:
-            continue
-    return found
+@dataclass(frozen=True)
+class _Thumbnail:
+    """A JPEG as viewers show it. place: its bytes, or its file."""
+
+    place: bytes | Path
+    width_px: int
+    height_px: int
+    exif_orientation: int
+
+
+class Thumbnails(Mapping[str, NDArray[np.uint8]]):
+    """image_id -> reduced raster (h, w, 3) as stored, of the images that can be read."""
+
+    def __init__(self, pictures: Mapping[str, _Thumbnail]) -> None:
+        self._pictures = pictures
+
+    def __getitem__(self, image_id: str) -> NDArray[np.uint8]:
+        from PIL import Image as PilImage
+
+        found = self._pictures[image_id]
+        with PilImage.open(io.BytesIO(found.place) if isinstance(found.place, bytes) else found.place) as picture:
+            shown = np.asarray(picture.convert("RGB"))
+        return turned(shown, _INVERSE.get(found.exif_orientation, found.exif_orientation))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._pictures)
+
+    def __len__(self) -> int:
+        return len(self._pictures)
+
+    def link(self, image_id: str) -> tuple[str, int, int]:
+        """For the page: a data URI or the file relative to it, and width and height in pixels, as viewers show it."""
+        found = self._pictures[image_id]
+        if isinstance(found.place, bytes):
+            uri = "data:image/jpeg;base64," + base64.b64encode(found.place).decode("ascii")
+        else:
+            uri = f"{FOLDER}/{found.place.name}"
+        return uri, found.width_px, found.height_px
+
+
+def thumbnails(context: Context) -> Thumbnails:
+    """Of every image of the block, by id, but those that cannot be read. More than MAX_IMAGES are kept in files
+    beside the page, and made again where their images have changed."""
+    images = sorted(context.block.images, key=lambda image: image.image_id)
+    beside = len(images) > MAX_IMAGES
+    side_px = next((side for most, side in _SIDES_PX if len(images) <= most), _SIDE_PX)
+    folder = context.workspace.report.parent / FOLDER
+    with ThreadPoolExecutor(_THREADS) as pool:
+        made = list(pool.map(partial(_thumbnail, context, side_px, folder if beside else None), images))
+    pictures = {image.image_id: found for image, found in zip(images, made, strict=True) if found is not None}
+    current = {found.place for found in pictures.values()}
+    for path in sorted(folder.glob("*.jpg")):
+        if path not in current:
+            path.unlink(missing_ok=True)
+    return Thumbnails(pictures)
+
+
+def _thumbnail(context: Context, side_px: int, folder: Path | None, image: Image) -> _Thumbnail | None:
+    """None where the image cannot be read. folder: where pictures beside the page lie."""
+    path = context.image_path(image)
+    try:
+        if folder is None:
+            return _encoded(path, side_px, image.exif_orientation)
+        file = folder / _name(path, side_px, image.exif_orientation)
+        known = _known(file, image.exif_orientation)
+        if known is not None:
+            return known
+        made = _encoded(path, side_px, image.exif_orientation)
+    except ItemError:
+        return None
+    write_atomically(file, lambda stream: stream.write(made.place))  # type: ignore[arg-type]
+    return _Thumbnail(file, made.width_px, made.height_px, made.exif_orientation)
+
+
+def _name(path: Path, side_px: int, exif_orientation: int) -> str:
+    """Another one when the image is another one."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise ItemError(f"{path}: {error.strerror or error}") from error
+    facts = f"{path.as_posix()} {state.st_size} {state.st_mtime_ns} {side_px} {exif_orientation}"
+    return hashlib.sha256(facts.encode()).hexdigest()[:16] + ".jpg"
+
+
+def _known(file: Path, exif_orientation: int) -> _Thumbnail | None:
+    from PIL import Image as PilImage
+
+    try:
+        with PilImage.open(file) as picture:
+            return _Thumbnail(file, *picture.size, exif_orientation)
+    except (OSError, ValueError):
+        return None
+
+
+def _encoded(path: Path, side_px: int, exif_orientation: int) -> _Thumbnail:
+    from PIL import Image as PilImage
+
+    shown = np.ascontiguousarray(turned(_small(path, side_px), exif_orientation))
+    stream = io.BytesIO()
+    PilImage.fromarray(shown).save(stream, "JPEG", quality=_QUALITY, optimize=True)
+    return _Thumbnail(stream.getvalue(), shown.shape[1], shown.shape[0], exif_orientation)
 
 
 def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
     """The stored raster, reduced. A JPEG is decoded at reduced size: a tenth of the time."""
     if path.suffix.lower() in _JPEG_SUFFIXES:
-        from PIL import Image
+        from PIL import Image as PilImage
 
         try:
-            with Image.open(path) as picture:
+            with PilImage.open(path) as picture:
                 if picture.mode in ("RGB", "L"):
                     picture.draft(picture.mode, (side_px, side_px))
                     picture.thumbnail((side_px, side_px), reducing_gap=2.0)
