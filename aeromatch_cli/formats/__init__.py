@@ -222,8 +222,8 @@ The page that a person looks at; it needs no network.
 
 ### report/pictures/, report/pairs/
 
-Of blocks of more than 300 images: reduced pictures (JPEG, as viewers show them) and the matches of pairs, which the page
-loads when a pair is drawn. Up to 300 images all of it is in the page.
+Of blocks of more than 300 images: reduced pictures (JPEG, as viewers show them) and the matches of pairs, which the
+page loads when a pair is drawn. Up to 300 images all of it is in the page.
 
 ### evaluation/
 
