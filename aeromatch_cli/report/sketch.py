@@ -55,7 +55,9 @@ def _lay(
     pose, image = context.pose(image_id), context.image_by_id[image_id]
     if pose is None or pose.world_rotation is None:
         return
-    aside = np.linalg.norm(points_m[..., :2] - pose.center_m[:2], axis=2)
+    window = _around(points_m, pose.center_m)
+    points_m, canvas, nearest = points_m[window], canvas[window], nearest[window]
+    aside = np.hypot(points_m[..., 0] - pose.center_m[0], points_m[..., 1] - pose.center_m[1])
     above = pose.center_m[2] - points_m[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(above > 0.0, aside / above, np.inf)
@@ -76,3 +78,12 @@ def _lay(
     canvas[rows, columns, :3] = colour[whole[:, 1], whole[:, 0], :3]
     canvas[rows, columns, 3] = 255
     nearest[rows, columns] = distance[rows, columns]
+
+
+def _around(points_m: FloatArray, center_m: FloatArray) -> tuple[slice, slice]:
+    """Rows and columns of points_m (h, w, 3), x right and y up, that can be within _FARTHEST of a camera above them: an
+    image shows a small part of a large block."""
+    reach_m = _FARTHEST * max(0.0, float(center_m[2] - np.nanmin(points_m[..., 2])))
+    columns = np.searchsorted(points_m[0, :, 0], [center_m[0] - reach_m, center_m[0] + reach_m])
+    rows = np.searchsorted(-points_m[:, 0, 1], [-center_m[1] - reach_m, -center_m[1] + reach_m])
+    return slice(*rows.tolist()), slice(*columns.tolist())
