@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from benchmarks.tables import Row, grouped, ratio, total
 
@@ -28,6 +27,27 @@ def quality(rows: Sequence[Row]) -> list[tuple[str, float, float, float]]:
     ]
 
 
+def _label(axis: Any, points: Sequence[tuple[str, float, float, float]], ours: Container[object]) -> None:
+    """Beside every point, where no other label and no point is. Limits and scales of the axis must stand."""
+    from matplotlib.transforms import Bbox
+
+    taken = []
+    for _, seconds, correct, _ in points:
+        x, y = axis.transData.transform((seconds, correct))
+        taken.append(Bbox.from_bounds(x - 4, y - 4, 8, 8))
+    for method, seconds, correct, right in points:
+        for side, (right_of, above) in (("left", (6, 5)), ("left", (6, -11)), ("right", (-6, 5)), ("right", (-6, -11))):
+            label = axis.annotate(
+                f"{method}, {100 * right:.1f} % right", (seconds, correct), xytext=(right_of, above),
+                textcoords="offset points", fontsize=8, color=_OURS if method in ours else _PEERS, ha=side, zorder=4,
+            )  # fmt: skip
+            box = label.get_window_extent()
+            if not any(box.overlaps(other) for other in taken) or (side, above) == ("right", -11):
+                taken.append(box)
+                break
+            label.remove()
+
+
 def draw_quality(path: Path, rows: Sequence[Row]) -> None:
     """Write an SVG. Ours have the seconds of the whole command too, which tells them from peers."""
     import matplotlib
@@ -40,18 +60,9 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
     ours = {row["method"] for row in rows if "run_seconds" in row}
     figure, axis = plt.subplots(figsize=_SIZE_IN)
     points = [point for point in quality(rows) if point[2] > 0.0]  # a logarithm has no place for none
-    places = np.log([point[1:3] for point in points])
-    for (method, seconds, correct, right), place in zip(points, places, strict=True):
-        colour = _OURS if method in ours else _PEERS
-        axis.scatter(seconds, correct, color=colour, s=36, zorder=3)
-        # Of two neighbours the upper one's label stands above it.
-        nearest = places[np.argsort(np.linalg.norm(places - place, axis=1))[:2]][-1]
-        beside = 6, 5 if place[1] >= nearest[1] else -11
-        axis.annotate(
-            f"{method}, {100 * right:.1f} % right", (seconds, correct), xytext=beside, textcoords="offset points",
-            fontsize=8, color=colour, zorder=4,
-        )  # fmt: skip
-    # Room for the labels, which stand to the right.
+    for method, seconds, correct, _ in points:
+        axis.scatter(seconds, correct, color=_OURS if method in ours else _PEERS, s=36, zorder=3)
+    # Room for the labels.
     low, high = 0.8 * min(point[1] for point in points), 4.0 * max(point[1] for point in points)
     bottom, top = 0.8 * min(point[2] for point in points), 1.2 * max(point[2] for point in points)
     for rate in _RATES:
@@ -70,6 +81,7 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
     axis.set_xlabel("seconds per pair: features, matching, verification")
     axis.set_ylabel("correct matches per pair")
     figure.tight_layout()
+    _label(axis, points, ours)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None})
     plt.close(figure)
