@@ -16,7 +16,7 @@ from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.report.figures import evenly_chosen
 from aeromatch_cli.report.previews import DrawnMatches, error_classes, turned_points
 from aeromatch_cli.report.rows import PairRow
-from aeromatch_cli.report.thumbnails import MAX_IMAGES, Thumbnails
+from aeromatch_cli.report.thumbnails import Thumbnails
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import write_text
 
@@ -83,7 +83,7 @@ def pair_data(
             data.pairs[keys[ids]] = (
                 _table(context, ids, places, errors_px), int(row.verified), int(row.matches_in or 0), row.state,
             )  # fmt: skip
-    if len(pictures) > MAX_IMAGES:
+    if pictures.beside:
         data.beside = sorted({int(key.partition(",")[0]) for key in data.pairs})
     return data, keys
 

@@ -201,13 +201,23 @@ def to_colour8(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     return np.stack([to_gray8(pixels[..., band]) for band in range(pixels.shape[2])], axis=-1)
 
 
-def jpeg_uri(pixels: NDArray[np.uint8], quality: int = 80) -> str:
+def jpeg_uri(pixels: NDArray[np.uint8]) -> str:
     """data: URI of (H, W) gray or (H, W, 3) RGB."""
+    return data_uri(jpeg(pixels))
+
+
+def data_uri(content: bytes) -> str:
+    """Of a JPEG."""
+    return "data:image/jpeg;base64," + base64.b64encode(content).decode("ascii")
+
+
+def jpeg(pixels: NDArray[np.uint8], quality: int = 80) -> bytes:
+    """Of (H, W) gray or (H, W, 3) RGB."""
     from PIL import Image
 
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(stream, "JPEG", quality=quality, optimize=True)
-    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return stream.getvalue()
 
 
 def _spread(points_px: FloatArray, limit: int) -> IntArray:

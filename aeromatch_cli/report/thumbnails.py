@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import io
 from collections.abc import Iterator, Mapping
@@ -19,7 +18,7 @@ from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink
-from aeromatch_cli.report.previews import to_colour8, turned
+from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import write_atomically
 
@@ -47,10 +46,11 @@ class _Thumbnail:
 
 
 class Thumbnails(Mapping[str, NDArray[np.uint8]]):
-    """image_id -> reduced raster (h, w, 3) as stored, of the images that can be read."""
+    """image_id -> reduced raster (h, w, 3) as stored, of the images that can be read. beside: they are files beside the
+    page."""
 
-    def __init__(self, pictures: Mapping[str, _Thumbnail]) -> None:
-        self._pictures = pictures
+    def __init__(self, pictures: Mapping[str, _Thumbnail], *, beside: bool) -> None:
+        self._pictures, self.beside = pictures, beside
 
     def __getitem__(self, image_id: str) -> NDArray[np.uint8]:
         from PIL import Image as PilImage
@@ -69,10 +69,7 @@ class Thumbnails(Mapping[str, NDArray[np.uint8]]):
     def link(self, image_id: str) -> tuple[str, int, int]:
         """For the page: a data URI or the file relative to it, and width and height in pixels, as viewers show it."""
         found = self._pictures[image_id]
-        if isinstance(found.place, bytes):
-            uri = "data:image/jpeg;base64," + base64.b64encode(found.place).decode("ascii")
-        else:
-            uri = f"{FOLDER}/{found.place.name}"
+        uri = data_uri(found.place) if isinstance(found.place, bytes) else f"{FOLDER}/{found.place.name}"
         return uri, found.width_px, found.height_px
 
 
@@ -90,7 +87,7 @@ def thumbnails(context: Context) -> Thumbnails:
     for path in sorted(folder.glob("*.jpg")):
         if path not in current:
             path.unlink(missing_ok=True)
-    return Thumbnails(pictures)
+    return Thumbnails(pictures, beside=beside)
 
 
 def _thumbnail(context: Context, side_px: int, folder: Path | None, image: Image) -> _Thumbnail | None:
@@ -131,12 +128,8 @@ def _known(file: Path, exif_orientation: int) -> _Thumbnail | None:
 
 
 def _encoded(path: Path, side_px: int, exif_orientation: int) -> _Thumbnail:
-    from PIL import Image as PilImage
-
-    shown = np.ascontiguousarray(turned(_small(path, side_px), exif_orientation))
-    stream = io.BytesIO()
-    PilImage.fromarray(shown).save(stream, "JPEG", quality=_QUALITY, optimize=True)
-    return _Thumbnail(stream.getvalue(), shown.shape[1], shown.shape[0], exif_orientation)
+    shown = turned(_small(path, side_px), exif_orientation)
+    return _Thumbnail(jpeg(shown, _QUALITY), shown.shape[1], shown.shape[0], exif_orientation)
 
 
 def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
