@@ -213,14 +213,14 @@ def faults(reader: Reader, cases: int, seed: int, folder: Path) -> Iterator[tupl
                 (folder / beside).write_bytes(content)
         data = damaged(reader.sound[name], rng)
         path.write_bytes(data)
-        started = time.monotonic()
+        started = time.process_time()  # not of the clock: other work may hold the machine up
         try:
             with contextlib.suppress(AeromatchError):
                 reader.read(path)
         except Exception:  # noqa: BLE001 - this is what is looked for
             yield name, data, traceback.format_exc(limit=-3)
-        if time.monotonic() - started > SLOWEST_S:
-            yield name, data, f"took {time.monotonic() - started:.0f} s"
+        if (took := time.process_time() - started) > SLOWEST_S:
+            yield name, data, f"took {took:.0f} s of the processor"
 
 
 def main() -> None:
