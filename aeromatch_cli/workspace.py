@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import os
 import socket
 import uuid
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aeromatch_cli.errors import ConfigError, WorkspaceError
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.fingerprints import contents_digest
 from aeromatch_cli.formats.reading import readable
-from aeromatch_cli.strategies import Strategy
 
 FORMAT_VERSION = 1
-_PROBE_BYTES = 1 << 20
+# What precedes the checksum of a JSON file.
+_CHECKSUM = ',\n "checksum": "'
 
 
 @dataclass(frozen=True)
@@ -101,12 +101,22 @@ class Workspace:
         return self.root / "reports"
 
     @property
+    def exports(self) -> Path:
+        """Record of the files that the exporters wrote."""
+        return self.root / "export" / "files.json"
+
+    @property
     def evaluation(self) -> Path:
         return self.root / "evaluation"
 
     @property
     def report(self) -> Path:
         return self.root / "report" / "index.html"
+
+    @property
+    def report_files(self) -> Path:
+        """Record of the report's files."""
+        return self.root / "report" / "files.json"
 
     def enhanced(self, image_id: str, suffix: str) -> Path:
         return self.root / "enhanced" / f"{image_id}{suffix}"
@@ -147,7 +157,8 @@ class Workspace:
         """Raises WorkspaceError where another format version wrote this workspace."""
         if not self.block.exists():
             return
-        found = read_json(self.block).get("format_version")
+        with readable(self.block, ValueError):  # of other versions it may have no checksum
+            found = _object(self.block.read_text(encoding="utf-8")).get("format_version")
         if found != FORMAT_VERSION:
             raise WorkspaceError(
                 f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
@@ -251,27 +262,51 @@ def write_bytes(path: Path, data: bytes) -> None:
     write_atomically(path, lambda stream: stream.write(data))
 
 
-def write_json(path: Path, value: Any) -> None:
-    write_text(path, json.dumps(value, indent=1, sort_keys=False, allow_nan=False) + "\n")
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """An object that is not empty; its last key is the checksum of what stands before."""
+    text = json.dumps(value, indent=1, sort_keys=False, allow_nan=False)
+    write_text(path, _with_checksum(text.removesuffix("\n}")))
+
+
+def _with_checksum(head: str) -> str:
+    return f'{head}{_CHECKSUM}{zlib.crc32(head.encode("utf-8")):08x}"\n}}\n'
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file. Raises BrokenFileError on anything else."""
+    """The object that `write_json` wrote. Raises BrokenFileError on anything else."""
     with readable(path, ValueError):
-        value = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(value, dict):
-            raise ValueError("it holds no JSON object")
+        text = path.read_text(encoding="utf-8")
+        value = _object(text)
+        if text != _with_checksum(text.rpartition(_CHECKSUM)[0]):
+            raise ValueError("its contents contradict its checksum")
+        del value["checksum"]
     return value
 
 
+def _object(text: str) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("it holds no JSON object")
+    return value
+
+
+def write_record(path: Path, head: Mapping[str, Any], names: Iterable[str]) -> None:
+    """A JSON record with the digests of files below its folder, for which it vouches: it is written last."""
+    write_json(path, {**head, "files": {name: contents_digest(path.parent / name) for name in sorted(names)}})
+
+
 def whole_record(path: Path) -> dict[str, Any]:
-    """A JSON record whose `files`, name -> digest, lie beside it as they were written; else nothing."""
+    """A record whose files are as they were written; else nothing."""
     if not path.is_file():
         return {}
     record = read_json(path)
-    folder = path.parent
-    whole = all((folder / n).is_file() and file_digest(folder / n) == d for n, d in record["files"].items())
-    return record if whole else {}
+    return {} if changed_files(path.parent, record) else record
+
+
+def changed_files(folder: Path, record: Mapping[str, Any]) -> list[str]:
+    """Those of a record's files that are no longer as they were written, or gone."""
+    paths = {name: folder / name for name in record["files"]}
+    return [n for n, path in paths.items() if not path.is_file() or contents_digest(path) != record["files"][n]]
 
 
 def remove_stale_temporaries(root: Path) -> None:
@@ -300,61 +335,3 @@ def _alive(pid: int) -> bool:
         return True  # no Linux
     # A zombie was killed and its parent has not asked for it yet: it writes nothing any more.
     return facts.rpartition(")")[2].split()[0] != "Z"
-
-
-def fingerprint(*parts: Any) -> str:
-    """SHA-256 (hex) of the canonical JSON of `parts`; strategies bring their name, settings and version."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=True)
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
-
-
-# Marks of a field's json_schema_extra that keep its value out of the fingerprint.
-_NO_RECIPE = frozenset({"path", "fingerprint"})
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Strategy):
-        # Contents, not places: another folder, or another machine's, makes no other recipe, nor does its device.
-        files = [file_digest(Path(path)) for path in value.fingerprint_files()]
-        extras = {name: field.json_schema_extra for name, field in type(value).model_fields.items()}
-        places = {name for name, extra in extras.items() if isinstance(extra, dict) and _NO_RECIPE & extra.keys()}
-        recipe = value.model_dump(exclude=places)
-        return {"class": type(value).__name__, "version": value.version, "files": files, **recipe}
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if hasattr(value, "__dataclass_fields__"):
-        return {key: getattr(value, key) for key in value.__dataclass_fields__}
-    raise TypeError(f"{type(value).__name__} cannot enter a fingerprint")
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 (hex) of a file that a strategy names; read again only when it has changed. Raises ConfigError."""
-    try:
-        status = path.stat()
-        return _file_digest(path, status.st_size, status.st_mtime_ns)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}, which the configuration names: {error.strerror}") from None
-
-
-@lru_cache(maxsize=64)
-def _file_digest(path: Path, size: int, stamp: int) -> str:
-    del size, stamp  # only tell changed files apart
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def image_fingerprint(path: Path) -> str:
-    """Size, modification time and SHA-256 of the first and last MiB: enough to notice a changed photograph."""
-    status = path.stat()
-    digest = hashlib.sha256(f"{status.st_size} {status.st_mtime_ns} ".encode())
-    with path.open("rb") as stream:
-        digest.update(stream.read(_PROBE_BYTES))
-        if status.st_size > _PROBE_BYTES:
-            stream.seek(max(_PROBE_BYTES, status.st_size - _PROBE_BYTES))
-            digest.update(stream.read(_PROBE_BYTES))
-    return digest.hexdigest()
-
-
-def stable_hash(text: str) -> int:
-    """The same number on every machine and in every process; shards and seeds come from it."""
-    return int.from_bytes(hashlib.sha256(text.encode("utf-8")).digest()[:8], "big")

@@ -152,7 +152,7 @@ def _copied(rendered: Path, folder: Path) -> Site:
 # --- comparing workspaces -----------------------------------------------------------------------------------------
 
 # The page tells the time at which it was made.
-_NOT_COMPARED = ("report/index.html", "reports/report.json")
+_NOT_COMPARED = ("report/index.html", "report/files.json", "reports/report.json")
 
 
 def contents(work: Path) -> dict[str, Any]:
@@ -174,7 +174,8 @@ def _content(path: Path, work: Path) -> Any:
     text = path.read_bytes().replace(str(work).encode(), b"WORK")
     if path.parent.name == "reports":
         report = json.loads(text)
-        # How it came about differs between a run and its resumption; what it is about does not.
+        # How it came about differs between a run and its resumption, seconds and so its checksum do too; what it is
+        # about does not.
         return {key: report[key] for key in ("stage", "items", "failed", "fingerprint", "failures")}
     return hashlib.sha256(text).hexdigest()
 

@@ -24,4 +24,4 @@ def read_inputs(
     lists = read_lists(None if poses is None else str(poses), cameras, angles)
     names, passed_over = scan_images(images, exclude)
     headers = {name: read_header(images / name) for name in names}
-    return block_inputs(images, lists, headers, passed_over, **settings)
+    return block_inputs(str(images), lists, headers, passed_over, **settings)

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import pytest
-from chaos import injected, prepared
+from chaos import Calm, injected
 
 pytestmark = pytest.mark.slow
-Calm = tuple[Path, dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
 def calm(tmp_path_factory: pytest.TempPathFactory) -> Calm:
-    return prepared(tmp_path_factory.mktemp("calm"))
+    return Calm(tmp_path_factory.mktemp("calm"))
 
 
-@pytest.mark.parametrize("kind", ["run killed with its workers", "disk full", "byte flipped", "two runs at once"])
-def test_a_fault_is_named_and_the_next_run_mends_it(
-    calm: tuple[Path, dict[str, Any]], tmp_path: Path, kind: str
-) -> None:
-    assert not injected(kind, 1, *calm, tmp_path)
+@pytest.mark.parametrize(
+    "kind", ["run killed with its workers", "disk full", "input replaced", "two runs at once", "permissions revoked"]
+)
+def test_a_fault_is_named_and_the_next_run_mends_it(calm: Calm, kind: str) -> None:
+    assert not injected(kind, 1, calm, "baseline")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_changed_byte_of_any_file_is_found(calm: Calm, seed: int) -> None:
+    assert not injected("byte flipped", seed, calm, "baseline")

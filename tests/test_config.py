@@ -10,7 +10,7 @@ from aeromatch_cli.config import FAMILIES, Settings, dump, load, parse_method, p
 from aeromatch_cli.config.page import page
 from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.workspace import fingerprint
+from aeromatch_cli.fingerprints import fingerprint
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

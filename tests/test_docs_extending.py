@@ -23,7 +23,7 @@ from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.data import Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import output, scores, totals
-from aeromatch_cli.workspace import fingerprint
+from aeromatch_cli.fingerprints import fingerprint
 
 PAGE = text_of(ROOT / "docs" / "extending.md")
 NEW_FILE = re.compile(r"(?m)^`(aeromatch_cli/[\w/]+\.py)`:\n\n((?:(?: {4}.*)?\n)+)")

@@ -18,7 +18,7 @@ from make_slow import slow_square
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor, Outcome, available_cores
-from aeromatch_cli.workspace import stable_hash
+from aeromatch_cli.fingerprints import stable_hash
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from safetensors.torch import load_file, save_file
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.precision import device_of
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
-from aeromatch_cli.workspace import fingerprint
 
 pytestmark = pytest.mark.slow
 

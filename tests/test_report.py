@@ -320,13 +320,8 @@ def test_shards_are_summed_per_stage(tmp_path):
     one = context(tmp_path, {}, ())
     for index in (1, 2):
         path = one.workspace.stage_report("match", f"{index}-of-2")
-        write_atomically(
-            path,
-            lambda s: s.write(
-                b'{"stage": "match", "seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1, "facts": {},'
-                b' "failures": []}'
-            ),
-        )
+        counts = {"seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1}
+        write_json(path, {"stage": "match", **counts, "facts": {}, "failures": []})
     (row,) = stage_rows(one.workspace)
     assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 3.0, 20, 18, 2)
 

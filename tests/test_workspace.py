@@ -20,17 +20,14 @@ from pydantic import Field
 from aeromatch_cli.config import FAMILIES
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import BrokenFileError, ConfigError, WorkspaceError
+from aeromatch_cli.fingerprints import file_digest, fingerprint, image_fingerprint, stable_hash
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import (
     FORMAT_VERSION,
     Workspace,
-    file_digest,
-    fingerprint,
-    image_fingerprint,
     read_json,
     remove_stale_temporaries,
-    stable_hash,
     write_atomically,
     write_json,
     write_text,
@@ -239,7 +236,8 @@ def test_json_round_trip_and_no_nan(tmp_path: Path) -> None:
 
 def test_fingerprint_is_the_same_in_another_process() -> None:
     code = (
-        "from aeromatch_cli.config import Settings\nfrom aeromatch_cli.workspace import fingerprint, stable_hash\n"
+        "from aeromatch_cli.config import Settings\n"
+        "from aeromatch_cli.fingerprints import fingerprint, stable_hash\n"
         "s = Settings()\nprint(fingerprint(s.pairs, s.extract, s.match, s.filter, {'b': 1.5, 'a': None}))\n"
         "print(stable_hash('a/ü'))"
     )

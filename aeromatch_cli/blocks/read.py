@@ -114,7 +114,7 @@ def read_lists(
 
 
 def block_inputs(
-    images_dir: Path,
+    images_dir: str,
     lists: GivenLists,
     headers: Mapping[str, ExifFacts | str],
     passed_over: Sequence[ScanFailure] = (),
@@ -218,7 +218,7 @@ def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[
     return [f"passed over {len(items)}: {listed(items)}: {reason}" for reason, items in passed.items()], failures
 
 
-def _nothing_left(images_dir: Path, failures: list[ReadFailure]) -> str:
+def _nothing_left(images_dir: str, failures: list[ReadFailure]) -> str:
     if not failures:
         return f"no image (jpg, jpeg, png, tif, tiff) in {images_dir}: check --images"
     return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"

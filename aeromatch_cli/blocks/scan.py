@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,8 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 _FOLDER_MARK = "--"
 _LONGEST_SLUG = 150
 _HASH_DIGITS = 10
+_APPLE_DOUBLE = "is macOS metadata (AppleDouble), not an image"
+_EMPTY = "file is empty: copy it again"
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,26 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
     return sorted(names), sorted(failures, key=lambda failure: failure.name)
 
 
+def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[ScanFailure]]:
+    """The same of a listing: relative name -> size of every file below a folder that is not on this machine."""
+    names: list[str] = []
+    failures: list[ScanFailure] = []
+    for name, size_bytes in sorted(sizes_bytes.items()):
+        *parents, file = name.split("/")
+        if Path(file).suffix.lower() not in SUFFIXES or any(part.startswith(".") for part in parents):
+            continue
+        if file.startswith("._"):
+            failures.append(ScanFailure(name, _APPLE_DOUBLE, False))
+        elif size_bytes == 0:
+            failures.append(ScanFailure(name, _EMPTY, True))
+        elif not file.startswith("."):
+            names.append(name)
+    return names, failures
+
+
 def _failure_of(path: Path, name: str) -> ScanFailure | None:
     if path.name.startswith("._"):
-        return ScanFailure(name, "is macOS metadata (AppleDouble), not an image", False)
+        return ScanFailure(name, _APPLE_DOUBLE, False)
     if path.name.startswith("."):
         return None
     try:
@@ -96,7 +115,7 @@ def _failure_of(path: Path, name: str) -> ScanFailure | None:
         return ScanFailure(name, f"cannot be read ({error.strerror}): broken link or missing permission", True)
     if not path.is_file():
         return ScanFailure(name, "is not a regular file", False)
-    return ScanFailure(name, "file is empty: copy it again", True) if size_bytes == 0 else None
+    return ScanFailure(name, _EMPTY, True) if size_bytes == 0 else None
 
 
 def identifier(text: str) -> str:

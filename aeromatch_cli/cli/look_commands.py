@@ -153,6 +153,7 @@ def init(
 
     def call() -> Result:
         from aeromatch_cli.config.overview import first_settings
+        from aeromatch_cli.images.remote import is_remote
         from aeromatch_cli.stages.run import Result
         from aeromatch_cli.workspace import write_text
 
@@ -160,7 +161,9 @@ def init(
             raise ConfigError("no images: give --images DIR")
         if out.exists():
             raise ConfigError(f"{out} exists and is not replaced: give another name, or delete it")
-        text, found = first_settings(images, out.absolute().parent)
+        if is_remote(images):
+            raise ConfigError(f"init looks at a folder of this machine, not at {images}: write the file by hand")
+        text, found = first_settings(Path(images), out.absolute().parent)
         write_text(out, text)
         return Result((*found, f"written to {out}: aeromatch run {out}"), {"file": str(out), "found": found})
 

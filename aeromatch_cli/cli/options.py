@@ -38,14 +38,14 @@ Config = Annotated[
     ),
 ]
 Images = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--images",
-        metavar="DIR",
+        metavar="DIR|URL|ZIP",
         envvar="AEROMATCH_IMAGES",
         show_envvar=False,
         rich_help_panel=_BLOCK,
-        help="Folder of images, searched recursively.",
+        help="Folder of images, searched recursively; or a URL (s3://, gs://, https://), or a zip archive.",
     ),
 ]
 Poses = Annotated[

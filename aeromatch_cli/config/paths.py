@@ -41,6 +41,8 @@ def absolute_paths(differences: Mapping[str, Any], tree: Mapping[str, Any], fold
 def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
     if key not in PATH_KEYS or not isinstance(value, str) or not value or value in _WORDS.get(key, ()):
         return value
+    if key == "images" and "://" in value:
+        return value
     return value if key == "ground" and _is_number(value) else _below(folder, value)
 
 

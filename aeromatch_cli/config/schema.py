@@ -52,7 +52,11 @@ class _Section(BaseModel):
 class BlockSettings(_Section):
     """What was flown: images, poses, cameras, ground."""
 
-    images: str = Field("", description="Folder of images, searched recursively.")
+    images: str = Field(
+        "",
+        description="Folder of images, searched recursively; or a zip archive, or the URL of an object store or web "
+        "server (`s3://bucket/block`), of which copies are kept in the cache folder.",
+    )
     poses: str = Field(
         "exif", description="Pose file of any format in `pose_format`, `exif` for GPS and XMP angles, or `none`."
     )

@@ -18,12 +18,13 @@ from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
+from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.workspace import Workspace, file_digest
+from aeromatch_cli.workspace import Workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
 MIN_OVERLAP = 0.20

@@ -8,6 +8,8 @@ Python objects.
 - Pixels are (x, y); (0, 0) is the centre of the top-left pixel of the stored raster, whatever its EXIF Orientation.
 - Metres are in the world frame: the CRS of `block.json` minus its `origin_m`. x is east, y north, z up.
 - Poses are `cam_from_world`: the camera has x right, y down, z forward.
+- JSON files end with `checksum`: CRC-32 (hex) of the text before it. `files` of a record: SHA-256 of files beside it;
+  of an SQLite database without journal mode and counters, which change when it is read.
 - Files appear under their name complete or not at all. A fingerprint is a SHA-256 of all settings and inputs that a
   result depends on; a result is up to date where it is present with an equal fingerprint.
 
@@ -121,13 +123,14 @@ Features and matches of reduced images; laid out like this workspace. It may be 
 
 ### enhanced/<id>.png, <id>.mask.png, <id>.json
 
-The enhanced picture (kept by the single stage and with `--keep-images`); the mask (255 = treated); `fingerprint`,
-`picture` (whether the picture is kept) and the strategy's own facts. Images that are not enhanced have none.
+The enhanced picture (kept by the single stage and with `--keep-images`); the mask (255 = treated); a record with
+`fingerprint`, `picture` (whether the picture is kept), the strategy's own facts and `files`. Images that are not
+enhanced have none.
 
 ### simulated/<id>/views.json, <view>.png
 
-- `fingerprint`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views were made
-  of.
+- `fingerprint`, `files`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views
+  were made of.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
   With `scale` < 1 the camera is the one resized by it.
@@ -231,6 +234,10 @@ Written by `aeromatch evaluate`: `evaluation.json` (`format_version`, `workspace
 `left_out`, `min_overlap`, `totals`, `conditions`, `summary`, `consumer`, `seconds`; null where unknown), `pairs.csv`
 (one
 line per pair), `conditions.csv`, plots as PNG.
+
+### export/files.json, report/files.json
+
+`files`: of all that the exporters, or the report, have written. What differs is made again.
 
 ### export/colmap/
 

@@ -13,6 +13,7 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.files import read_mask, read_raster
 from aeromatch_cli.images.masks import below_horizon, without_frames
+from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink, shrink_camera
 
 
@@ -20,17 +21,23 @@ from aeromatch_cli.images.scaling import shrink, shrink_camera
 class Source:
     """A stored picture, and the scale at which it is used.
 
-    mask: file or None. camera: of the stored raster. sky_rotation: world_rotation (3, 3) of the pose where the image
-    sees above the horizon, else None. scale: stored raster to the raster worked on, at most 1 (--max-size).
-    fingerprint: of all that its pixels depend on.
+    picture: its file, here or elsewhere. mask: file or None. camera: of the stored raster. sky_rotation: world_rotation
+    (3, 3) of the pose where the image sees above the horizon, else None. scale: stored raster to the raster worked on,
+    at most 1 (--max-size). fingerprint: of all that its pixels depend on. taken: of the file alone.
     """
 
-    path: Path
+    picture: Path | RemoteFile
     mask: Path | None
     camera: Camera
     sky_rotation: FloatArray | None
     scale: float
     fingerprint: str
+    taken: str = ""
+
+    @property
+    def path(self) -> Path:
+        """The file on this machine, fetched where it lies elsewhere. Raises ItemError where that fails."""
+        return on_disk(self.picture)
 
     @property
     def working_camera(self) -> Camera:

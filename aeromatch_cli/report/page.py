@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
@@ -41,7 +42,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.workspace import fingerprint, read_json, write_text
+from aeromatch_cli.workspace import read_json, write_record, write_text
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
 MAX_TABLE_ROWS = 2000
@@ -68,6 +69,10 @@ def run(context: Context) -> StageReport:
     pairs, images = gather(context)
     page = render(context, pairs, images)
     write_text(context.workspace.report, page)
+    record = context.workspace.report_files
+    folder = record.parent
+    names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file() and path != record)
+    write_record(record, {}, names)
     report.done = 1
     report.fingerprint = fingerprint([vars(row) for row in pairs], [vars(row) for row in images])
     report.facts = {"page": "report/index.html", "bytes": len(page.encode("utf-8"))}

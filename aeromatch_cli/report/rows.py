@@ -24,6 +24,7 @@ from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.images.remote import RemoteFile
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
@@ -261,7 +262,10 @@ def _pose_words(context: Context, image: Image) -> str:
 
 
 def _href(context: Context, image: Image) -> str:
-    """Link from the report to the picture; "" where there is none (another drive on Windows)."""
+    """Link from the report to the picture; "" where there is none (another drive on Windows, an object store)."""
+    if isinstance(context.picture(image), RemoteFile):
+        address = str(context.picture(image))
+        return address if address.startswith(("https://", "http://")) else ""
     try:
         relative = os.path.relpath(context.image_path(image), context.workspace.report.parent)
     except ValueError:

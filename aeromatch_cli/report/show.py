@@ -21,6 +21,7 @@ from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verif
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import STAGE_ORDER
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
@@ -87,10 +88,10 @@ class _Work:
         found = load(str(self.workspace.config))
         return found.model_copy(update={"workspace": str(self.workspace.root)})
 
-    @cached_property
-    def folder(self) -> Path:
-        """Of the images."""
-        return Path(self.settings.block.images)
+    def picture(self, image: Image) -> Path:
+        """The file of an image."""
+        folder = self.settings.block.images
+        return on_disk(remote_file(folder, image.name)) if is_remote(folder) else Path(folder) / image.name
 
     def image(self, text: str) -> Image:
         """By name, file name, stem or id. Raises ConfigError where none or several fit."""
@@ -214,7 +215,7 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
         if path.exists():
             lines.append(f"{what:<11} {path}")
     target = out or workspace.root / "show" / f"{image_id}.png"
-    picture = image_picture(read_pixels(work.folder / image.name, colour=True), keypoints, matched)
+    picture = image_picture(read_pixels(work.picture(image), colour=True), keypoints, matched)
     tiles = [Tile("keypoints: in verified matches green, others red", picture)]
     if views:
         tiles += tiles_of_image(steps_of_image(work.settings, image_id))
@@ -269,7 +270,7 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     sides = [work.keypoints_px(i) for i in ids]
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
-    pixels = [read_pixels(work.folder / image.name, colour=True) for image in (image0, image1)]
+    pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
     target = out or workspace.root / "show" / f"{ids[0]}--{ids[1]}.png"
     words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
     tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, errors, dropped))]

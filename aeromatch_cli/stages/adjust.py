@@ -15,6 +15,7 @@ import numpy as np
 from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.geometry.cameras import focal_px
@@ -27,15 +28,7 @@ from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
-from aeromatch_cli.workspace import (
-    file_digest,
-    fingerprint,
-    translated_os_errors,
-    whole_record,
-    write_atomically,
-    write_json,
-    write_text,
-)
+from aeromatch_cli.workspace import translated_os_errors, whole_record, write_atomically, write_record, write_text
 
 VERSION = 16
 # A focal length that the adjustment changed by more than this share is said.
@@ -121,9 +114,8 @@ def _write(context: Context, adjusted: AdjustedBlock, report: StageReport) -> No
     folder = context.workspace.orientation
     write_atomically(context.workspace.adjusted, lambda stream: write_adjusted(stream, adjusted))
     write_text(folder / "orientation.csv", orientation_text(adjusted, context.block))
-    files = {name: file_digest(folder / name) for name in ("adjusted.npz", "orientation.csv")}
-    record = {"fingerprint": report.fingerprint, "facts": report.facts, "files": files}
-    write_json(folder / "adjusted.json", record)
+    head = {"fingerprint": report.fingerprint, "facts": report.facts}
+    write_record(folder / "adjusted.json", head, ("adjusted.npz", "orientation.csv"))
 
 
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -18,16 +18,18 @@ from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
-from aeromatch_cli.blocks.scan import scan_images
+from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
+from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
-from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, image_fingerprint, read_json
+from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, read_json
 
 log = logging.getLogger("aeromatch")
 
@@ -52,6 +54,7 @@ class BlockRead:
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
     recognised: str
+    remote: Mapping[str, RemoteFile]
     gsd_before_m: float | None
     ground_hint: tuple[Ground, str] | None
 
@@ -62,7 +65,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         raise ConfigError("no images: give --images DIR, or block.images in the configuration")
     _check_folders(settings, workspace)
     before = read_json(workspace.block) if workspace.block.is_file() else {}
-    inputs, prints = _read_inputs(settings, workspace, executor, before)
+    inputs, prints, remote = _read_inputs(settings, workspace, executor, before)
     ground, source, remarks = given_ground(settings, inputs)
     control, absent = read_control(settings.block.gcp, inputs.images, inputs.crs, inputs.origin_m)
     absent += far_control(control, inputs.poses, settings.block.gcp)
@@ -86,6 +89,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         recognised=inputs.recognised,
+        remote=remote,
         gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
         ground_hint=None
         if inputs.ground_hint_z_m is None or inputs.ground_is_stated
@@ -137,16 +141,23 @@ def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
 
 def _read_inputs(
     settings: Settings, workspace: Workspace, executor: Executor, before: Mapping[str, Any]
-) -> tuple[BlockInputs, dict[str, str]]:
-    """Inputs, and the fingerprint of every image by image_id."""
+) -> tuple[BlockInputs, dict[str, str], dict[str, RemoteFile]]:
+    """Inputs, the fingerprint of every image by image_id, and by name those that lie elsewhere."""
     given, root = settings.block, Path(settings.block.images)
     lists = read_lists("" if given.poses == "none" else given.poses, given.cameras, given.angles, given.pose_format)
-    names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
-    outcomes = dict(zip(names, executor.run(_read_header, [root / name for name in names], "read"), strict=True))
+    remote: dict[str, RemoteFile] = {}
+    if is_remote(given.images):
+        with executor.step("list"):
+            remote = list_remote(given.images)
+        names, passed_over = scan_files({name: file.size_bytes for name, file in remote.items()})
+    else:
+        names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
+    pictures = [remote.get(name) or root / name for name in names]
+    outcomes = dict(zip(names, executor.run(_read_header, pictures, "read"), strict=True))
     # The origin of an earlier run is kept, unless the user now asks for another CRS.
     frame = WorldFrame(before["given_crs"], tuple(before["given_origin_m"])) if "given_crs" in before else None
     inputs = block_inputs(
-        root,
+        given.images,
         lists,
         {name: outcome.value[0] if outcome.value else outcome.error for name, outcome in outcomes.items()},
         passed_over,
@@ -156,11 +167,12 @@ def _read_inputs(
         known_frame=frame if frame is not None and given.crs in ("auto", frame.crs) else None,
     )
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
-    return inputs, {image.image_id: prints[image.name] for image in inputs.images}
+    return inputs, {image.image_id: prints[image.name] for image in inputs.images}, remote
 
 
-def _read_header(path: Path) -> tuple[ExifFacts | str, str]:
+def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:
     """What a picture's header says, or why it is unusable, and the fingerprint of the file."""
+    path = on_disk(picture)
     try:
         return exif_or_reason(path), image_fingerprint(path)
     except OSError as error:

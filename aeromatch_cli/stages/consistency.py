@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Pair, Verdict
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
-from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.features import check_sums, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
@@ -25,7 +26,7 @@ from aeromatch_cli.stages.filter import Judged, select, verified_pairs
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
-from aeromatch_cli.workspace import Workspace, fingerprint, read_json, translated_os_errors, write_atomically
+from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
 
 VERSION = 3
 
@@ -50,6 +51,7 @@ def run(context: Context) -> StageReport:
     report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context))
     last = context.workspace.stage_report("consistency")
     if not context.overwrite and path.is_file() and last.is_file():
+        check_sums(path)
         before = read_json(last)
         if before.get("fingerprint") == report.fingerprint:
             report.skipped, report.facts = report.items, before["facts"]

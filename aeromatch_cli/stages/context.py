@@ -12,11 +12,13 @@ from typing import Any
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.workspace import Workspace, fingerprint
+from aeromatch_cli.workspace import Workspace
 
 # A focal length with a larger standard deviation, as a share of it, is a guess.
 _GUESS = 0.2
@@ -50,6 +52,8 @@ class Context:
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
+    # By name; none where the images lie in a folder.
+    remote: Mapping[str, RemoteFile] = field(default_factory=dict)
     # The pairs that are worked on, of a step of a cascade; None: all.
     chosen: frozenset[tuple[str, str]] | None = None
     # Fingerprints of features and matches that steps of a cascade have made together; None without a cascade.
@@ -90,8 +94,13 @@ class Context:
                 rows.setdefault(pair.image_id0, []).append(pair)
         return rows
 
+    def picture(self, image: Image) -> Path | RemoteFile:
+        """Where an image lies, here or elsewhere."""
+        return self.remote.get(image.name) or Path(self.settings.block.images) / image.name
+
     def image_path(self, image: Image) -> Path:
-        return Path(self.settings.block.images) / image.name
+        """Its file on this machine. Raises ItemError where it cannot be fetched."""
+        return on_disk(self.picture(image))
 
     def pose(self, image_id: str) -> Pose | None:
         return self.block.poses.get(image_id)

@@ -9,6 +9,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Image
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
 from aeromatch_cli.images.source import Source, read_source
@@ -16,7 +18,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import PIPELINE_VERSION, library_version
 from aeromatch_cli.strategies import Enhanced, Enhancer
-from aeromatch_cli.workspace import Workspace, fingerprint, image_fingerprint, read_json, write_atomically, write_json
+from aeromatch_cli.workspace import Workspace, whole_record, write_atomically, write_record
 
 # Among a stage's facts: how many images are not enhanced because they and those they are paired with were taken under
 # the same illumination.
@@ -79,12 +81,13 @@ def source_of(context: Context, image: Image) -> Source:
         context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
     ]
     return Source(
-        path=context.image_path(image),
+        picture=context.picture(image),
         mask=mask,
         camera=camera,
         sky_rotation=pose.world_rotation if sky and pose else None,
         scale=scale,
         fingerprint=fingerprint(*parts),
+        taken=context.image_fingerprints[image.image_id],
     )
 
 
@@ -93,9 +96,21 @@ def _is_skipped(context: Context, image: Image) -> bool:
     return enhancer.keep_source and context.same_illumination(image.image_id, enhancer.same_illumination_minutes)
 
 
+def check_unchanged(source: Source) -> None:
+    """Raise ItemError where the picture is no longer the one that the command found when it began: what is made of
+    another one must not be taken for its result."""
+    path = source.path
+    try:
+        same = image_fingerprint(path) == source.taken
+    except OSError as error:
+        raise ItemError(f"{path} is gone since the command began ({error.strerror}): put it back, run again") from None
+    if not same:
+        raise ItemError(f"{path} has changed since the command began: run the same command again")
+
+
 def enhanced(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanced]:
     """Pixels as taken, their validity, and what the strategy made of them; always made anew: a PNG costs more."""
-    pixels, valid = read_source(task.source, colour=task.colour)
+    pixels, valid = _read(task)
     return pixels, valid, task.enhancer(pixels, valid)
 
 
@@ -103,28 +118,35 @@ def for_views(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None, Enhanc
     """The same for the stages after this one: an image that is skipped as it was taken."""
     if not task.skipped:
         return enhanced(task)
-    pixels, valid = read_source(task.source, colour=task.colour)
+    pixels, valid = _read(task)
     return pixels, valid, Enhanced(pixels)
 
 
+def _read(task: EnhanceTask) -> tuple[NDArray[Any], BoolArray | None]:
+    found = read_source(task.source, colour=task.colour)
+    check_unchanged(task.source)
+    return found
+
+
 def keep(task: EnhanceTask, result: Enhanced, *, picture: bool) -> None:
-    """Write mask and facts, and with `picture` the enhanced pixels; an image that stays as it was taken leaves nothing.
+    """Write mask and record, and with `picture` the enhanced pixels; an image left as it was taken leaves nothing.
 
     What other settings left goes: a mask of theirs would be taken for this one's. A picture of these very settings
     stays in any case.
     """
     picture = picture and not task.as_taken
     stays = picture or _has_picture(task)
-    kept = {".png": stays, ".mask.png": result.mask is not None, ".json": stays or bool(result.info)}
+    kept = {".png": stays, ".mask.png": result.mask is not None, ".json": not task.as_taken}
     _remove(task, [suffix for suffix, wanted in kept.items() if not wanted])
     if picture:
         write_atomically(task.workspace.enhanced(task.image_id, ".png"), lambda s: write_png(s, result.pixels))
     mask = result.mask
     if mask is not None:
         write_atomically(task.workspace.enhanced(task.image_id, ".mask.png"), lambda s: write_png(s, mask))
-    if kept[".json"]:
-        facts = task.workspace.enhanced(task.image_id, ".json")
-        write_json(facts, {"fingerprint": task.fingerprint, "picture": stays, **result.info})
+    if kept.pop(".json"):
+        names = [f"{task.image_id}{suffix}" for suffix, wanted in kept.items() if wanted]
+        head = {"fingerprint": task.fingerprint, "picture": stays, **result.info}
+        write_record(task.workspace.enhanced(task.image_id, ".json"), head, names)
 
 
 def _remove(task: EnhanceTask, suffixes: Iterable[str]) -> None:
@@ -168,10 +190,15 @@ def is_done(task: EnhanceTask) -> bool:
     return task.as_taken or _has_picture(task)
 
 
+def is_kept(task: EnhanceTask) -> bool:
+    """Whether what `keep` leaves in any case is on file."""
+    return task.as_taken or _record(task).get("fingerprint") == task.fingerprint
+
+
 def _has_picture(task: EnhanceTask) -> bool:
     """Whether the picture on file is of these very settings and inputs."""
-    picture, facts = (task.workspace.enhanced(task.image_id, suffix) for suffix in (".png", ".json"))
-    if task.as_taken or not (picture.is_file() and facts.is_file()):
-        return False
-    found = read_json(facts)
-    return found.get("fingerprint") == task.fingerprint and bool(found.get("picture"))
+    return not task.as_taken and is_kept(task) and bool(_record(task)["picture"])
+
+
+def _record(task: EnhanceTask) -> dict[str, Any]:
+    return whole_record(task.workspace.enhanced(task.image_id, ".json"))

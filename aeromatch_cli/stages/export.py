@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.stages.adjust import adjusted_block
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
@@ -15,7 +16,9 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint
 from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.workspace import file_digest, fingerprint, read_json, translated_os_errors
+from aeromatch_cli.workspace import Workspace, changed_files, read_json, translated_os_errors, write_record
+
+log = logging.getLogger("aeromatch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +56,7 @@ def run(context: Context) -> StageReport:
         not context.overwrite
         and last.is_file()
         and (found := read_json(last)).get("fingerprint") == wanted
-        and _complete(folders, found["facts"])
+        and _complete(context.workspace)
     ):
         report.skipped = report.items
         report.facts = found["facts"]
@@ -68,16 +71,26 @@ def run(context: Context) -> StageReport:
     alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
     done = run_stage(alone, report, _run_task, tasks, names)
     report.facts = {str(facts["name"]): facts for facts in done}
+    written = [f"{facts['name']}/{name}" for facts in done for name in facts["files"]]
+    write_record(context.workspace.exports, {}, written)
     report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)
 
 
-def _complete(folders: list[Path], facts: Mapping[str, Any]) -> bool:
-    """Whether every file that the exporters wrote is still there."""
-    return all(
-        folder.name in facts and all((folder / name).is_file() for name in facts[folder.name]["files"])
-        for folder in folders
-    )
+def _complete(workspace: Workspace) -> bool:
+    """Whether every file that the exporters wrote is as they wrote it; says which one is not."""
+    record = workspace.exports
+    if not record.is_file():
+        return False
+    changed = changed_files(record.parent, read_json(record))
+    if changed:
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        log.warning(
+            "warning: %s%s was changed or deleted since it was written: the export is made again",
+            record.parent / changed[0],
+            more,
+        )
+    return not changed
 
 
 def _run_task(task: ExportTask) -> dict[str, Any]:

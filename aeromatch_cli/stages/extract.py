@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Features, Image
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images.depth import sample_colours
@@ -16,7 +17,7 @@ from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Extractor
-from aeromatch_cli.workspace import fingerprint, write_atomically
+from aeromatch_cli.workspace import write_atomically
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +117,11 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
 
 def _is_done(task: ExtractTask) -> bool:
     source = task.views.enhance
-    if known_fingerprint(task.path) != task.fingerprint or not source.workspace.views(source.image_id).is_file():
+    if known_fingerprint(task.path) != task.fingerprint:
         return False
-    return not task.keep_images or (enhance.is_done(source) and simulate.is_done(task.views))
+    if task.keep_images:
+        return enhance.is_done(source) and simulate.is_done(task.views)
+    return enhance.is_kept(source) and simulate.is_kept(task.views)
 
 
 def current(context: Context, image_ids: Iterable[str]) -> set[str]:

@@ -12,11 +12,11 @@ from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGround
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, FloatArray, Ground
+from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.orientation.dem import Terrain
 from aeromatch_cli.orientation.judgement import heights_above_m
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.orienters import GivenPoses
-from aeromatch_cli.workspace import image_fingerprint
 
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
 # that differs by more than so many standard deviations of a position, whichever is more.

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.images.source import Source
@@ -15,12 +16,13 @@ from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.enhance import check_unchanged
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
-from aeromatch_cli.workspace import Workspace, fingerprint, write_atomically
+from aeromatch_cli.workspace import Workspace, write_atomically
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,8 @@ def _match_pair(task: MatchTask, pair: PairTask, features0: Features, ahead: dic
     if matches is None:
         sources = (task.sources[ids[0]], task.sources[ids[1]]) if matcher.reads_pixels else None
         matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
+        for source in sources or ():
+            check_unchanged(source)
     return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, rows.features_of(task.workspace, *ids))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
@@ -42,16 +43,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
-from aeromatch_cli.workspace import (
-    file_digest,
-    fingerprint,
-    read_json,
-    translated_os_errors,
-    whole_record,
-    write_bytes,
-    write_json,
-    write_text,
-)
+from aeromatch_cli.workspace import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
 
 log = logging.getLogger("aeromatch")
 
@@ -326,8 +318,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
             old.unlink(missing_ok=True)
     large = {key: solution.facts[key] for key in ("tied", "similar", "groups")}
     facts = {key: value for key, value in solution.facts.items() if key not in large}
-    files = {name: file_digest(folder / name) for name in names}
-    write_json(path, {**head, "facts": facts, **large, "files": files})
+    write_record(path, {**head, "facts": facts, **large}, names)
     return read_json(path)
 
 

@@ -13,6 +13,7 @@ from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
@@ -24,7 +25,7 @@ from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
-from aeromatch_cli.workspace import Workspace, file_digest, fingerprint, read_json, write_json, write_text
+from aeromatch_cli.workspace import Workspace, read_json, write_json, write_text
 
 log = logging.getLogger("aeromatch")
 
@@ -149,6 +150,7 @@ def _context(
         focal_sigmas=found.focal_sigmas,
         likely_focals=found.likely_focals,
         angles=found.angles,
+        remote=found.remote,
         control=found.control,
         shard=shard,
         overwrite=overwrite,

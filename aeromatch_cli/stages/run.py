@@ -12,8 +12,9 @@ from typing import Any
 
 from aeromatch_cli import report
 from aeromatch_cli.config import Settings
-from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
+from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -35,7 +36,14 @@ from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.workspace import Workspace, locked, read_json, remove_stale_temporaries, translated_os_errors
+from aeromatch_cli.workspace import (
+    Workspace,
+    locked,
+    read_json,
+    remove_stale_temporaries,
+    translated_os_errors,
+    whole_record,
+)
 
 log = logging.getLogger("aeromatch")
 
@@ -80,16 +88,19 @@ def execute(
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     with ExitStack() as stack:
-        if command != "check" and Path(settings.block.images or ".").is_dir():
+        if command != "check" and (not settings.block.images or _there(settings)):
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 return _repairing(command, settings, executor, part, overwrite, _Said(say))
-        except BaseException:
+        except BaseException as error:
             # Workers are stopped in the middle of what they write.
             if command != "check":
                 remove_stale_temporaries(Path(settings.workspace))
+            if isinstance(error, PermissionError):  # even looking into a folder may fail
+                words = f"cannot read {error.filename} ({error.strerror}): check its permissions"
+                raise WorkspaceError(words) from error
             raise
 
 
@@ -130,9 +141,7 @@ def _attempt(
     command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
 ) -> Result:
     dry = command == "check"
-    # Without images nothing is made at all.
-    there = bool(settings.block.images) and Path(settings.block.images).is_dir()
-    if there and (words := changed_words(Workspace(Path(settings.workspace)).config, settings)):
+    if _there(settings) and (words := changed_words(Workspace(Path(settings.workspace)).config, settings)):
         said(f"changed          {words}")
     context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":
@@ -155,6 +164,12 @@ def _attempt(
             "(`aeromatch run` does everything)"
         )
     return _result(command, context, reports, said)
+
+
+def _there(settings: Settings) -> bool:
+    """Whether there may be images: without any nothing is made at all."""
+    images = settings.block.images
+    return bool(images) and (is_remote(images) or Path(images).is_dir())
 
 
 def _one_stage(command: str, context: Context) -> list[StageReport]:
@@ -197,10 +212,12 @@ def _run_all(context: Context) -> list[StageReport]:
 
 
 def _current_page(context: Context) -> StageReport | None:
-    """The page's report, where the page is younger than everything that it tells of."""
+    """The page's report, where the page is as it was written and younger than everything that it tells of."""
     workspace = context.workspace
     own = workspace.stage_report("report")
     if context.overwrite or not (workspace.report.is_file() and own.is_file()):
+        return None
+    if not whole_record(workspace.report_files):
         return None
     told = [path for path in workspace.reports.glob("*.json") if path != own]
     told += [workspace.config, workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]

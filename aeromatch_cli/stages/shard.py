@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.workspace import stable_hash
+from aeromatch_cli.fingerprints import stable_hash
 
 
 @dataclass(frozen=True)

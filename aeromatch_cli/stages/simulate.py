@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Image, Neighbour, Pose, View
+from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.views import render_view
@@ -19,7 +20,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
-from aeromatch_cli.workspace import fingerprint, read_json, write_atomically, write_json
+from aeromatch_cli.workspace import whole_record, write_atomically, write_record
 
 # Name of the source view that images get besides their simulated ones where other images have no attitude.
 _ADDED = "as-taken"
@@ -110,7 +111,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
         for item in pictures:
             gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
             write_atomically(workspace.view(image_id, item.view.name), partial(write_png, pixels=gray))
-    write_json(
+    write_record(
         workspace.views(image_id),
         {
             "fingerprint": task.fingerprint,
@@ -129,6 +130,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
                 for view in (item.view for item in pictures)
             ],
         },
+        [f"{item.view.name}.png" for item in pictures] if stay else (),
     )
 
 
@@ -167,11 +169,13 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    workspace, image_id = task.enhance.workspace, task.enhance.image_id
-    path = workspace.views(image_id)
-    if not path.is_file():
-        return False
-    found = read_json(path)
-    if found.get("fingerprint") != task.fingerprint or not found.get("pictures"):
-        return False
-    return all(workspace.view(image_id, view["name"]).is_file() for view in found["views"])
+    return is_kept(task) and bool(_record(task)["pictures"])
+
+
+def is_kept(task: SimulateTask) -> bool:
+    """Whether what `keep` leaves in any case is on file."""
+    return bool(_record(task).get("fingerprint") == task.fingerprint)
+
+
+def _record(task: SimulateTask) -> dict[str, Any]:
+    return whole_record(task.enhance.workspace.views(task.enhance.image_id))

@@ -6,7 +6,7 @@ from importlib import metadata
 from pathlib import Path
 
 import aeromatch_cli
-from aeromatch_cli.workspace import file_digest, fingerprint
+from aeromatch_cli.fingerprints import file_digest, fingerprint
 
 # Source that answers depend on, below the package or scripts. Peers read no more of the package than lens models.
 PEER_CODE = ("geometry/cameras.py", "geometry/frames.py", "benchmarks/peers", "benchmarks/processes.py")

@@ -1,0 +1,89 @@
+"""Fingerprints: what says that two results are the same one, without comparing them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.strategies import Strategy
+
+_PROBE_BYTES = 1 << 20
+# An SQLite database begins with this; whoever only reads it may change its journal mode (1, 1 or 2, 2) and counters.
+_SQLITE = b"SQLite format 3\0"
+_SQLITE_MODE, _SQLITE_COUNTERS = slice(18, 20), (slice(24, 28), slice(92, 100))
+
+
+def fingerprint(*parts: Any) -> str:
+    """SHA-256 (hex) of the canonical JSON of `parts`; strategies bring their name, settings and version."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=_plain, allow_nan=True)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+# Marks of a field's json_schema_extra that keep its value out of the fingerprint.
+_NO_RECIPE = frozenset({"path", "fingerprint"})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Strategy):
+        # Contents, not places: another folder, or another machine's, makes no other recipe, nor does its device.
+        files = [file_digest(Path(path)) for path in value.fingerprint_files()]
+        extras = {name: field.json_schema_extra for name, field in type(value).model_fields.items()}
+        places = {name for name, extra in extras.items() if isinstance(extra, dict) and _NO_RECIPE & extra.keys()}
+        recipe = value.model_dump(exclude=places)
+        return {"class": type(value).__name__, "version": value.version, "files": files, **recipe}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if hasattr(value, "__dataclass_fields__"):
+        return {key: getattr(value, key) for key in value.__dataclass_fields__}
+    raise TypeError(f"{type(value).__name__} cannot enter a fingerprint")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 (hex) of a file that a strategy names; read again only when it has changed. Raises ConfigError."""
+    try:
+        status = path.stat()
+        return _file_digest(path, status.st_size, status.st_mtime_ns)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}, which the configuration names: {error.strerror}") from None
+
+
+@lru_cache(maxsize=64)
+def _file_digest(path: Path, size: int, stamp: int) -> str:
+    del size, stamp  # only tell changed files apart
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def contents_digest(path: Path) -> str:
+    """SHA-256 (hex) of a file that this program wrote; of a database, what programs change that only read it is left
+    out."""
+    with path.open("rb") as stream:
+        head = bytearray(stream.read(100))
+        if head.startswith(_SQLITE) and head[_SQLITE_MODE] in (b"\1\1", b"\2\2"):
+            for part in (_SQLITE_MODE, *_SQLITE_COUNTERS):
+                head[part] = bytes(len(head[part]))
+        digest = hashlib.sha256(head)
+        while block := stream.read(_PROBE_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def image_fingerprint(path: Path) -> str:
+    """Size, modification time and SHA-256 of the first and last MiB: enough to notice a changed photograph."""
+    status = path.stat()
+    digest = hashlib.sha256(f"{status.st_size} {status.st_mtime_ns} ".encode())
+    with path.open("rb") as stream:
+        digest.update(stream.read(_PROBE_BYTES))
+        if status.st_size > _PROBE_BYTES:
+            stream.seek(max(_PROBE_BYTES, status.st_size - _PROBE_BYTES))
+            digest.update(stream.read(_PROBE_BYTES))
+    return digest.hexdigest()
+
+
+def stable_hash(text: str) -> int:
+    """The same number on every machine and in every process; shards and seeds come from it."""
+    return int.from_bytes(hashlib.sha256(text.encode("utf-8")).digest()[:8], "big")
