@@ -320,6 +320,9 @@ class Executor:
             raise ConfigError(
                 "run.executor=dask needs the extra: pip install 'aeromatch[cluster]', or use --executor processes"
             ) from None
+        # dask would write tracebacks of what is said here in words: a lost worker, a lost scheduler.
+        for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.worker"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         client = self._dask_client(Client)
         # A worker that is lost takes its task with it: that is given to another one, so many times.
         futures = client.map(guarded, [function] * len(tasks), tasks, pure=False, retries=_DASK_RETRIES)

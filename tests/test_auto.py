@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 
 import pytest
-from conftest import Site, invoke
+from conftest import PAGE, Site, invoke
 
 from aeromatch_cli.config import load
 
@@ -72,7 +72,7 @@ def test_check_says_what_further_steps_may_take(site: Site) -> None:
 def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
     # The pictures have 400 keypoints at most: as many matches as of 2000.
     more = [word for step in ("guided", "learned") for word in ("--set", f"cascade.{step}.below_matches=3000")]
-    outcome = invoke("run", *site.options("--json", *more))
+    outcome = invoke("run", *site.options("--json", *more, *PAGE))
     assert outcome.code == 0
     with (site.work / "steps.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import IMAGES, Site, contents, invoke
+from conftest import IMAGES, PAGE, Site, contents, invoke
 from typer.testing import CliRunner
 
 from aeromatch_cli import __version__
@@ -310,7 +310,7 @@ def test_settings_come_from_a_file_and_options_win(site):
 
 @pytest.mark.slow
 def test_run_as_a_process(site: Site):
-    done = run_process("run", "baseline", *site.options("--json", "--jobs", "2"), cwd="/")
+    done = run_process("run", "baseline", *site.options("--json", "--jobs", "2", *PAGE), cwd="/")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout.splitlines()[-1])
     assert facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Site
+from conftest import PAGE, Site
 from test_control import adjusted_truth, cameras
 from test_export_colmap import Truth, make_truth
 
@@ -164,7 +164,7 @@ def test_what_is_dropped_is_read_again(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site) -> None:
     """A strict limit drops some matches; a change of it runs no stage before consistency again."""
-    outcome = done_site("run", "--set", "consistency.epipolar_px=0.3")
+    outcome = done_site("run", "--set", "consistency.epipolar_px=0.3", *PAGE)
     assert outcome.code == 0
     stages = outcome.facts["stages"]
     assert {stages[name]["done"] for name in ("extract", "match", "filter", "adjust")} == {0}

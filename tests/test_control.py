@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import Site
+from conftest import PAGE, Site
 from test_export_colmap import ORIGIN_M, Truth, make_truth
 
 from aeromatch_cli.blocks.control import far_control, read_control
@@ -173,7 +173,7 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
                 lines.append(" ".join(map(str, (*place, x, y, name, f"p{number}"))))
     path = done_site.root / "gcp_list.txt"
     path.write_text("\n".join(lines) + "\n")
-    outcome = done_site("run", "--gcp", path)
+    outcome = done_site("run", "--gcp", path, *PAGE)
     assert outcome.code == 0
     control = outcome.facts["stages"]["adjust"]["facts"]["control"]
     assert control["control"] >= 6

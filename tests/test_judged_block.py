@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site, contents
+from conftest import IMAGES, PAGE, Site, contents
 
 from aeromatch_cli.formats.tables import read_poses
 from aeromatch_cli.geometry.rotations import angle_between_deg
@@ -33,7 +33,7 @@ def turned(rows, degrees: float):
 
 def test_kappas_off_by_180_degrees_are_named_and_replaced(site: Site, rendered: Path) -> None:
     site.rewrite_poses(lambda rows: turned(rows, 180.0))
-    outcome = site("run")
+    outcome = site("run", *PAGE)
     assert outcome.code == 0
     warning = "warning: the given angles do not fit the pictures: all kappas are off by 180 degrees"
     assert warning in outcome.stderr
@@ -95,7 +95,7 @@ def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:
 
 def test_surveyed_poses_that_fit_nothing_are_said(site: Site) -> None:
     site.rewrite_poses(lambda rows: turned(rows, 180.0))
-    outcome = site("run", "--set", "orient=given")
+    outcome = site("run", "--set", "orient=given", *PAGE)
     words = "They do not fit the given poses; use orient=global instead of given"
     assert words in outcome.stdout
     assert words in (site.work / "report" / "index.html").read_text()

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import QUICK, Site, invoke
+from conftest import PAGE, QUICK, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config.text import default_yaml
@@ -91,7 +91,7 @@ def test_skipped_images_have_no_enhanced_picture_and_are_counted(site: Site) -> 
     assert pictures() == ids[:2]
     assert site("enhance", *chained).counts("enhance") == (0, 5, 0)
     for _ in range(2):  # the second time it is up to date
-        outcome = site("run", *chained, "--keep-images")
+        outcome = site("run", *chained, "--keep-images", *PAGE)
         assert said in outcome.stdout
         assert pictures() == ids[:2]
     facts = read_json(site.work / "reports" / "extract.json")["facts"]
@@ -105,7 +105,7 @@ def test_skipped_images_have_no_enhanced_picture_and_are_counted(site: Site) -> 
 
 
 def test_preset_fusion_verifies_the_block(site: Site) -> None:
-    outcome = invoke("run", "fusion", *site.options("--json"))
+    outcome = invoke("run", "fusion", *site.options("--json", *PAGE))
     assert outcome.code == 0
     assert True in enhanced_views(site).values()
     report = read_json(site.work / "reports" / "filter.json")

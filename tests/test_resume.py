@@ -69,7 +69,7 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     assert verified(halves) == expected
     rest = done_site("run", "--workspace", halves)
     assert rest.code == 0
-    assert set(rest.done()) == {"adjust", "consistency", "export", "report"}
+    assert set(rest.done()) == {"adjust", "consistency", "export"}
     assert contents(halves)["export/colmap/database.db"] == contents(done_site.work)["export/colmap/database.db"]
 
     swapped = Site(tmp_path / "swapped")
@@ -88,11 +88,11 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     [
         (
             "match.ratio=0.75",
-            {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+            {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
         (
             "filter.poselib.threshold_px=3",
-            {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+            {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
         (
             "extract.keypoints=300",
@@ -103,15 +103,14 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
                 "adjust": IMAGES,
                 "consistency": PAIRS,
                 "export": 1,
-                "report": 1,
             },
         ),
-        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1}),
+        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1}),
         (
             "block.sigma_position_m=9",
-            {"orient": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1, "report": 1},
+            {"orient": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
-        ("export.colmap.pose_priors=false", {"export": 1, "report": 1}),
+        ("export.colmap.pose_priors=false", {"export": 1}),
     ],
 )
 def test_a_setting_redoes_exactly_what_depends_on_it(done_site, change, redone):
@@ -255,7 +254,7 @@ def test_overwrite_redoes_everything(done_site):
     outcome = done_site("run", "--overwrite")
     assert outcome.done() == {
         "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES,
-        "consistency": PAIRS, "export": 1, "report": 1
+        "consistency": PAIRS, "export": 1
     }  # fmt: skip
     assert contents(done_site.work) == before
 
@@ -306,7 +305,7 @@ def test_damaged_files_are_made_again(done_site, name, damage):
 def test_a_lost_file_of_the_export_is_written_again(done_site, name):
     expected = contents(done_site.work)
     (done_site.work / "export" / "colmap" / name).unlink()
-    assert done_site("run").done() == {"export": 1, "report": 1}
+    assert done_site("run").done() == {"export": 1}
     assert contents(done_site.work) == expected
 
 

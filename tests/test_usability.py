@@ -199,6 +199,7 @@ def test_figures_are_numbers_that_json_has():
 
 
 def test_report_calls_images_by_their_files_names(done_site):
+    assert done_site("report").code == 0
     page = (done_site.work / "report" / "index.html").read_text()
     visible = re.sub(r"<[^>]+>", " ", page.split("<body>")[1].split('<details id="settings">')[0])
     for name in done_site.names():

@@ -137,6 +137,9 @@ class RunSettings(_Section):
         "would need more. Empty: no limit.",
     )
     keep_images: bool = Field(False, description="Also keep enhanced and simulated pictures in the workspace.")
+    report: bool = Field(
+        True, description="Whether `run` ends with report/index.html. Without it, `aeromatch report` makes it any time."
+    )
 
 
 class Settings(_Section):

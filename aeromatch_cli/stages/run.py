@@ -200,15 +200,20 @@ def _run_all(context: Context) -> list[StageReport]:
     context, reports = _to_filter(context)
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
-            report.run(context)
+            report.run(context)  # in any case: nothing else says why
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
         reports += [adjust.run(context), consistency.run(context), export.run(context)]
-        page = _current_page(context)
-        if page is None:
-            with context.executor.step("report"):
-                page = report.run(context)
-        reports.append(page)
+        if context.settings.run.report:
+            reports.append(_page(context))
     return reports
+
+
+def _page(context: Context) -> StageReport:
+    page = _current_page(context)
+    if page is None:
+        with context.executor.step("report"):
+            page = report.run(context)
+    return page
 
 
 def _current_page(context: Context) -> StageReport | None:
@@ -248,7 +253,7 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
     if command == "run" and context.shard is None:
         lines += closing_lines(reports, names)
     lines.append(f"workspace {context.workspace.root}")
-    if command in ("run", "report") and context.shard is None:
+    if reports[-1].stage == "report":
         lines.append(f"report    {context.workspace.report}")
     if command in ("run", "export") and context.shard is None:
         lines += [f"export    {context.workspace.export(e.name)}" for e in context.settings.export]
