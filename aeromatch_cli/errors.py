@@ -37,3 +37,20 @@ class BrokenFileError(WorkspaceError):
 
     def __str__(self) -> str:
         return f"cannot read {self.path}: {self.reason}; delete it to have it made again"
+
+
+# What Python and native libraries say that get no memory.
+_NO_MEMORY = (
+    "MemoryError", "bad_alloc", "Cannot allocate memory", "can't allocate memory", "can't start new thread",
+    "failed to map segment", "Insufficient memory", "Memory allocation still failed",
+)  # fmt: skip
+
+
+def tells_of_memory(text: str) -> bool:
+    """Whether the text of an error, or what a process said at its end, tells of a lack of memory."""
+    return any(words in text for words in _NO_MEMORY)
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether an error comes from a lack of memory, whatever class a library gives it."""
+    return isinstance(error, MemoryError) or tells_of_memory(str(error))

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
+from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError, lacks_memory
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -67,10 +67,14 @@ class SilentProgress:
 
 @dataclass(frozen=True)
 class Outcome(Generic[R]):
-    """What became of one task: a value, or the reason why there is none."""
+    """What became of one task: a value, or the reason why there is none.
+
+    lost: whether the reason lies with the machine (memory, a worker that died), so that another try may do.
+    """
 
     value: R | None
     error: str = ""
+    lost: bool = False
 
 
 def single_threaded() -> None:
@@ -148,9 +152,9 @@ def guarded(function: Callable[[T], R], task: T) -> Outcome[R]:
         raise
     except AeromatchError as error:
         return Outcome(None, str(error))
-    except MemoryError:
-        return Outcome(None, "out of memory; use --max-size or fewer --jobs")
     except Exception as error:  # noqa: BLE001 - one item must never stop the rest; the report names it
+        if lacks_memory(error):
+            return Outcome(None, "out of memory; use --max-size or fewer --jobs", lost=True)
         log.debug("%s", traceback.format_exc())
         frame = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{os.path.basename(frame.filename)}:{frame.lineno}"  # noqa: PTH119
@@ -261,7 +265,8 @@ class Executor:
             for index in in_flight:
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
-                    outcomes[index] = Outcome(None, "its worker process died (out of memory, or a crash in a library)")
+                    words = "its worker process died (out of memory, or a crash in a library)"
+                    outcomes[index] = Outcome(None, words, lost=True)
                     self._advance(index)
         return [outcomes[index] for index in range(len(tasks))]
 
@@ -333,7 +338,7 @@ class Executor:
             if future.status == "finished":
                 outcomes[index] = future.result()
             elif future.status == "error" and not isinstance(error := future.exception(), WorkspaceError):
-                outcomes[index] = Outcome(None, f"its dask worker was lost ({type(error).__name__})")
+                outcomes[index] = Outcome(None, f"its dask worker was lost ({type(error).__name__})", lost=True)
             elif future.status == "error":
                 raise error
             else:

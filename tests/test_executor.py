@@ -17,7 +17,7 @@ from make_slow import slow_square
 
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
-from aeromatch_cli.executor import Executor, Outcome, available_cores
+from aeromatch_cli.executor import Executor, Outcome, available_cores, guarded
 from aeromatch_cli.fingerprints import stable_hash
 
 
@@ -268,6 +268,18 @@ def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, list[subprocess.
 
 
 @pytest.mark.slow
+def run_out(what: str) -> None:
+    raise MemoryError if what == "memory" else RuntimeError(what)
+
+
+@pytest.mark.parametrize("what", ["memory", "DefaultCPUAllocator: can't allocate memory", "std::bad_alloc"])
+def test_a_lack_of_memory_is_the_machines(what: str) -> None:
+    outcome = guarded(run_out, what)
+    assert (outcome.value, outcome.lost) == (None, True)
+    assert outcome.error.startswith("out of memory; use --max-size")
+    assert not guarded(run_out, "other").lost
+
+
 def test_a_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed")
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):

@@ -13,9 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site, contents, heed_interrupts
+from conftest import IMAGES, Site, contents, heed_interrupts, invoke
 
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.formats.rows import row_fingerprints
+from aeromatch_cli.images.source import Source
+from aeromatch_cli.stages import enhance
 from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
@@ -307,6 +310,31 @@ def test_a_lost_file_of_the_export_is_written_again(done_site, name):
     (done_site.work / "export" / "colmap" / name).unlink()
     assert done_site("run").done() == {"export": 1}
     assert contents(done_site.work) == expected
+
+
+@pytest.mark.parametrize("preset", ["baseline", "auto"])
+def test_an_image_that_could_not_be_read_for_a_while_leaves_no_trace(
+    site: Site, monkeypatch: pytest.MonkeyPatch, preset: str
+) -> None:
+    """Neither in the orientation, nor in what steps of a cascade have made together."""
+    calm = site.another_workspace("calm") / "work"
+    assert invoke("run", preset, *site.options("--workspace", calm)).code == 0
+    read, absent = enhance.read_source, site.image(1)
+
+    def failing(source: Source, *, colour: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        if source.path == absent:
+            raise ItemError(f"{source.path} is away")
+        return read(source, colour=colour)
+
+    monkeypatch.setattr(enhance, "read_source", failing)
+    outcome = invoke("run", preset, *site.options())
+    assert outcome.code == 1
+    assert "is away" in outcome.stderr
+    monkeypatch.undo()
+    assert invoke("run", preset, *site.options()).code == 0
+    found, expected = contents(site.work), contents(calm)
+    passing = {name for name in {*found, *expected} if "first_pass" in name or name == "config.yaml"}
+    assert {n for n in {*found, *expected} - passing if found.get(n) != expected.get(n)} == set()
 
 
 def test_a_flipped_byte_inside_an_array_is_noticed(done_site):

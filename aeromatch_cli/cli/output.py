@@ -19,7 +19,7 @@ import typer
 
 from aeromatch_cli import __version__
 from aeromatch_cli.cli.log import logged_to, record
-from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.errors import AeromatchError, lacks_memory
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
@@ -78,7 +78,11 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
     except Exception as error:  # noqa: BLE001 - recorded: a defect must not look like exit code 1, "some items failed"
         frame = traceback.extract_tb(error.__traceback__)[-1]
         text = f"unexpected {type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}: {error}"
-        printed(f"error: {text}; this is a defect of aeromatch, --log-file FILE keeps its traceback", err=True)
+        remedy = "this is a defect of aeromatch, --log-file FILE keeps its traceback"
+        if lacks_memory(error):
+            text = "out of memory"
+            remedy = "use fewer --jobs, or --max-size, and run the same command again, which goes on"
+        printed(f"error: {text}; {remedy}", err=True)
         record.error("error: %s", text, exc_info=True)
         return {"error": text, "exit_code": AeromatchError.exit_code}
     say = said(quiet)

@@ -64,9 +64,11 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
   and the one found, pixels, where they differ by more than 2 %), `stays` (whether wrong given poses were kept,
   orient=given), `remarks` (what is wrong with given positions or angles, sentences).
-- `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for. `groups`:
-  images that were oriented together, the largest group first: `kind` (`given`, `positions`, or `level`: no positions,
-  scale and origin arbitrary), `images`.
+- `failed`: images and rows of pairs that the first pass had to leave out; once they can be read again, `orient` starts
+  anew.
+- `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for.
+- `groups`: images that were oriented together, the largest group first: `kind` (`given`, `positions`, or `level`: no
+  positions, scale and origin arbitrary), `images`.
 
 ### orientation/cameras.csv, poses.csv
 

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import zlib
 from pathlib import Path
 from types import ModuleType
 
-from aeromatch_cli.errors import InputError
+from aeromatch_cli.errors import InputError, tells_of_memory
 
 
 def run_process(module: str, folder: Path, result: str, what: str) -> Path:
-    """The file `result` that a module of this package makes in `folder`. InputError, naming `what`, where it stops."""
+    """The file `result` that a module of this package makes in `folder`.
+
+    Raises MemoryError where it ends for lack of memory, InputError, naming `what`, where it stops otherwise: only the
+    latter says something of the block.
+    """
     command = [sys.executable, "-m", f"aeromatch_cli.orientation.{module}", str(folder)]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode == -signal.SIGKILL or tells_of_memory(done.stderr):
+        raise MemoryError(f"{what} ended for lack of memory")
     if done.returncode or not (folder / result).is_file():
         said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
         raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")

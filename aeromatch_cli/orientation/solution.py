@@ -66,13 +66,15 @@ class Solution:
 class Evidence:
     """The first pass of a block. pairs: its verified matches. thresholds_px: by image_id, errors of exact matches.
 
-    stated_cameras: camera_id -> Camera as it was given, where the block has another by now.
+    stated_cameras: camera_id -> Camera as it was given, where the block has another by now. failed: images and rows of
+    pairs that the first pass had to leave out.
     """
 
     block: Block
     pairs: Sequence[PairPoints]
     thresholds_px: Mapping[str, float]
     stated_cameras: Mapping[str, Camera]
+    failed: Sequence[str] = ()
 
     @property
     def cameras(self) -> dict[str, Camera]:

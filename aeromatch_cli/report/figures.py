@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -47,6 +47,11 @@ def new_axes(
         figure = Figure(figsize=(width_inches, height_inches), dpi=dpi)
         figure.subplots_adjust(**margins)
         return figure.add_subplot()
+
+
+def label_width(values: Iterable[float]) -> float:
+    """Points that the axis label and the tick labels of metres need beside a vertical axis that shows these values."""
+    return 32.0 + 6.4 * max(len(f"{value:.0f}") for value in values)
 
 
 def png(figure: Any) -> bytes:

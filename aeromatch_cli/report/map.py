@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.report.figures import COLOURS, evenly_chosen, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, evenly_chosen, label_width, new_axes, svg
 
 MAP_CLASSES = 6
 # Above this many pairs their lines lose the tooltips and are joined into one path per colour; above the second they are
@@ -127,9 +127,8 @@ def block_map(
             handles.append(axes.scatter(*places.T, area, label=words, gid=kind, zorder=4, **style))
             titles[kind] = [s.title for s in members]
     axes.figure.legend(
-        handles=handles, loc="outside right upper", alignment="left", frameon=False, title="Verified matches per pair"
+        handles=handles, loc="upper right", alignment="left", frameon=False, title="Verified matches per pair"
     )
-    _scale_equally(axes)
     if len(stations) <= MAX_LABELS:
         _draw_labels(axes, stations)
     if sketch is not None:
@@ -152,8 +151,17 @@ def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any
     half = np.maximum(high - low, max(float((high - low).max()) * 0.02, 1.0)) * _AIR / 2
     middle = (low + high) / 2
     height = float(np.clip((_WIDTH - _LEGEND_WIDTH) * half[1] / half[0], *_AXES_HEIGHTS))
-    axes = new_axes(_WIDTH / 72, height / 72)
-    _show(axes, middle, half)
+    left = label_width((middle[1] - half[1], middle[1] + half[1]))
+    margins = {
+        "left": left / _WIDTH,
+        "right": 1.0 - _LEGEND_WIDTH / _WIDTH,
+        "bottom": 42.0 / height,
+        "top": 1.0 - 8.0 / height,
+    }
+    axes = new_axes(_WIDTH / 72, height / 72, margins=margins)
+    # Equal scales: what is left of the axes' width or height shows more ground.
+    size = axes.bbox.size
+    _show(axes, middle, (half / size).max() * size)
     axes.ticklabel_format(useOffset=False, style="plain")
     return axes
 
@@ -171,20 +179,6 @@ def _name_axes(axes: Any, in_world: bool) -> None:
 
 def _show(axes: Any, middle: FloatArray, half: FloatArray) -> None:
     axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
-
-
-def _scale_equally(axes: Any) -> None:
-    """Settle where the axes stand, then let what is left of their width or height show more ground.
-
-    Twice: more ground may have longer numbers, which need more room.
-    """
-    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
-    for _ in range(2):
-        axes.figure.draw_without_rendering()
-        _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
-    axes.figure.draw_without_rendering()
-    axes.figure.set_layout_engine("none")
-    _show(axes, (low + high) / 2, ((high - low) / axes.bbox.size).max() * axes.bbox.size / 2)
 
 
 def _draw_sketch(axes: Any, sketch: Sketch) -> None:

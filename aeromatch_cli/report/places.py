@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
-from aeromatch_cli.report.figures import COLOURS, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, label_width, new_axes, svg
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -18,6 +18,8 @@ _FINE, _COARSE = 160, (6, 40)
 _WELL_SEEN, _FEW_POINTS, _AVERAGE = 3, 3, 5.0
 _MORE_IMAGES = 10
 _WIDTH_IN, _HEIGHTS_IN = 7.0, (3.2, 7.0)
+# Room for the bar of colours and its numbers, for the labels below and for the title.
+_BAR_IN, _LABELS_IN, _TITLE_IN = 1.0, 0.6, 0.35
 _LARGEST_ERROR = 0.99  # quantile
 _MANY_IMAGES = 20
 _MARGINS = {"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96}
@@ -96,10 +98,17 @@ def _points_figure(ground: Ground, footprints: Sequence[FloatArray], points_m: F
 def _field(ground: Ground, values: FloatArray, known: BoolArray, label: str, marked: BoolArray | None = None) -> str:
     """Values (rows, columns) in colours where they are known; marked cells red."""
     from matplotlib.colors import LinearSegmentedColormap, ListedColormap, LogNorm, Normalize
+    from matplotlib.ticker import MaxNLocator
 
     extent_m = ground.high_m - ground.low_m
-    height = float(np.clip(_WIDTH_IN * 0.8 * extent_m[1] / extent_m[0], *_HEIGHTS_IN))
-    axes = new_axes(_WIDTH_IN, height)
+    left = label_width((ground.low_m[1], ground.high_m[1])) / 72.0
+    wide = _WIDTH_IN - left - _BAR_IN
+    height = float(np.clip(wide * extent_m[1] / extent_m[0] + _LABELS_IN + _TITLE_IN, *_HEIGHTS_IN))
+    margins = {
+        "left": left / _WIDTH_IN, "right": 1.0 - _BAR_IN / _WIDTH_IN,
+        "bottom": _LABELS_IN / height, "top": 1.0 - _TITLE_IN / height,
+    }  # fmt: skip
+    axes = new_axes(_WIDTH_IN, height, margins=margins)
     largest = float(values.max(initial=1.0))
     logarithmic = marked is not None
     norm = LogNorm(1.0, max(largest, 2.0)) if logarithmic else Normalize(0.0, max(largest, 1.0))
@@ -110,10 +119,15 @@ def _field(ground: Ground, values: FloatArray, known: BoolArray, label: str, mar
     if marked is not None and marked.any():
         red = ListedColormap([COLOURS["bad"]])
         axes.imshow(np.ma.masked_where(~marked, marked.astype(float)), cmap=red, interpolation="none", **where)
-    bar = axes.figure.colorbar(drawn, ax=axes, shrink=0.85, pad=0.02)
+    axes.apply_aspect()
+    place = axes.get_position()
+    beside = axes.figure.add_axes((place.x1 + 0.02, place.y0, 0.03, place.height))
+    bar = axes.figure.colorbar(drawn, cax=beside)
     if logarithmic:
         bar.ax.yaxis.set_major_formatter("{x:,.0f}")
         bar.ax.yaxis.set_minor_formatter("")
+    else:
+        bar.locator = MaxNLocator(integer=True)
     axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
     axes.set_title(label, fontsize=10)
     axes.ticklabel_format(useOffset=False, style="plain")

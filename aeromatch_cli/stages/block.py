@@ -21,7 +21,7 @@ from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, Ground, Image
-from aeromatch_cli.errors import ConfigError, ItemError
+from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.geometry.angles import Angles
@@ -154,6 +154,9 @@ def _read_inputs(
         names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
     pictures = [remote.get(name) or root / name for name in names]
     outcomes = dict(zip(names, executor.run(_read_header, pictures, "read"), strict=True))
+    for name, outcome in outcomes.items():
+        if outcome.lost:  # without the image it would be another block, whose origin later runs would keep
+            raise WorkspaceError(f"the header of {name} could not be read: {outcome.error}; run the same command again")
     # The origin of an earlier run is kept, unless the user now asks for another CRS.
     frame = WorldFrame(before["given_crs"], tuple(before["given_origin_m"])) if "given_crs" in before else None
     inputs = block_inputs(

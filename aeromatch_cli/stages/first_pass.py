@@ -5,7 +5,7 @@ It is cheap, and it leans on nothing that the user says of attitudes and focal l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -101,22 +101,28 @@ def prepared(context: Context, recipe: FirstPass) -> Context:
     )
 
 
-def run(context: Context, recipe: FirstPass, *, by_position: bool = True) -> Context:
-    """Extract, choose pairs, match and filter; the context with the pairs.
+def run(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, list[str]]:
+    """Extract, choose pairs, match and filter; the context with the pairs, and the images and rows that failed.
 
-    by_position: pairs lean on the given positions. Images and pairs that fail are left out here and named by the final
-    pass.
+    by_position: pairs lean on the given positions. What fails is left out here and named by the final pass.
     """
     context.workspace.create()
-    extract.run(context)
+    reports = [extract.run(context)]
     chosen, similar = _pairs(context, recipe, by_position=by_position)
     nan = float("nan")
     pairs = tuple(Pair(id0, id1, nan, nan, "first pass") for id0, id1 in sorted(chosen))
     context = replace(context, pairs=pairs, block=replace(context.block, similar=similar))
     if pairs:
-        match.run(context)
-        filter.run(context)
-    return context
+        reports += [match.run(context), filter.run(context)]
+    return context, sorted({item for report in reports for item, _ in report.failures})
+
+
+def mended(context: Context, recipe: FirstPass, failed: Sequence[str]) -> bool:
+    """Whether any of what failed in a first pass does so no longer. Images are tried; of pairs nothing is known."""
+    images = context.image_by_id.keys() & set(failed)
+    if len(images) < len(failed):
+        return True
+    return len(extract.run(prepared(context, recipe), images).failures) < len(images)
 
 
 def _pairs(

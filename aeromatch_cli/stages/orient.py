@@ -76,10 +76,14 @@ def run(
     record = before if before.get("fingerprint") == report.fingerprint else None
     if record is None and dry:
         return context, report
+    recipe = first_pass.fitted(recipe, context.block)
+    if record is not None and not dry and record["failed"] and first_pass.mended(context, recipe, record["failed"]):
+        # What is made without some of its images is no beginning to go on from.
+        record, before = None, {}
     if record is None:
         same = before.get("settings") == settings
         kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
-        solution = _solution(context, first_pass.fitted(recipe, context.block), kept, before)
+        solution = _solution(context, recipe, kept, before)
         head = {"fingerprint": report.fingerprint, "settings": settings, "images": images}
         record = _write(context, solution, head)
         report.done = report.items
@@ -148,6 +152,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
+    facts["failed"] = list(evidence.failed)
     terrains = solution.terrains
     old = _terrains(context, before) if kept else ()
     if len(old) == len(terrains):
@@ -258,12 +263,12 @@ def _oriented(models: Sequence[Model]) -> int:
 
 def _evidence(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, Evidence]:
     """The context of a first pass that has been run, and its verified matches."""
-    first = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
+    first, failed = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
     limit = first.settings.block.max_size_px
     sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
     thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
-    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras)
+    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras, failed)
 
 
 def _before(context: Context, kept: set[str]) -> Before:
@@ -316,7 +321,7 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     with translated_os_errors(folder):
         for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
             old.unlink(missing_ok=True)
-    large = {key: solution.facts[key] for key in ("tied", "similar", "groups")}
+    large = {key: solution.facts[key] for key in ("tied", "similar", "groups", "failed")}
     facts = {key: value for key, value in solution.facts.items() if key not in large}
     write_record(path, {**head, "facts": facts, **large}, names)
     return read_json(path)

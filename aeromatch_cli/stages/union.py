@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
@@ -66,19 +66,40 @@ class RowTask:
 
 
 def joined_context(context: Context, steps: Sequence[StepContext]) -> Context:
-    """The context of the stages after the cascade."""
+    """The context of the stages after the cascade. What failed in a step is not among the parts, so that its joined
+    files are made again when it is there later.
+    """
+    usable = _usable(steps)
     features: dict[str, str] = {}
     for image in context.block.images:
         image_id = image.image_id
-        looking = [step for step in steps if step.own_features and image_id in step.images]
-        kinds = [(step.name, extract.task_of(step.context, image_id).fingerprint) for step in looking]
+        kinds = [(s.name, extract.task_of(s.context, image_id).fingerprint) for s, ready in usable if image_id in ready]
         features[image_id] = fingerprint(VERSION, kinds)
     matches = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
-        found = [(s.name, match.pair_fingerprint(s.context, pair)) for s in steps if key in s.reasons]
+        found = []
+        for step in _matched(steps, pair):
+            verified = row_fingerprints(step.context.workspace.verified(key[0])).get(key[1])
+            found.append((step.name, match.pair_fingerprint(step.context, pair), verified))
         matches[key] = fingerprint(VERSION, found, features[key[0]], features[key[1]])
     return replace(context, union=Union(features, matches))
+
+
+def _usable(steps: Sequence[StepContext]) -> list[tuple[StepContext, set[str]]]:
+    """Steps with features of their own, and the images that have them."""
+    return [(step, extract.current(step.context, step.images)) for step in steps if step.own_features]
+
+
+def _matched(steps: Sequence[StepContext], pair: Pair) -> list[StepContext]:
+    """Steps that have matches of a pair."""
+    id0, id1 = pair.image_id0, pair.image_id1
+    return [
+        step
+        for step in steps
+        if (id0, id1) in step.reasons
+        and row_fingerprints(step.context.workspace.matches(id0)).get(id1) == match.pair_fingerprint(step.context, pair)
+    ]
 
 
 def run(context: Context, steps: Sequence[StepContext]) -> list[StageReport]:
@@ -93,7 +114,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
     tasks = []
-    usable = [(step, extract.current(step.context, step.images)) for step in steps if step.own_features]
+    usable = _usable(steps)
     for image in context.block.images:
         image_id = image.image_id
         own = [step for step, ready in usable if image_id in ready]
@@ -167,17 +188,12 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
     report = StageReport("match")
     _count_seconds(report, steps, ["match", "filter"])
     tasks, ready = [], extract.current(context, {image.image_id for image in context.block.images})
-    on_file = [{i: row_fingerprints(s.context.workspace.matches(i)) for i in context.rows()} for s in steps]
     for image_id0, pairs in context.rows().items():
         wanted, own = {}, {}
         for pair in pairs:
             key = pair.image_id0, pair.image_id1
             # Of several steps with the same features the last one's matches count.
-            known = {
-                step.features_of: step.context.workspace
-                for step, found in zip(steps, on_file, strict=True)
-                if key in step.reasons and found[image_id0].get(key[1]) == match.pair_fingerprint(step.context, pair)
-            }
+            known = {step.features_of: step.context.workspace for step in _matched(steps, pair)}
             if known and set(key) <= ready:
                 wanted[key[1]], own[key[1]] = context.union.matches[key], tuple(known.items())
         tasks.append(RowTask(image_id0, wanted, own, context.workspace))
