@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -34,14 +34,16 @@ def test_configuration_and_stages_import_nothing_heavy() -> None:
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["run", "--help"]])
 def test_help_answers_in_half_a_second(arguments: list[str]) -> None:
-    """Best of several: the machine may be busy. Through the installed script where there is one."""
+    """In seconds of the processor, as other tests may keep it busy: nothing here waits for anything else. Best of
+    several, through the installed script where there is one."""
     script = Path(sys.executable).with_name("aeromatch")
     command = [str(script)] if script.exists() else [sys.executable, "-m", "aeromatch_cli.cli"]
     seconds = []
     for _ in range(5):
-        started = time.perf_counter()
+        before = os.times()
         done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
-        seconds.append(time.perf_counter() - started)
+        after = os.times()
+        seconds.append(after.children_user + after.children_system - before.children_user - before.children_system)
         assert done.returncode == 0
         assert done.stdout.strip()
         if len(seconds) >= 3 and min(seconds) < 0.5:
