@@ -28,6 +28,8 @@ TABLE: Table = {
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),
     "scenes": ("benchmarks.contact_sheet", "one picture of every rendered scene: .assets/scenes.jpg"),
     "picture": ("benchmarks.picture", "the README's picture: one hard pair, SIFT beside a preset, by exact truth"),
+    "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
+    "memory": ("benchmarks.memory", "peak memory of whole runs against --memory, on large images"),
     "pages": ("benchmarks.pages", "brings the first lines of docs/results up to date with the tables' stamps"),
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
 }
