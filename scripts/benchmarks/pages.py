@@ -31,6 +31,7 @@ FOLDER = REPOSITORY / "docs" / "results"
 PAGES: Mapping[str, str] = {
     "bench_methods": "methods.md",
     "bench_presets": "auto.md",
+    "bench_presets_second": "auto.md",
     "bench_probability": "auto.md",
     "bench_blocks": "methods.md",
     "bench_thinned": "methods.md",
