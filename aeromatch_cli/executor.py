@@ -207,9 +207,16 @@ class Executor:
             self._client = None
 
     def run(
-        self, function: Callable[[T], R], tasks: Sequence[T], label: str, sizes: Sequence[int] | None = None
+        self,
+        function: Callable[[T], R],
+        tasks: Sequence[T],
+        label: str,
+        sizes: Sequence[int] | None = None,
+        *,
+        network: bool = False,
     ) -> list[Outcome[R]]:
         """Outcomes in task order. sizes: how many items each task counts in what is shown of the advance, by default 1.
+        network: whether the tasks run a network, which dask workers that offer a GPU do, where there are any.
 
         Raises WorkspaceError when results can no longer be saved.
         """
@@ -219,7 +226,7 @@ class Executor:
         self.progress.start(label, len(tasks) if sizes is None else sum(sizes))
         try:
             if self.kind == "dask":
-                return self._run_dask(function, tasks)
+                return self._run_dask(function, tasks, network=network)
             if self.jobs == 1 or len(tasks) <= 1:
                 return self._run_serial(function, tasks)
             return self._run_processes(function, tasks)
@@ -318,7 +325,7 @@ class Executor:
                     ) from None
         return self._pool
 
-    def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
+    def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T], *, network: bool) -> list[Outcome[R]]:
         try:
             from distributed import Client, as_completed
         except ImportError:
@@ -330,7 +337,9 @@ class Executor:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         client = self._dask_client(Client)
         # A worker that is lost takes its task with it: that is given to another one, so many times.
-        futures = client.map(guarded, [function] * len(tasks), tasks, pure=False, retries=_DASK_RETRIES)
+        needs = {"GPU": 1.0} if network and _offers_gpu(client) else None
+        many = [function] * len(tasks)
+        futures = client.map(guarded, many, tasks, pure=False, retries=_DASK_RETRIES, resources=needs)
         places = {future.key: index for index, future in enumerate(futures)}
         outcomes: dict[int, Outcome[R]] = {}
         for future in as_completed(futures):
@@ -363,6 +372,11 @@ class Executor:
             if self._scheduler and self._client.dashboard_link:
                 log.info("dask dashboard at %s", self._client.dashboard_link)
         return self._client
+
+
+def _offers_gpu(client: Any) -> bool:
+    """Whether a worker was started with `--resources GPU=1`."""
+    return any(worker.get("resources", {}).get("GPU") for worker in client.scheduler_info()["workers"].values())
 
 
 def available_cores() -> int:

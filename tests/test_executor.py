@@ -245,7 +245,7 @@ def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
     assert scheduler.stderr is not None
     address = next(m[0] for line in scheduler.stderr if (m := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
     worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
-    workers = [started(*worker), started(*worker)]
+    workers = [started(*worker, "--name", "plain"), started(*worker, "--name", "gpu", "--resources", "GPU=1")]
     try:
         yield address, workers
     finally:
@@ -267,7 +267,32 @@ def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, list[subprocess.
     assert workers[0].wait(10) != 0
 
 
+def worker_name(number: int) -> str:
+    from distributed import get_worker
+
+    return str(get_worker().name)
+
+
 @pytest.mark.slow
+def test_networks_run_where_a_gpu_is_offered(cluster: tuple[str, list[subprocess.Popen[str]]]) -> None:
+    address, workers = cluster
+    with Executor("dask", scheduler=address) as executor:
+        deadline = time.monotonic() + 30
+        anywhere: set[str | None] = set()
+        while anywhere != {"plain", "gpu"} and time.monotonic() < deadline:  # both have come
+            anywhere = {outcome.value for outcome in executor.run(worker_name, range(8), "any")}
+        assert anywhere == {"plain", "gpu"}
+        chosen = {outcome.value for outcome in executor.run(worker_name, range(8), "network", network=True)}
+        assert chosen == {"gpu"}
+        workers[1].kill()
+        workers[1].wait()
+        while (left := len(executor._client.scheduler_info()["workers"])) > 1 and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert left == 1
+        # Without any, the others do.
+        assert {o.value for o in executor.run(worker_name, range(4), "network", network=True)} == {"plain"}
+
+
 def run_out(what: str) -> None:
     raise MemoryError if what == "memory" else RuntimeError(what)
 
@@ -280,6 +305,7 @@ def test_a_lack_of_memory_is_the_machines(what: str) -> None:
     assert not guarded(run_out, "other").lost
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed")
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):

@@ -104,7 +104,8 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     todo = [task for task in tasks if context.overwrite or not _is_done(task)]
     report.items += len(tasks)
     report.skipped += len(tasks) - len(todo)
-    made = run_stage(context, report, run_task, todo, [task.image_id for task in todo])
+    network = any(task.extractor.network for task in todo)
+    made = run_stage(context, report, run_task, todo, [task.image_id for task in todo], network=network)
     if made:
         counts = [item.keypoints for item in made]
         facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}

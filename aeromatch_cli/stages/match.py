@@ -150,9 +150,9 @@ def run(context: Context) -> StageReport:
     on_file = {task.image_id0: row_fingerprints(context.workspace.matches(task.image_id0)) for task in tasks}
     todo = [task for task in tasks if context.overwrite or not rows.is_done(task.pairs, on_file[task.image_id0])]
     report.items = sum(len(task.pairs) for task in tasks)
-    results = run_stage(
-        context, report, run_task, todo, [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
-    )
+    names, sizes = [task.image_id0 for task in todo], [len(task.pairs) for task in todo]
+    network = any(matcher.network for task in todo for matcher in task.matchers.values())
+    results = run_stage(context, report, run_task, todo, names, sizes, network=network)
     report.failures.extend(failure for result in results for failure in result.failures)
     report.done = sum(result.done for result in results)
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)

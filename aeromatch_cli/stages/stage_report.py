@@ -155,13 +155,15 @@ def run_stage(
     tasks: Sequence[T],
     names: Sequence[str],
     sizes: Sequence[int] | None = None,
+    *,
+    network: bool = False,
 ) -> list[R]:
     """Run tasks, put failures into the report under their names, return the values of the rest.
 
-    sizes: how many items each task counts while it is shown how far the stage is.
+    sizes: how many items each task counts while it is shown how far the stage is. network: whether tasks run one.
     """
     label = context.part + report.stage
-    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, label, sizes) if tasks else []
+    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
     values = []
     for name, outcome in zip(names, outcomes, strict=True):
         if outcome.value is None:

@@ -33,6 +33,7 @@ class Strategy(BaseModel):
     "neighbours" (cameras, poses and ground of the images it is paired with); only that enters the fingerprint, so that
     a change re-does exactly the stages that depend on it. A filter that reads "colour" needs extract.colours.
     reads_pixels: True for a matcher that is also given both images' rasters.
+    network: True for what runs a network, which a GPU makes faster.
     descriptors: what those of an extractor are called, "" where it makes none.
     reads_descriptors: the descriptors that a matcher was made for, "" where any will do.
     verifies: False for a filter that limits matches but is no evidence for them; a chain needs one that is.
@@ -42,6 +43,7 @@ class Strategy(BaseModel):
     version: ClassVar[int] = 1
     needs: ClassVar[frozenset[str]] = frozenset()
     reads_pixels: ClassVar[bool] = False
+    network: ClassVar[bool] = False
     descriptors: ClassVar[str] = ""
     reads_descriptors: ClassVar[str] = ""
     verifies: ClassVar[bool] = True
@@ -122,6 +124,7 @@ class Extractor(Protocol):
 
     descriptor_length: ClassVar[int]
     descriptors: ClassVar[str]
+    network: ClassVar[bool]
 
     @property
     def colours(self) -> bool: ...
@@ -137,6 +140,7 @@ class Extractor(Protocol):
 class Matcher(Protocol):
     name: str
     reads_pixels: ClassVar[bool]
+    network: ClassVar[bool]
     reads_descriptors: ClassVar[str]
 
     def reads(self) -> frozenset[str]: ...

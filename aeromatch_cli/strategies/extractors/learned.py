@@ -37,6 +37,7 @@ class Learned(Described):
     """Keypoints, orientations and descriptors by networks that are trained on aerial images."""
 
     version: ClassVar[int] = 5
+    network: ClassVar[bool] = True
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
     detector: Literal["network", "sift"] = Field(

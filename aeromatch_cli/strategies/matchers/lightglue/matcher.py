@@ -44,6 +44,7 @@ class LightGlue(Search):
     """
 
     version: ClassVar[int] = 6
+    network: ClassVar[bool] = True
     reads_descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["lightglue"] = "lightglue"
     network_below_matches: int = Field(
