@@ -42,6 +42,7 @@ def import_pycolmap() -> ModuleType:
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
+    pycolmap.logging.minloglevel = 2  # what it would warn of is raised and said here in words
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     return pycolmap
