@@ -21,6 +21,7 @@ from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.evaluate.work import Evaluation
 from aeromatch_cli.formats.features import features_fingerprint, read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
+from aeromatch_cli.workspace import read_json
 
 pytestmark = pytest.mark.slow
 
@@ -103,7 +104,7 @@ def test_files_hold_what_was_found(work: Path, evaluation: Evaluation) -> None:
         "evaluation.json", "pairs.csv", "conditions.csv", "errors.png", "view_angles.png", "coverage.png",
     }  # fmt: skip
     folder = work / "evaluation"
-    found = json.loads((folder / "evaluation.json").read_text())
+    found = read_json(folder / "evaluation.json")
     assert found == json.loads(json.dumps(facts(evaluation)))
     assert found["totals"]["correct"] == sum(row.score.correct for row in evaluation.pairs)
     pairs = rows(folder / "pairs.csv")

@@ -12,6 +12,7 @@ from conftest import IMAGES, WIDTH
 from aeromatch_cli.config import validate
 from aeromatch_cli.data import Block, Camera, Features, FloatArray, Image
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
 from aeromatch_cli.stages.context import Context
@@ -50,7 +51,8 @@ def extracted(root: Path, max_size_px: int) -> Features:
     known = Block((image,), {"cam": camera}, {}, "local", (0.0, 0.0, 0.0), None, "unknown", None)
     workspace = Workspace(root / "work")
     workspace.create()
-    context = Context(settings, workspace, Executor("serial"), known, (), {"blobs": "print"}, {})
+    prints = {"blobs": image_fingerprint(root / "images" / "blobs.png")}
+    context = Context(settings, workspace, Executor("serial"), known, (), prints, {})
     task = extract.make_task(context, image)
     assert extract.run_task(task).keypoints > 0
     return read_features(task.path)

@@ -122,7 +122,10 @@ def mended(context: Context, recipe: FirstPass, failed: Sequence[str]) -> bool:
     images = context.image_by_id.keys() & set(failed)
     if len(images) < len(failed):
         return True
-    return len(extract.run(prepared(context, recipe), images).failures) < len(images)
+    own = prepared(context, recipe)
+    tasks = [extract.task_of(own, image_id) for image_id in sorted(images)]
+    tried = context.executor.run(extract.run_task, tasks, "first pass: images that failed")
+    return any(outcome.value is not None for outcome in tried)
 
 
 def _pairs(
