@@ -256,14 +256,20 @@ def _slow_renames(site: Site, rng: random.Random) -> None:
     ended(process, (0, -9))
 
 
-def _input_gone(site: Site, rng: random.Random) -> None:
-    """For a while, once the run knows it: a run that finds fewer images from the start is another one."""
-    image = rng.choice(sorted((site.block / "images").iterdir()))
-    aside = image.with_name(f".{image.name}.aside")
+def _begun(site: Site, rng: random.Random) -> subprocess.Popen[str]:
+    """A run that has read the headers of all images, and has come some way since."""
     process = site.start()
     while process.poll() is None and not list(site.work.rglob("features/*.npz")):
         time.sleep(0.05)
     site.wait(rng)
+    return process
+
+
+def _input_gone(site: Site, rng: random.Random) -> None:
+    """For a while, once the run knows it: a run that finds fewer images from the start is another one."""
+    image = rng.choice(sorted((site.block / "images").iterdir()))
+    aside = image.with_name(f".{image.name}.aside")
+    process = _begun(site, rng)
     image.rename(aside)
     try:
         ended(process, (0, 1, 3))
@@ -272,11 +278,10 @@ def _input_gone(site: Site, rng: random.Random) -> None:
 
 
 def _input_replaced(site: Site, rng: random.Random) -> None:
-    """For a while, by another picture."""
+    """For a while, by another picture, once the run knows it."""
     image, other = rng.sample(sorted((site.block / "images").iterdir()), 2)
     aside = image.with_name(f".{image.name}.aside")
-    process = site.start()
-    site.wait(rng)
+    process = _begun(site, rng)
     shutil.copy2(image, aside)
     shutil.copy(other, image)
     try:
