@@ -1,0 +1,93 @@
+"""Files of the workspace that are damaged or lost, and images that are away for a while: the next run mends it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import Site, contents, invoke
+
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.images.source import Source
+from aeromatch_cli.stages import enhance
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "features/{0}.npz",
+        "matches/{0}.npz",
+        "verified/{0}.npz",
+        "block.json",
+        "pairs.csv",
+        "images.csv",
+        "reports/filter.json",
+        "reports/export.json",
+        "orientation/orientation.json",
+        "orientation/poses.csv",
+    ],
+)
+def test_damaged_files_are_made_again(done_site, name, damage):
+    expected = contents(done_site.work)
+    path = done_site.work / name.format(done_site.names()[0].replace(".", "_"))
+    data = path.read_bytes()
+    if damage == "other" and path.suffix == ".npz":
+        with path.open("wb") as stream:
+            np.savez(stream, fingerprint=np.array("x"), image_id1=np.array(["y"]))
+    else:
+        damaged = {"cut": data[: len(data) // 2], "empty": b"", "other": b"\x80[1, 2]"}
+        path.write_bytes(damaged[damage])
+    outcome = done_site("run")
+    assert outcome.code == 0
+    assert contents(done_site.work) == expected
+
+
+@pytest.mark.parametrize("name", ["database.db", "sparse/images.txt", "world.json"])
+def test_a_lost_file_of_the_export_is_written_again(done_site, name):
+    expected = contents(done_site.work)
+    (done_site.work / "export" / "colmap" / name).unlink()
+    assert done_site("run").done() == {"export": 1}
+    assert contents(done_site.work) == expected
+
+
+@pytest.mark.parametrize("preset", ["baseline", "auto"])
+def test_an_image_that_could_not_be_read_for_a_while_leaves_no_trace(
+    site: Site, monkeypatch: pytest.MonkeyPatch, preset: str
+) -> None:
+    """Neither in the orientation, nor in what steps of a cascade have made together."""
+    calm = site.another_workspace("calm") / "work"
+    assert invoke("run", preset, *site.options("--workspace", calm)).code == 0
+    read, absent = enhance.read_source, site.image(1)
+
+    def failing(source: Source, *, colour: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        if source.path == absent:
+            raise ItemError(f"{source.path} is away")
+        return read(source, colour=colour)
+
+    monkeypatch.setattr(enhance, "read_source", failing)
+    outcome = invoke("run", preset, *site.options())
+    assert outcome.code == 1
+    assert "is away" in outcome.stderr
+    monkeypatch.undo()
+    assert invoke("run", preset, *site.options()).code == 0
+    found, expected = contents(site.work), contents(calm)
+    passing = {name for name in {*found, *expected} if "first_pass" in name or name == "config.yaml"}
+    assert {n for n in {*found, *expected} - passing if found.get(n) != expected.get(n)} == set()
+
+
+def test_a_flipped_byte_inside_an_array_is_noticed(done_site):
+    expected = contents(done_site.work)
+    for kind in ("features", "matches", "verified"):
+        path = sorted((done_site.work / kind).glob("*.npz"))[1]
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        path.write_bytes(data)
+    # Features are read only where something is to be matched anew.
+    outcome = done_site("run", "--overwrite")
+    assert outcome.code == 0
+    assert contents(done_site.work) == expected
+
+
+# --- killed and interrupted ---------------------------------------------------------------------------------------
