@@ -332,9 +332,6 @@ class Executor:
             raise ConfigError(
                 "run.executor=dask needs the extra: pip install 'aeromatch[cluster]', or use --executor processes"
             ) from None
-        # dask would write tracebacks of what is said here in words: a lost worker, a lost scheduler.
-        for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.worker"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
         client = self._dask_client(Client)
         # A worker that is lost takes its task with it: that is given to another one, so many times.
         needs = {"GPU": 1.0} if network and _offers_gpu(client) else None
@@ -360,6 +357,9 @@ class Executor:
 
     def _dask_client(self, connect: Callable[..., Any]) -> Any:
         if self._client is None:
+            # dask would write tracebacks of what is said here in words: a lost worker, a lost scheduler.
+            for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.worker"):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
             local = {"n_workers": self.jobs, "threads_per_worker": 1, "dashboard_address": None}
             try:
                 self._client = connect(self._scheduler or None, **({"timeout": "10s"} if self._scheduler else local))

@@ -43,7 +43,9 @@ def _plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 (hex) of a file that a strategy names; read again only when it has changed. Raises ConfigError."""
+    """SHA-256 (hex) of a file that a strategy names, or that this program wrote; read again only when it has changed.
+    Of an SQLite database, what programs change that only read it is left out. Raises ConfigError.
+    """
     try:
         status = path.stat()
         return _file_digest(path, status.st_size, status.st_mtime_ns)
@@ -54,13 +56,6 @@ def file_digest(path: Path) -> str:
 @lru_cache(maxsize=64)
 def _file_digest(path: Path, size: int, stamp: int) -> str:
     del size, stamp  # only tell changed files apart
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def contents_digest(path: Path) -> str:
-    """SHA-256 (hex) of a file that this program wrote; of a database, what programs change that only read it is left
-    out."""
     with path.open("rb") as stream:
         head = bytearray(stream.read(100))
         if head.startswith(_SQLITE) and head[_SQLITE_MODE] in (b"\1\1", b"\2\2"):

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.fingerprints import contents_digest
+from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.reading import readable
 
 FORMAT_VERSION = 1
@@ -292,7 +292,7 @@ def _object(text: str) -> dict[str, Any]:
 
 def write_record(path: Path, head: Mapping[str, Any], names: Iterable[str]) -> None:
     """A JSON record with the digests of files below its folder, for which it vouches: it is written last."""
-    write_json(path, {**head, "files": {name: contents_digest(path.parent / name) for name in sorted(names)}})
+    write_json(path, {**head, "files": {name: file_digest(path.parent / name) for name in sorted(names)}})
 
 
 def whole_record(path: Path) -> dict[str, Any]:
@@ -306,7 +306,7 @@ def whole_record(path: Path) -> dict[str, Any]:
 def changed_files(folder: Path, record: Mapping[str, Any]) -> list[str]:
     """Those of a record's files that are no longer as they were written, or gone."""
     paths = {name: folder / name for name in record["files"]}
-    return [n for n, path in paths.items() if not path.is_file() or contents_digest(path) != record["files"][n]]
+    return [n for n, path in paths.items() if not path.is_file() or file_digest(path) != record["files"][n]]
 
 
 def remove_stale_temporaries(root: Path) -> None:

@@ -36,8 +36,9 @@ def is_remote(folder: str) -> bool:
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A picture below a remote folder. size_bytes: None where the store does
-    not say. version: changes with its contents; "" where the store does not say."""
+    """A picture below a remote folder. version: changes with its contents. size_bytes is None and version "" where the
+    store does not say.
+    """
 
     folder: str
     name: str
@@ -45,14 +46,10 @@ class RemoteFile:
     version: str
 
     @property
-    def suffix(self) -> str:
-        return Path(self.name).suffix
-
-    @property
     def copy(self) -> Path:
         """Where this machine keeps it."""
         key = sha256(f"{self.folder}\n{self.name}\n{self.size_bytes}\n{self.version}".encode()).hexdigest()[:24]
-        return cache_folder() / key[:2] / f"{key}{self.suffix}"
+        return cache_folder() / key[:2] / f"{key}{Path(self.name).suffix}"
 
     def __str__(self) -> str:
         return f"{self.folder.rstrip('/')}/{self.name}"
@@ -91,7 +88,7 @@ def _fetch(picture: RemoteFile, path: Path) -> None:
     try:
         system, root = _opened(picture.folder)
         with _named_errors(str(picture)):
-            system.get_file(f"{root}/{picture.name}" if root else picture.name, str(partial))
+            system.get_file(_path(root, picture.name), str(partial))
         found = partial.stat().st_size
         if picture.size_bytes is not None and found != picture.size_bytes:
             raise ItemError(f"{picture} ends after {found} of {picture.size_bytes} bytes: run the same command again")
@@ -125,8 +122,13 @@ def remote_file(folder: str, name: str) -> RemoteFile:
     """One of them. Raises ItemError where it is not there."""
     system, root = _opened(folder)
     with _named_errors(f"{folder}/{name}"):
-        facts = system.info(f"{root}/{name}" if root else name)
+        facts = system.info(_path(root, name))
     return RemoteFile(folder, name, facts.get("size"), _version(facts))
+
+
+def _path(root: str, name: str) -> str:
+    """Of a file in its file system; an archive has no root."""
+    return f"{root}/{name}" if root else name
 
 
 def _version(facts: dict[str, Any]) -> str:

@@ -197,7 +197,8 @@ def is_kept(task: EnhanceTask) -> bool:
 
 def _has_picture(task: EnhanceTask) -> bool:
     """Whether the picture on file is of these very settings and inputs."""
-    return not task.as_taken and is_kept(task) and bool(_record(task)["picture"])
+    record = {} if task.as_taken else _record(task)
+    return record.get("fingerprint") == task.fingerprint and bool(record["picture"])
 
 
 def _record(task: EnhanceTask) -> dict[str, Any]:

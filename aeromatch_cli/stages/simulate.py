@@ -169,7 +169,8 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    return is_kept(task) and bool(_record(task)["pictures"])
+    record = _record(task)
+    return record.get("fingerprint") == task.fingerprint and bool(record["pictures"])
 
 
 def is_kept(task: SimulateTask) -> bool:
