@@ -6,16 +6,17 @@ import contextlib
 import ctypes
 import os
 import random
-import re
 import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from dask_cluster import dask_cluster
 
 _SETTINGS = ("--jobs", "2", "--set", "extract.keypoints=200", "--quiet")
 # Runs that make files of other kinds: whatever a run may leave is in one of them. The first is the quickest.
@@ -129,29 +130,11 @@ def _worker_killed(site: Site, rng: random.Random) -> None:
     ended(process, (0, 1, 2))
 
 
-@contextlib.contextmanager
-def _cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """A dask scheduler and two workers: its address, and the three processes."""
-    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    scheduler = _process([*dask, "--port", "0", "--host", "127.0.0.1", "--no-dashboard"])
-    assert scheduler.stderr is not None
-    address = next(m[0] for line in scheduler.stderr if (m := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
-    processes = [scheduler, *(_process(worker) for _ in range(2))]
-    try:
-        yield address, processes
-    finally:
-        for process in processes:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-
-
 def _of_cluster_killed(site: Site, rng: random.Random, number: int, codes: Sequence[int]) -> None:
-    with _cluster() as (address, processes):
+    with dask_cluster() as (address, processes):
         process = site.start("--executor", "dask", "--scheduler", address)
         site.wait(rng)
-        os.killpg(processes[number].pid, signal.SIGKILL)
+        processes[number].kill()
         code, said = ended(process, codes)
         assert code == 0 or "dask" in said, said
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from conftest import heed_interrupts
+from dask_cluster import Processes, dask_cluster
 from make_slow import slow_square
 
 from aeromatch_cli.blocks.exif import read_exif
@@ -229,33 +229,15 @@ def test_workers_that_cannot_start_are_an_error_and_no_endless_loop(tmp_path: Pa
 
 
 @pytest.fixture
-def cluster() -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """A dask scheduler and two workers as processes of their own: its address, and the workers."""
+def cluster() -> Iterator[tuple[str, Processes]]:
+    """Its address, and the workers."""
     pytest.importorskip("distributed")
-    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = os.environ | {"PYTHONPATH": paths, "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
-
-    def started(*arguments: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, "-m", *arguments], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
-            text=True,
-        )  # fmt: skip
-
-    scheduler = started("distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard")
-    assert scheduler.stderr is not None
-    address = next(m[0] for line in scheduler.stderr if (m := re.search(r"tcp://127\.0\.0\.1:\d+", line)))
-    worker = ("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
-    workers = [started(*worker, "--name", "plain"), started(*worker, "--name", "gpu", "--resources", "GPU=1")]
-    try:
-        yield address, workers
-    finally:
-        for process in (*workers, scheduler):
-            process.kill()
-            process.communicate()
+    with dask_cluster() as (address, processes):
+        yield address, processes[1:]
 
 
 @pytest.mark.slow
-def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, list[subprocess.Popen[str]]]) -> None:
+def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, Processes]) -> None:
     address, workers = cluster
     with Executor("dask", scheduler=address) as executor:
         assert [o.value for o in executor.run(slow_square, [3], "first")] == [9]
@@ -274,7 +256,7 @@ def worker_name(number: int) -> str:
 
 
 @pytest.mark.slow
-def test_networks_run_where_a_gpu_is_offered(cluster: tuple[str, list[subprocess.Popen[str]]]) -> None:
+def test_networks_run_where_a_gpu_is_offered(cluster: tuple[str, Processes]) -> None:
     address, workers = cluster
     with Executor("dask", scheduler=address) as executor:
         deadline = time.monotonic() + 30
