@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import time
 from pathlib import Path
 
 import cv2
@@ -443,3 +444,18 @@ def test_a_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded(tmp_p
     # A mapping camera's frame is no such thing: it is cut off, and the decoder says so.
     with pytest.raises(ItemError, match="cannot decode"):
         read_pixels(_claiming(tmp_path / "large.png", 26_460, 17_004), colour=False)
+
+
+def test_a_png_chunk_that_claims_more_than_the_file_holds_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Picture.fromarray(pattern()).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data + b"appended")  # behind the end anything may stand
+    np.testing.assert_array_equal(read_pixels(path, colour=True), pattern())
+    place = data.index(b"IDAT") - 4
+    for length in (0x7FFF_FFFF, len(data)):
+        path.write_bytes(data[:place] + length.to_bytes(4, "big") + data[place + 4 :])
+        before = time.process_time()
+        with pytest.raises(ItemError, match=r"a\.png is cut off: its PNG data ends early; copy it again or remove it"):
+            read_pixels(path, colour=True)
+        assert time.process_time() - before < 0.5  # OpenCV alone takes seconds

@@ -25,6 +25,8 @@ _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
 
+_PNG = b"\x89PNG\r\n\x1a\n"
+
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
     """The stored raster: (H, W) uint8 gray, or with `colour` uint8 or uint16 and (H, W, 3) RGB where it has colour.
@@ -69,6 +71,8 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     _check_size(path)
     try:
         data = path.read_bytes()
+        if fault := _png_fault(data):
+            raise ItemError(f"image {path} is {fault}")
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except (OSError, cv2.error) as error:
         raise ItemError(f"cannot read image {path}: {error}") from None
@@ -92,6 +96,26 @@ def _check_size(path: Path) -> None:
     except (OSError, ValueError, SyntaxError):
         return  # the decoder says what is wrong with it
     tiff.check_pixels(path, width, height)
+
+
+def _png_fault(data: bytes) -> str:
+    """What is wrong with a PNG's structure, "" for nothing; other formats pass.
+
+    A chunk may claim any length: OpenCV makes room for up to 2 GB of it, and fills that, before it finds that the file
+    ends; so no chunk may claim more than is left.
+    """
+    if not data.startswith(_PNG):
+        return ""
+    place = len(_PNG)
+    while place + 8 <= len(data):
+        kind = data[place + 4 : place + 8]
+        # Length and kind stand before the contents, a checksum behind them.
+        place += 12 + int.from_bytes(data[place : place + 4], "big")
+        if place > len(data):
+            return "cut off: its PNG data ends early; copy it again or remove it"
+        if kind == b"IEND":
+            break
+    return ""
 
 
 def _jpeg_fault(data: bytes) -> str:
