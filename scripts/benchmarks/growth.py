@@ -44,8 +44,8 @@ def write_block(folder: Path, images: int, seed: int) -> None:
         x, y = (left + _WIDTH / 2) * _GSD_M, -(top + _HEIGHT / 2) * _GSD_M
         lines.append(f"{name},{x},{y},{_FOCAL * _GSD_M},0,0,0")
     (folder / "poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    camera = {"model": "PINHOLE", "width": _WIDTH, "height": _HEIGHT}
-    camera["params"] = [_FOCAL, _FOCAL, _WIDTH / 2, _HEIGHT / 2]  # type: ignore[assignment]
+    params = [_FOCAL, _FOCAL, _WIDTH / 2, _HEIGHT / 2]
+    camera = {"model": "PINHOLE", "width": _WIDTH, "height": _HEIGHT, "params": params}
     (folder / "cameras.json").write_text(json.dumps({"1": camera}), encoding="utf-8")
 
 
