@@ -136,7 +136,7 @@ def test_a_small_block_runs_and_is_not_run_again(
         assert row["seconds"] > 0
         assert row["keypoints_max"] <= 300
     first = capsys.readouterr().out
-    assert f"| small | 1 | `all` | {rows[0]['keypoints_mean']:.0f} |" in first
+    assert f"| small | 1 | `all` | reference | {rows[0]['keypoints_mean']:.0f} |" in first
     monkeypatch.setattr("benchmarks.blocks.cases.run_step", None)  # nothing is left to run
     assert bench(tmp_path, "blocks", methods) == 0
     assert capsys.readouterr().out == first

@@ -36,7 +36,7 @@ from benchmarks.processes import limit_threads
 from benchmarks.quality import draw_quality
 from benchmarks.scenes import NOISY_POSES, Judged, rendered_scenes, with_noisy_poses
 from benchmarks.tables import Row, code, grouped, markdown, median, number, percent, plain, ratio, total, write_rows
-from benchmarks.whole import evaluated, whole_run
+from benchmarks.whole import budget_settings, evaluated, whole_run
 
 _JUDGED = "auto"
 _ALL_PAIRS = 1_000_000
@@ -45,22 +45,13 @@ _STAGES = ("extract", "match", "filter")
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
-def _budget(args: argparse.Namespace, network: bool) -> int:
-    """Descriptors per image: half as many by networks, as by default."""
-    return int(args.keypoints // 2 if network else args.keypoints)
-
-
 def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
     """One row for each pair of a preset's run."""
     scene = judged.scene
     given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
     name, own_settings = parse_method(preset)
-    whole = load(name, own_settings)
-    most = _budget(args, network=whole.extract.name != "sift")
-    settings = [f"extract.keypoints={most}"]
-    settings += [f"cascade.{s.name}.keypoints={_budget(args, True)}" for s in whole.cascade if s.own_features]
-    settings += [*own_settings, *args.set]
+    settings = [*budget_settings(load(name, own_settings), args.keypoints), *own_settings, *args.set]
     run = whole_run("run", name, scene.images, work, extra=given, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
@@ -78,7 +69,7 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
 
 def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
     """One row for each pair that a peer has answered."""
-    most = _budget(args, network=peer in NEED_WEIGHTS)
+    most = args.keypoints // 2 if peer in NEED_WEIGHTS else args.keypoints
     limits = Options(most, "image", args.jobs, args.seed, args.reference_weights)
     noisy = with_noisy_poses(judged) if reads_poses(peer) else None
     rows: list[Row] = []

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.config import Settings
+
 
 @dataclass(frozen=True)
 class Run:
@@ -44,6 +46,14 @@ def whole_run(
     finished = done.returncode in (0, 1) and bool(done.stdout.strip())
     answer = json.loads(done.stdout.splitlines()[-1]) if finished else {}
     return Run(done.returncode, seconds, answer, done.stderr.strip())
+
+
+def budget_settings(settings: Settings, keypoints: int) -> list[str]:
+    """Settings of a preset for so many SIFT descriptors per image; networks, which take longer for each, have half as
+    many, as by default. A grid has points of its own number."""
+    most = keypoints if settings.extract.name == "sift" else keypoints // 2
+    asked = [f"extract.keypoints={most}"] if hasattr(settings.extract, "keypoints") else []
+    return asked + [f"cascade.{s.name}.keypoints={keypoints // 2}" for s in settings.cascade if s.own_features]
 
 
 def evaluated(work: Path, truth: Path, *, mapping: bool) -> dict[str, Any]:

@@ -6,10 +6,7 @@ from __future__ import annotations
 import resource
 import shutil
 import sqlite3
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,20 +26,27 @@ from aeromatch_cli.strategies.pairings import PAIRINGS
 from aeromatch_cli.workspace import read_json, write_json, write_text
 from benchmarks.blocks import steps
 from benchmarks.blocks.steps import run_step
+from benchmarks.orient.cases import worsened
 from benchmarks.peers.base import MIN_INLIERS, prepared
 from benchmarks.peers.table import Named
 from benchmarks.scenes import MIN_OVERLAP, brightness_of
 from benchmarks.sources import OUR_CODE, code_digest, library_versions
+from benchmarks.whole import budget_settings, whole_run
 
 COLMAP = ("pycolmap", "pycolmap-guided", "pycolmap-uncut", "pycolmap-uncut-guided")
 _STEPS = ("benchmarks/blocks/steps.py", "benchmarks/peers/colmap.py")
+# What presets are given: --poses of a benchmark -> case of the benchmark of orientation.
+GIVEN = {"reference": "reference", "positions": "noise", "nothing": "nothing"}
+# Stages whose seconds count as those of a preset.
+TIMED = ("orient", "pairs", "extract", "match", "filter")
 Answer = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Case:
-    """images: folder. pairs: image names, or None for a method's own choice (COLMAP: all). command: by `aeromatch run`,
-    start-up, export and report included, instead of stage by stage. keypoints: descriptors per image."""
+    """images: folder. pairs: image names, or None for a method's own choice (COLMAP: all). command: seconds are those
+    of the whole command with start-up, export and report, not of its stages. keypoints: descriptors per image. poses:
+    of GIVEN; cameras are the reference's."""
 
     images: Path
     reference: Path
@@ -51,6 +55,7 @@ class Case:
     jobs: int
     command: bool = False
     mapping: bool = True
+    poses: str = "reference"
 
     @property
     def pictures(self) -> list[tuple[str, int]]:
@@ -82,7 +87,8 @@ def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
     """Figures and database of one method; made unless `store` has them."""
     ours = None if name.spec in COLMAP else load(*parse_method(name.spec)).model_dump(mode="json")
     code = (*_STEPS, *(OUR_CODE if ours else ()))
-    basis = [name.spec, ours, case.pictures, case.pairs, case.keypoints, case.jobs, case.command and bool(ours)]
+    basis = [name.spec, ours, case.pictures, case.pairs, case.keypoints, case.jobs]
+    basis += [case.command, case.poses] if ours else []
     folder = store / fingerprint(basis, code_digest(*code), library_versions())[:16]
     folder.mkdir(parents=True, exist_ok=True)
     database, facts, mapped = folder / "database.db", folder / "answer.json", folder / "mapping.json"
@@ -100,30 +106,33 @@ def answer(case: Case, name: Named, store: Path) -> tuple[Answer, Path]:
 
 
 def _preset(case: Case, spec: str, folder: Path) -> Answer:
-    preset, settings = parse_method(spec)
-    if case.command:
-        return _run_command(case, preset, settings, folder)
+    """By `aeromatch run` into a fresh workspace; with its report where the whole command is timed."""
+    preset, own = parse_method(spec)
     pairs = _pair_list(case, folder, ",")
-    return run_step(
-        steps.preset, preset, settings, case.images, case.reference, folder, case.keypoints, case.jobs, pairs
-    )
+    settings = budget_settings(load(preset, own), case.keypoints)
+    settings += [] if case.command else ["run.report=false"]
+    settings += ["pairs=file", f"pairs.path={pairs}"] if pairs else []
+    work, before = folder / "workspace", _processor_seconds()
+    extra, settings = _given(case, folder), [*settings, *own]
+    run = whole_run("run", preset, case.images, work, extra=extra, jobs=case.jobs, settings=settings)
+    if not run.answer:
+        raise SystemExit(f"aeromatch run {preset} failed with exit code {run.code}:\n{run.said[-2000:]}")
+    stages = {name: found["seconds"] for name, found in run.answer["stages"].items()}
+    return {
+        "database": str(work / "export" / "colmap" / "database.db"),
+        "seconds": run.seconds if case.command else sum(stages.get(stage, 0.0) for stage in TIMED),
+        "processor_seconds": _processor_seconds() - before,
+        "stages": stages,
+    }
 
 
-def _run_command(case: Case, preset: str, settings: list[str], folder: Path) -> Answer:
-    """Wall clock and processor seconds of `aeromatch run` from a fresh workspace."""
-    work = folder / "workspace"
-    shutil.rmtree(work, ignore_errors=True)
-    command = [sys.executable, "-c", "from aeromatch_cli.cli import main; main()", "run", preset]
-    command += ["--images", str(case.images), "--poses", str(case.reference / "poses.csv")]
-    command += ["--cameras", str(case.reference / "block.json"), "--workspace", str(work), "--jobs", str(case.jobs)]
-    command += ["--quiet", f"--set=extract.keypoints={case.keypoints}", *(f"--set={text}" for text in settings)]
-    before, started = _processor_seconds(), time.perf_counter()
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    seconds, processor = time.perf_counter() - started, _processor_seconds() - before
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command[3:])} failed with exit code {done.returncode}:\n{done.stderr[-2000:]}")
-    database = work / "export" / "colmap" / "database.db"
-    return {"database": str(database), "seconds": seconds, "processor_seconds": processor}
+def _given(case: Case, folder: Path) -> list[str]:
+    """Options of the command: poses as asked; the reference's cameras, its ground height beside its own poses alone."""
+    if case.poses == "reference":
+        return ["--poses", str(case.reference / "poses.csv"), "--cameras", str(case.reference / "block.json")]
+    names = [name for name, _ in case.pictures]
+    made, _ = worsened(GIVEN[case.poses], case.reference, names, folder)
+    return [*made, "--cameras", str(folder / "block.json")]  # the last one counts
 
 
 def _processor_seconds() -> float:
@@ -199,13 +208,14 @@ def count_matches(database: Path, reference: Path, only: Collection[NamePair] | 
     matches: rows. unique_matches: each pair of places once (COLMAP counts a place with two orientations twice).
     within_3px, within_5px: unique ones by symmetric epipolar distance from the reference poses, on undistorted pixels.
     thinned*: of the unique ones, those left one-to-one at 2 px spacing in both images, as in every other table.
-    filled_cells: share of the 16 x 16 cells of all images that hold one within 3 px.
+    filled_cells, filled_ninths: share of the 16 x 16, 3 x 3 cells of all images that hold one within 3 px.
     """
     truth = load_reference(reference)
     sums = dict.fromkeys(
         ("pairs", "matches", "unique_matches", "within_3px", "within_5px", "thinned", "thinned_3px", "thinned_5px"), 0
     )
-    filled = {name: np.zeros((GRID_CELLS, GRID_CELLS), bool) for name in truth.cameras}
+    sizes = GRID_CELLS, 3
+    filled = {(name, n): np.zeros((n, n), bool) for name in truth.cameras for n in sizes}
     with sqlite3.connect(database) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         points_px = {image_id: _stored_px(*rest) for image_id, *rest in connection.execute(_KEYPOINTS)}
@@ -221,15 +231,17 @@ def count_matches(database: Path, reference: Path, only: Collection[NamePair] | 
             errors_px = np.nan_to_num(truth.errors(*pair, places[:, :2], places[:, 2:]), nan=np.inf)
             for name, side in zip(pair, (places[:, :2], places[:, 2:]), strict=True):
                 camera = truth.cameras[name]
-                cells = (side[errors_px <= CORRECT_PX] + 0.5) / [camera.width_px, camera.height_px] * GRID_CELLS
-                filled[name][tuple(np.clip(cells.astype(int), 0, GRID_CELLS - 1).T)] = True
+                within_image = (side[errors_px <= CORRECT_PX] + 0.5) / [camera.width_px, camera.height_px]
+                for n in sizes:
+                    filled[name, n][tuple(np.clip((within_image * n).astype(int), 0, n - 1).T)] = True
             kept = errors_px[thin(places[:, :2], places[:, 2:], np.zeros(len(places)))]
             found = (1, rows, len(places), *_within(errors_px), len(kept), *_within(kept))
             sums = {key: total + value for (key, total), value in zip(sums.items(), found, strict=True)}
     counts = [len(places_px) for places_px in points_px.values()]
-    shares = [filled[name].mean() for name in names.values()]
+    shares = [float(np.mean([filled[name, n].mean() for name in names.values()])) for n in sizes]
     return sums | {
-        "keypoints_mean": float(np.mean(counts)), "keypoints_max": max(counts), "filled_cells": float(np.mean(shares)),
+        "keypoints_mean": float(np.mean(counts)), "keypoints_max": max(counts),
+        "filled_cells": shares[0], "filled_ninths": shares[1],
     }  # fmt: skip
 
 

@@ -5,18 +5,22 @@ where it is the name of a preset of synth. A method is a preset, with settings i
 brackets as in `--set` and a label before it where the name gets long ('plain=fusion[enhance=none]'), or COLMAP's CPU
 SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
 
-  blocks    every k-th image (--thin); extraction, matching and verification are timed, start-up and export are not;
-            then both of pycolmap's mappings from each database. COLMAP matches all pairs, a preset those it chooses
+  blocks    every k-th image (--thin); `aeromatch run` without its report, of which orientation, pairs, extraction,
+            matching and verification are timed, start-up, adjustment and export are not; then both of pycolmap's
+            mappings from each database. COLMAP matches all pairs, a preset those it chooses
   thinned   the same where ordinary matching falls apart
   cross     only pairs across a block's darker and brighter series that share a fifth of the smaller footprint
   easy      wall clock of `aeromatch run`, everything included, against the first method
   orient    whole chains from pictures to an oriented block: `scripts/bench blocks orient --help`
 
-Every step runs in a process of its own. The budget is exact for all, in COLMAP's sense of a keypoint (a place with two
-orientations counts twice). pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. It is
+Presets are given (--poses) the reference poses, positions alone with 5 m noise, or nothing; COLMAP uses none. All have
+the reference's cameras. The budget is exact, in COLMAP's sense of a keypoint (a place with two orientations counts
+twice); networks, which take longer for each, have half as many, as by default, and `auto` has both.
+pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. It is
 therefore cut to the budget after extraction, untimed, largest scales first as its own rule would; pycolmap-uncut is
 not. Verified matches are those of pairs with at least 15, each pair of places once (COLMAP counts a place with two
-orientations twice); within 3 and 5 px: by symmetric epipolar distance from the reference poses.
+orientations twice); within 3 and 5 px: by symmetric epipolar distance from the reference poses. Cells filled: of
+16 x 16 of each image, and ninths of 3 x 3, that hold a match within 3 px.
 Writes OUT/SECTION.json and OUT/SECTION.md; OUT/answers keeps what every method answered: a killed run goes on there.
 """
 
@@ -27,13 +31,14 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.synthetic.presets import PRESETS
 from benchmarks import options, stamps
 from benchmarks.blocks import chains
-from benchmarks.blocks.cases import COLMAP, Case, answer, chosen_images, count_matches, cross_pairs
+from benchmarks.blocks.cases import COLMAP, GIVEN, Case, answer, chosen_images, count_matches, cross_pairs
 from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
 from benchmarks.peers.table import Named, check_method, named_methods, settings_of
 from benchmarks.scenes import render_once
@@ -73,11 +78,14 @@ def rows_of(args: argparse.Namespace, section: str, methods: Sequence[Named]) ->
             images = chosen_images(source / "images", every, limit, folder)
             pairs = cross_pairs(images, reference) if section == "cross" else None
             mapping = SECTIONS[section].mapping and not args.no_mapping
-            case = Case(images, reference, pairs, args.keypoints, args.jobs, section == "easy", mapping)
-            for name in methods:
+            for poses, name in product(args.poses, methods):
+                if name.spec in COLMAP and poses != args.poses[0]:
+                    continue  # the same answer
+                case = Case(images, reference, pairs, args.keypoints, args.jobs, section == "easy", mapping, poses)
                 found, database = answer(case, name, args.out / "answers")
                 only = None if pairs is None else set(pairs)
-                head = {"block": block, "every": every, "method": name.label, "spec": name.spec}
+                head = {"block": block, "every": every, "poses": None if name.spec in COLMAP else poses}
+                head |= {"method": name.label, "spec": name.spec}
                 head |= {"images": len(case.pictures), "asked_keypoints": args.keypoints, "cores": args.jobs}
                 asked = {} if pairs is None else {"asked_pairs": len(pairs)}
                 yield head | asked | found | count_matches(database, reference, only)
@@ -105,6 +113,7 @@ def make_options(section: str) -> argparse.ArgumentParser:
     add("--thin", type=options.numbers, default=default.thin, help="keep every k-th image; several k comma-separated")
     add("--keypoints", type=options.positive, default=default.keypoints, help="descriptors per image")
     add("--methods", default=default.methods, help="comma-separated; the first is what others are compared with")
+    add("--poses", type=options.names, default="reference", help=f"what presets get: {', '.join(GIVEN)}")
     add("--jobs", type=options.positive, default=2)
     add("--no-mapping", action="store_true", help="leave out pycolmap's mapping")
     options.add_output(parser)
@@ -123,6 +132,8 @@ def main(arguments: Sequence[str]) -> None:
     methods = named_methods(args.methods)
     for name in methods:
         check_method(name.spec, COLMAP)
+    if unknown := [poses for poses in args.poses if poses not in GIVEN]:
+        parser.error(f"--poses: {', '.join(unknown)} are none of {', '.join(GIVEN)}")
     rows: list[Row] = []
     for row in rows_of(args, section, methods):
         rows.append(row)

@@ -1,5 +1,5 @@
-"""Steps of `bench blocks`, each in a process of its own: pycolmap ends the whole process on a fault, and takes over
-signals."""
+"""COLMAP's steps of `bench blocks`, each in a process of its own: pycolmap ends the whole process on a fault, and takes
+over signals."""
 
 from __future__ import annotations
 
@@ -27,38 +27,6 @@ def run_step(step: Callable[..., Figures], *given: Any) -> Figures:
             return process.submit(step, *given).result()
         except BrokenProcessPool as error:
             raise SystemExit(f"{step.__name__}: its process died ({error})") from error
-
-
-def preset(
-    name: str, own: list[str], images: Path, reference: Path, work: Path, keypoints: int, jobs: int, pairs: Path | None
-) -> Figures:
-    """Orient, extract, match and filter of a preset, timed; then export, untimed. What a killed run made is kept:
-    seconds are null then. own: settings. pairs: a list of them, or None for the preset's choice.
-    """
-    from aeromatch_cli.config import load
-    from aeromatch_cli.executor import Executor
-    from aeromatch_cli.stages import export, extract, filter, match  # noqa: A004
-    from aeromatch_cli.stages import pairs as pairing
-
-    block = {"images": str(images), "poses": str(reference / "poses.csv"), "cameras": str(reference / "block.json")}
-    top: dict[str, Any] = {"workspace": str(work / "workspace"), "run": {"jobs": jobs}}
-    # A grid has points of its own number, no keypoints.
-    limited = hasattr(load(name, own, block, **top).extract, "keypoints")
-    asked = [f"extract.keypoints={keypoints}"] if limited else []
-    asked += ["pairs=file", f"pairs.path={pairs}"] if pairs else []
-    settings = load(name, [*asked, *own], block, **top)
-    with Executor("processes", jobs) as executor:
-        context, oriented, _ = pairing.prepare(settings, executor)
-        started = time.perf_counter()
-        reports = [oriented, *(stage.run(context) for stage in (extract, match, filter))]
-        seconds = oriented.seconds + time.perf_counter() - started
-        export.run(context)
-    fresh = not any(report.skipped for report in reports)
-    return {
-        "database": str(context.workspace.export("colmap") / "database.db"),
-        "seconds": seconds if fresh else None,
-        "stages": {report.stage: report.seconds for report in reports},
-    }
 
 
 def colmap_extract(images: Path, reference: Path, database: Path, keypoints: int, jobs: int, cut: bool) -> Figures:

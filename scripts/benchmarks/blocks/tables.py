@@ -27,6 +27,7 @@ _BLOCKS: tuple[Column[Row], ...] = (
     ("within 3 px", lambda row: row["within_3px"]),
     ("within 5 px", lambda row: row["within_5px"]),
     ("cells filled", lambda row: percent(row["filled_cells"]) if "filled_cells" in row else "-"),
+    ("ninths", lambda row: percent(row["filled_ninths"]) if "filled_ninths" in row else "-"),
     ("registered", lambda row: f"{row['registered']} of {row['images']}" if "registered" in row else "-"),
     ("by global mapping", lambda row: f"{row['global']['registered']}" if "global" in row else "-"),
     ("points", lambda row: row.get("points", "-")),
@@ -77,8 +78,8 @@ _EASY: list[Column[_Both]] = [
 
 def blocks_table(rows: Sequence[Row]) -> str:
     """A line per block, thinning and method: matches, and what mapping makes of them."""
-    lines = [((row["block"], row["every"], code(row["method"])), row) for row in rows]
-    return table(("block", "every", "method"), lines, _BLOCKS)
+    lines = [((row["block"], row["every"], code(row["method"]), row["poses"] or "-"), row) for row in rows]
+    return table(("block", "every", "method", "poses"), lines, _BLOCKS)
 
 
 def cross_table(rows: Sequence[Row]) -> str:
