@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rasterio
 from numpy.typing import NDArray
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from rasterio.errors import NotGeoreferencedWarning
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 
@@ -97,6 +100,19 @@ def write_bands(
     with path.open("wb") as stream:
         directory.save(stream)
         stream.write(np.ascontiguousarray(np.moveaxis(bands, 0, 2)).tobytes())
+    return path
+
+
+def write_jpeg_2000(path: Path, bands: NDArray[Any]) -> Path:
+    """Lossless JPEG 2000 of bands (B, H, W) in tiles of 256 pixels."""
+    count, height, width = bands.shape
+    size: dict[str, Any] = {"count": count, "height": height, "width": width, "dtype": bands.dtype}
+    lossless = {"QUALITY": 100, "REVERSIBLE": "YES", "BLOCKXSIZE": 256, "BLOCKYSIZE": 256}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="JP2OpenJPEG", **size, **lossless) as out:
+            out.write(bands)
+    path.with_name(path.name + ".aux.xml").unlink(missing_ok=True)
     return path
 
 

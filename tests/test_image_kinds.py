@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import HEIGHT, IMAGES, WIDTH
-from make_images import write_bands
+from make_images import write_bands, write_jpeg_2000
 
 from aeromatch_cli.workspace import Workspace, read_json
 
@@ -55,9 +55,13 @@ def test_the_same_picture_twice(site):
 
 
 def test_sizes_depths_and_formats_mixed(site):
-    """A 16-bit TIFF, a gray PNG and a smaller JPEG among the others, with cameras from EXIF defaults."""
-    deep, gray, small = (site.image(index) for index in range(3))
+    """A 16-bit TIFF and JPEG 2000, a gray PNG and a smaller JPEG among the others, with cameras from EXIF defaults."""
+    deep, gray, small, deeper = (site.image(index) for index in range(4))
     renamed = {deep.name: deep.with_suffix(".tif").name, gray.name: gray.with_suffix(".png").name}
+    renamed[deeper.name] = deeper.with_suffix(".jp2").name
+    bands = np.moveaxis(cv2.imread(str(deeper))[..., ::-1], 2, 0).astype(np.uint16) * 200
+    write_jpeg_2000(deeper.with_suffix(".jp2"), bands)
+    deeper.unlink()
     cv2.imwrite(str(deep.with_suffix(".tif")), cv2.imread(str(deep)).astype(np.uint16) * 200)
     cv2.imwrite(str(gray.with_suffix(".png")), cv2.imread(str(gray), cv2.IMREAD_GRAYSCALE))
     cv2.imwrite(str(small), cv2.resize(cv2.imread(str(small)), (WIDTH * 3 // 4, HEIGHT * 3 // 4)))

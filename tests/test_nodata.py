@@ -137,7 +137,7 @@ def test_the_nodata_value_counts_where_all_bands_have_it(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("nodata", [-9999.0, 0.5, 256.0, float("nan")])
 def test_nodata_values_that_the_type_cannot_hold_are_passed_over(nodata: float) -> None:
-    from aeromatch_cli.images.tiff import _has_values
+    from aeromatch_cli.images.gdal import _has_values
 
     assert _has_values(np.zeros((1, 4, 4), np.uint8), [nodata]) is None
     assert _has_values(np.zeros((2, 4, 4), np.uint8), [None, 0.0]) is None

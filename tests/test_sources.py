@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import rasterio
 from make_ground import ground
+from make_images import write_jpeg_2000
 
 from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.images import gdal
 from aeromatch_cli.images import stored as sources
-from aeromatch_cli.images import tiff
 from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import enhance, pairs
 
@@ -78,17 +79,30 @@ def test_sixteen_bits_keep_what_eight_would_round_away(tmp_path, images):
     assert len(np.unique(values)) > 40
 
 
-def test_a_tiff_is_never_decoded_whole(tmp_path, images, monkeypatch):
-    write_tiff(images / "a.tif", np.rint(PICTURE).astype(np.uint8)[None])
+def test_jpeg_2000_is_the_same_picture_whole_and_by_windows(tmp_path, images):
+    stored = np.repeat(np.rint(PICTURE * 16.0)[None], 4, axis=0).astype(np.uint16)
+    stored[3] = 4095 - stored[3]
+    write_jpeg_2000(images / "a.jp2", stored)
+    whole, valid = gdal.read_bands(images / "a.jp2")
+    assert valid is None
+    np.testing.assert_array_equal(whole, np.moveaxis(stored[:3], 0, 2))
+    found = raster(tmp_path)
+    values, _ = found.window(130, 90, 60, 40)
+    assert same_but_for_gain(values, stored[0, 90:130, 130:190].astype(np.float32)) < 5e-3
+
+
+@pytest.mark.parametrize(("name", "write"), [("a.tif", write_tiff), ("a.jp2", write_jpeg_2000)])
+def test_a_picture_of_windows_is_never_decoded_whole(tmp_path, images, monkeypatch, name, write):
+    write(images / name, np.rint(PICTURE).astype(np.uint8)[None])
     found = raster(tmp_path)
     parts = []
-    read = tiff.read_tiff
+    read = gdal.read_bands
 
     def watched(path, part=None):
         parts.append(part)
         return read(path, part)
 
-    monkeypatch.setattr(tiff, "read_tiff", watched)
+    monkeypatch.setattr(gdal, "read_bands", watched)
     monkeypatch.setattr("aeromatch_cli.images.scaling._STRIP_PX", 60 * WIDTH)
     sources._units.clear()
     found.reduced(0.125)

@@ -26,8 +26,8 @@ from aeromatch_cli.blocks.xmp import (
 )
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import tiff
-from aeromatch_cli.images.tiff import check_pixels
+from aeromatch_cli.images import gdal
+from aeromatch_cli.images.gdal import check_pixels
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
@@ -150,24 +150,26 @@ def _header(path: Path, notes: list[str]) -> _Header:
             packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or main.get(_XMP_PACKET)
             return _Header(size_px, main, exif, gps, packet)
     except UnidentifiedImageError as error:
-        if path.suffix.lower() not in tiff.SUFFIXES:
+        if path.suffix.lower() not in gdal.SUFFIXES:
             raise _unreadable(path) from error
-        return _header_of_other_tiff(path, notes)
+        return _header_of_other(path, notes)
     except _BROKEN as error:
         raise ItemError(f"{path.name}: header cannot be read ({error}): copy the file again") from error
 
 
-def _header_of_other_tiff(path: Path, notes: list[str]) -> _Header:
-    """The same of a TIFF that Pillow does not know (16 bit or float with several bands): by the reader of its pixels.
+def _header_of_other(path: Path, notes: list[str]) -> _Header:
+    """The same of a file that Pillow does not know (16 bit or float with several bands): by the reader of its pixels.
 
-    Pillow can read the tags all the same.
+    Pillow can read the tags of a TIFF all the same.
     """
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     try:
-        size_px = tiff.tiff_size(path)
+        size_px = gdal.stored_size(path)
     except ItemError as error:
         raise _unreadable(path) from error
+    if path.suffix.lower() not in gdal.TIFF:
+        return _Header(size_px, {}, {}, {}, None)
     with path.open("rb") as stream:
         magic = stream.read(16)
         magic = magic if magic[2:3] == b"+" else magic[:8]  # BigTIFF is version 43, and its offsets have 8 bytes

@@ -37,7 +37,7 @@ from aeromatch_cli.blocks.observations import (
     oriented,
 )
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.blocks.scan import ScanFailure, image_ids
+from aeromatch_cli.blocks.scan import KINDS, ScanFailure, image_ids
 from aeromatch_cli.data import Camera, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
@@ -220,7 +220,7 @@ def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[
 
 def _nothing_left(images_dir: str, failures: list[ReadFailure]) -> str:
     if not failures:
-        return f"no image (jpg, jpeg, png, tif, tiff) in {images_dir}: check --images"
+        return f"no image ({KINDS}) in {images_dir}: check --images"
     return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from aeromatch_cli.errors import ConfigError
 
-SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
+KINDS = ", ".join(suffix[1:] for suffix in SUFFIXES)  # as messages say it
 
 _FOLDER_MARK = "--"
 _LONGEST_SLUG = 150
@@ -37,7 +38,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
     """Relative names (forward slashes, sorted) of the images below a folder, and what was passed over and why.
 
     Folders are searched at any depth, links included; hidden files and folders are skipped. A suffix in any case
-    counts: jpg, jpeg, png, tif, tiff. exclude: folders that are not searched, such as masks; nor is any folder that is
+    counts. exclude: folders that are not searched, such as masks; nor is any folder that is
     a workspace of this program. Raises ConfigError where the folder is missing or cannot be read.
     """
     if not folder.is_dir():

@@ -13,7 +13,7 @@ from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.blocks.pose_files.source import Source
 from aeromatch_cli.blocks.poses import read_poses
-from aeromatch_cli.blocks.scan import scan_images
+from aeromatch_cli.blocks.scan import KINDS, scan_images
 from aeromatch_cli.config.faults import nearest
 from aeromatch_cli.config.load import differences_of_preset, preset_names
 from aeromatch_cli.config.schema import FAMILIES, Settings
@@ -86,7 +86,7 @@ def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
     """
     names, _ = scan_images(images, [])
     if not names:
-        raise InputError(f"no image (jpg, jpeg, png, tif, tiff) in {images}: check --images")
+        raise InputError(f"no image ({KINDS}) in {images}: check --images")
     looked = [exif_or_reason(images / name) for name in names[:: max(1, len(names) // _LOOKED_AT)][:_LOOKED_AT]]
     facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
     found = [f"{len(names)} images", *_seen(facts)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import tiff
+from aeromatch_cli.images import gdal
 from aeromatch_cli.images.depth import in_16_bits, to_gray8
 
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
@@ -45,8 +45,8 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
     import cv2
 
     valid = None
-    if path.suffix.lower() in tiff.SUFFIXES:
-        pixels, valid = tiff.read_tiff(path)
+    if path.suffix.lower() in gdal.SUFFIXES:
+        pixels, valid = gdal.read_bands(path)
     else:
         # Gray straight from the decoder is fastest, but it would cast a 16-bit PNG to 8 bit.
         straight = not colour and path.suffix.lower() in (".jpg", ".jpeg")
@@ -95,7 +95,7 @@ def _check_size(path: Path) -> None:
             width, height = picture.size
     except (OSError, ValueError, SyntaxError):
         return  # the decoder says what is wrong with it
-    tiff.check_pixels(path, width, height)
+    gdal.check_pixels(path, width, height)
 
 
 def _png_fault(data: bytes) -> str:

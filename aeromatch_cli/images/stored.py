@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.images import tiff
+from aeromatch_cli.images import gdal
 from aeromatch_cli.images.masks import without_frames
 from aeromatch_cli.images.scaling import shrink_in_strips
 from aeromatch_cli.images.source import Source, read_source
@@ -66,18 +66,18 @@ class StoredRaster:
         return small, np.asarray(share > _KNOWN)
 
     def _unit(self) -> float | None:
-        """What values of a TIFF that is read by parts are multiplied with; None where it is decoded whole."""
+        """What values of a file that is read by parts are multiplied with; None where it is decoded whole."""
         return _kept(_units, self._source.fingerprint, _KEPT_UNITS, self._glanced)
 
     def _glanced(self) -> float | None:
         source = self._source
         if (
-            source.path.suffix.lower() not in tiff.SUFFIXES
+            source.path.suffix.lower() not in gdal.SUFFIXES
             or source.mask is not None
             or source.sky_rotation is not None
         ):
             return None
-        if tiff.tiff_size(source.path) != (self.width_px, self.height_px) or tiff.may_have_a_mask(source.path):
+        if gdal.stored_size(source.path) != (self.width_px, self.height_px) or gdal.may_have_a_mask(source.path):
             return None  # where all is decoded the size is judged, and whether the last band is a mask
         small, valid = self._of_parts(_GLANCE, 1.0)
         if without_frames(small) is not None or (valid is not None and not valid.any()):
@@ -104,7 +104,7 @@ class StoredRaster:
         return small, np.asarray(shrink_in_strips(read_known, size, scale) > _KNOWN)
 
     def _part(self, part: tuple[int, int, int, int], unit: float) -> tuple[NDArray[np.float32], BoolArray | None]:
-        pixels, valid = tiff.read_tiff(self._source.path, part)
+        pixels, valid = gdal.read_bands(self._source.path, part)
         gray = _gray(pixels).astype(np.float32) * np.float32(unit)
         if valid is None or valid.all():
             return gray, None

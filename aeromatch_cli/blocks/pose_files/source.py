@@ -21,7 +21,7 @@ from aeromatch_cli.geometry.rotations import to_quaternion
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
 _LARGEST_BYTES = 2_000_000_000
 # A name that is an image's.
-IMAGE = re.compile(r".+\.(jpe?g|tiff?|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
+IMAGE = re.compile(r".+\.(jpe?g|tiff?|jp2|j2k|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 

@@ -1,4 +1,5 @@
-"""TIFFs of any number of bands and any depth, as rasterio reads them. The only file that knows its band order."""
+"""TIFF and JPEG 2000 of any number of bands and depth, whole or by windows, as GDAL (rasterio) reads them. The only file
+that knows its band order."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
 
-SUFFIXES = frozenset({".tif", ".tiff"})
+TIFF = frozenset({".tif", ".tiff"})
+SUFFIXES = TIFF | {".jp2", ".j2k"}
 # OpenCV decodes no more (CV_IO_MAX_IMAGE_PIXELS). The largest aerial cameras have half as many.
 MAX_PIXELS = 1 << 30
 
@@ -28,13 +30,13 @@ def check_pixels(path: Path, width_px: int, height_px: int) -> None:
         )
 
 
-def tiff_size(path: Path) -> tuple[int, int]:
+def stored_size(path: Path) -> tuple[int, int]:
     """Width and height of the stored raster, from the header alone. Raises ItemError."""
     with _opened(path) as source:
         return int(source.width), int(source.height)
 
 
-def read_tiff(path: Path, part: tuple[int, int, int, int] | None = None) -> tuple[NDArray[Any], BoolArray | None]:
+def read_bands(path: Path, part: tuple[int, int, int, int] | None = None) -> tuple[NDArray[Any], BoolArray | None]:
     """(H, W) or (H, W, 3) of whole or floating numbers as stored, and where the file has values (None = everywhere).
 
     part: left, top, width, height of what is read, None for everything. The first three bands of four or more, the
