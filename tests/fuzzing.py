@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from make_features import random_features
-from make_images import DJI_XMP, gps_tags, write_image
+from make_images import DJI_XMP, gps_tags, write_image, write_jpeg_2000
 from make_pose_files import LOCAL, WORLD, patb, write_micmac
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
@@ -154,7 +154,9 @@ def readers() -> dict[str, Reader]:
         image = write_image(Path(scratch) / "a.jpg", gps=gps_tags(52.0, 13.0, 100.0), xmp=DJI_XMP).read_bytes()
         png = write_image(Path(scratch) / "a.png").read_bytes()
         tif = write_image(Path(scratch) / "a.tif").read_bytes()
+        jp2 = write_jpeg_2000(Path(scratch) / "a.jp2", np.full((3, 30, 40), 900, np.uint16)).read_bytes()
         ori = {"Orientation-A.jpg.xml": next(write_micmac(Path(scratch)).glob("*.xml")).read_bytes()}
+    pictures = {"a.jpg": image, "a.png": png, "a.tif": tif, "a.jp2": jp2}
     camera = '{"1": {"model": "OPENCV", "width": 40, "height": 30, "params": [9, 9, 20, 15, 0, 0, 0, 0]}}'
     control = (
         "EPSG:32633\n390951.2 5818970.1 34.0 512.3 390.8 a.jpg north\n390952.2 5818971.1 34.0 51.3 39.8 a.jpg s check\n"
@@ -185,8 +187,8 @@ def readers() -> dict[str, Reader]:
             _texts({"gcp_list.txt": control}),
         ),
         "settings": Reader(lambda path: load(str(path)), _texts({"a.yaml": settings})),
-        "exif": Reader(read_exif, {"a.jpg": image, "a.png": png, "a.tif": tif}),
-        "pixels": Reader(lambda path: read_pixels(path, colour=True), {"a.jpg": image, "a.png": png, "a.tif": tif}),
+        "exif": Reader(read_exif, pictures),
+        "pixels": Reader(lambda path: read_pixels(path, colour=True), pictures),
         "masks": Reader(lambda path: read_mask(path, 40, 30), {"a.png": png}),
         "features": Reader(read_features, {"a.npz": _archive(write_features, features, "f")}),
         "matches": Reader(read_match_row, {"a.npz": _archive(write_match_row, [MatchEntry("b", "f", "s", kept)])}),

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from make_images import write_image
+from make_images import write_image, write_jpeg_2000
 from numpy.typing import NDArray
 from PIL import Image as Picture
 
@@ -459,3 +459,13 @@ def test_a_png_chunk_that_claims_more_than_the_file_holds_is_refused_at_once(tmp
         with pytest.raises(ItemError, match=r"a\.png is cut off: its PNG data ends early; copy it again or remove it"):
             read_pixels(path, colour=True)
         assert time.process_time() - before < 0.5  # OpenCV alone takes seconds
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_jpeg_2000_that_is_cut_off_is_refused(tmp_path: Path, share: float) -> None:
+    bands = np.random.default_rng(0).integers(0, 4096, (3, 600, 700)).astype(np.uint16)
+    path = write_jpeg_2000(tmp_path / "a.jp2", bands)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ItemError, match=r"a\.jp2"):
+        read_pixels(path, colour=True)

@@ -1,5 +1,7 @@
-"""TIFF and JPEG 2000 of any number of bands and depth, whole or by windows, as GDAL (rasterio) reads them. The only file
-that knows its band order."""
+"""TIFF and JPEG 2000 of any number of bands and depth, whole or by windows, as GDAL (rasterio) reads them.
+
+The only file that knows its band order.
+"""
 
 from __future__ import annotations
 
