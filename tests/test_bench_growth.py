@@ -7,19 +7,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from benchmarks.growth import STAGES, table_of, write_block
+from benchmarks.growth import STAGES, draw_growth, table_of, write_block
 from benchmarks.memory import peak_mb
 
 
-def test_exponents_are_those_of_the_number_of_images() -> None:
+def test_exponents_are_those_of_the_number_of_images(tmp_path: Path) -> None:
     rows = [
         {
             "images": images, "run": run, "seconds": seconds, "peak_mb": 200.0, "pairs": 10 * images, "report_mb": 1.0,
-            "workspace_mb": 2.0 * images, "stages": dict.fromkeys(STAGES, (images / 100.0) ** 2),
+            "processor_seconds": seconds, "workspace_mb": 2.0 * images,
+            "stages": dict.fromkeys(STAGES, (images / 100.0) ** 2),
         }
         for images in (100, 1000)
         for run, seconds in (("run", images / 10.0), ("again", 5.0))
     ]  # fmt: skip
+    draw_growth(tmp_path / "growth.svg", rows)
+    assert "n log n" in (tmp_path / "growth.svg").read_text(encoding="utf-8")
     lines = {line.split("|")[1].strip(): line for line in table_of(rows).splitlines()}
     assert "| 1.0 | 100 (2.00) |" in lines["match, s"]
     assert "| 10.0 | 100 (1.00) |" in lines["whole run, s"]

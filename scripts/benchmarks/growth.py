@@ -3,13 +3,17 @@
 Blocks of small images are cut from one made texture, as a level camera above a plane sees it, in strips with 70 % and
 60 % overlap; poses and camera are exact. `run`: the whole command; `again`: the same command on the finished workspace.
 Memory: the largest sum of what the command's processes hold (PSS), looked at every 0.2 s. Exponent: of the power of the
-number of images by which the seconds grow from one block to the next.
+number of images by which the seconds grow from one block to the next. Processor: seconds of all processes together,
+which other work on the machine hardly changes.
+
+Writes OUT/growth.json, OUT/growth.md and OUT/growth.svg. Whole rows that OUT has are not made again.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import resource
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,10 +22,12 @@ from typing import Any
 
 from benchmarks import options, stamps
 from benchmarks.memory import peak_mb, texture
+from benchmarks.pages import FOLDER
 from benchmarks.tables import Row, markdown, number, write_rows
 
 _WIDTH, _HEIGHT, _FOCAL, _GSD_M = 160, 120, 200.0, 0.5
 _STEP_X, _STEP_Y = 48, 48
+_SIZE_IN = (7.5, 5.0)
 STAGES = ("orient", "pairs", "extract", "match", "filter", "adjust", "consistency", "export", "report")
 
 
@@ -49,8 +55,12 @@ def write_block(folder: Path, images: int, seed: int) -> None:
     (folder / "cameras.json").write_text(json.dumps({"1": camera}), encoding="utf-8")
 
 
-def rows_of(args: Any) -> Iterator[Row]:
+def rows_of(args: Any, known: Sequence[Row]) -> Iterator[Row]:
+    """Two rows per block, those that are known first."""
     for images in args.images:
+        if len(before := [row for row in known if row["images"] == images]) == 2:
+            yield from before
+            continue
         folder, work = args.out / f"block-{images}", args.out / f"work-{images}"
         write_block(folder, images, args.seed)
         shutil.rmtree(work, ignore_errors=True)
@@ -59,19 +69,25 @@ def rows_of(args: Any) -> Iterator[Row]:
         command += ["--cameras", str(folder / "cameras.json"), "--ground", "0", "--crs", "local"]
         command += ["--workspace", str(work), "--jobs", str(args.jobs), "--set", f"extract.keypoints={args.keypoints}"]
         for run in ("run", "again"):
-            log = args.out / f"{run}-{images}.log"
+            log, used_s = args.out / f"{run}-{images}.log", _processor_s()
             exit_code, seconds, peak = peak_mb(command, log)
             answer = _answer(log)
             if exit_code not in (0, 1) or not answer:
                 raise SystemExit(f"{run} of {images} images ended with exit code {exit_code}: see {log}")
             yield {
                 "images": images, "run": run, "seconds": seconds, "peak_mb": peak, "exit_code": exit_code,
+                "processor_seconds": _processor_s() - used_s,
                 "pairs": answer["stages"]["pairs"]["items"],
                 "stages": {stage: answer["stages"][stage]["seconds"] for stage in STAGES},
                 "report_mb": (work / "report" / "index.html").stat().st_size / 1e6,
                 "workspace_mb": sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) / 1e6,
             }  # fmt: skip
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _processor_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _answer(log: Path) -> dict[str, Any]:
@@ -87,6 +103,7 @@ def table_of(rows: Sequence[Row]) -> str:
     lines: list[tuple[str, ...]] = [("pairs", *(number(row["pairs"]) for row in first))]
     lines += [(f"{stage}, s", *_grown(first, lambda row, s=stage: row["stages"][s])) for stage in STAGES]
     lines.append(("whole run, s", *_grown(first, lambda row: row["seconds"])))
+    lines.append(("processor, s", *_grown(first, lambda row: row["processor_seconds"])))
     lines.append(("again, s", *_grown(first, lambda row: again[row["images"]]["seconds"])))
     lines.append(("peak memory, MB", *_grown(first, lambda row: row["peak_mb"])))
     lines.append(("of again, MB", *_grown(first, lambda row: again[row["images"]]["peak_mb"])))
@@ -107,6 +124,37 @@ def _grown(rows: Sequence[Mapping[str, Any]], value: Any) -> Iterator[str]:
         yield text
 
 
+def draw_growth(path: Path, rows: Sequence[Row]) -> None:
+    """Write an SVG: seconds of every stage, of the whole run and of the same command again, and n log n beside them."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams["svg.hashsalt"] = "growth"
+    import matplotlib.pyplot as plt
+
+    first, again = ([row for row in rows if row["run"] == run] for run in ("run", "again"))
+    counts = [row["images"] for row in first]
+    lines = {stage: [row["stages"][stage] for row in first] for stage in STAGES}
+    lines["whole run"] = [row["seconds"] for row in first]
+    lines["again"] = [row["seconds"] for row in again]
+    figure, axis = plt.subplots(figsize=_SIZE_IN)
+    for order, (name, seconds) in enumerate(lines.items()):
+        whole = name not in STAGES
+        style: dict[str, Any] = {"color": "black", "linestyle": "--" if name == "again" else "-"} if whole else {}
+        axis.plot(counts, seconds, marker="os^vD"[order % 5], markersize=4, linewidth=1.2, label=name, **style)
+    top = lines["whole run"][-1] / (counts[-1] * math.log(counts[-1]))
+    axis.plot(counts, [top * n * math.log(n) for n in counts], color="#999999", linestyle=":", label="n log n")
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlabel("images")
+    axis.set_ylabel("seconds")
+    axis.grid(color="#eeeeee")
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
+
+
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("growth", __doc__)
     add = parser.add_argument
@@ -118,11 +166,15 @@ def main(arguments: Sequence[str]) -> None:
     options.add_output(parser)
     args = options.parse(parser, arguments, {"images": "20,40"})
     args.out.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for row in rows_of(args):
+    kept = args.out / "growth.json"
+    rows: list[Row] = []
+    for row in rows_of(args, json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else []):
         rows.append(row)
-        write_rows(args.out / "growth.json", rows)
+        write_rows(kept, rows)
         print({key: value for key, value in row.items() if key != "stages"}, row["stages"], file=sys.stderr)
+    draw_growth(args.out / "growth.svg", rows)
+    if args.docs is not None:
+        draw_growth(FOLDER / "large.svg", rows)
     options.publish(
         args, table_of(rows) + "\n", args.out / "growth.md", table="bench_growth_blocks",
         command=options.command_line(parser, args),
