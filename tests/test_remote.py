@@ -92,6 +92,41 @@ def test_a_picture_that_changes_is_fetched_again(tmp_path: Path) -> None:
     assert paths[0] != paths[1]
 
 
+def test_a_damaged_copy_is_fetched_again(archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name, file = next(item for item in sorted(list_remote(str(archive)).items()) if item[0].endswith("0001.jpg"))
+    path, sound = on_disk(file), on_disk(file).read_bytes()
+    for damaged in (sound[:99] + bytes([sound[99] ^ 1]) + sound[100:], sound[:1000], b""):
+        path.write_bytes(damaged)
+        monkeypatch.setattr(remote, "_whole_copies", set())  # as in a new process
+        assert on_disk(file).read_bytes() == sound, name
+
+
+def test_entries_that_lead_out_of_an_archive_are_named(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as out:
+        for name in ("../evil.jpg", "a/../../up.jpg", "..\\win.jpg", "/abs.jpg", "sound.jpg"):
+            out.writestr(name, b"x")
+    files = list_remote(str(tmp_path / "a.zip"))
+    names, failures = scan_files({name: file.size_bytes for name, file in files.items()})
+    assert names == ["sound.jpg"]
+    assert {one.name for one in failures} == {"..\\win.jpg", "../evil.jpg", "a/../../up.jpg", "/abs.jpg"}
+    assert {one.reason for one in failures} == {"leads out of the folder: it is not read"}
+
+
+def test_an_archive_with_a_name_twice_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as out:
+        out.writestr("a.jpg", b"x")
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            out.writestr("a.jpg", b"y")
+    with pytest.raises(ConfigError, match=r"a\.zip holds a\.jpg more than once: make the archive anew"):
+        list_remote(str(tmp_path / "a.zip"))
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w"):
+        pass
+    assert list_remote(str(tmp_path / "empty.zip")) == {}
+    (tmp_path / "no.zip").write_bytes(b"no archive")
+    with pytest.raises(ConfigError, match=r"no\.zip cannot be read \(.*\): check the archive, or make it anew"):
+        list_remote(str(tmp_path / "no.zip"))
+
+
 def test_a_run_of_an_archive_equals_that_of_a_folder(site: Site, archive: Path) -> None:
     flat = archive.with_name("flat.zip")
     with zipfile.ZipFile(flat, "w") as out:
@@ -127,8 +162,19 @@ def test_pictures_of_a_web_server(site: Site, web: str) -> None:
     pytest.importorskip("aiohttp")
     originals = {path.name: path.read_bytes() for path in site.images.iterdir()}
     assert fetched(f"{web}/images", sorted(originals)) == originals
-    with pytest.raises(ConfigError, match=r"nowhere cannot be read .*: check the address"):
+    with pytest.raises(ConfigError, match=r"nowhere cannot be read \(.*404.*\): check the address"):
         list_remote(f"{web}/nowhere")
+    one = site.image(0).name
+    with pytest.raises(ConfigError, match="is a file: give the folder that holds the images"):
+        list_remote(f"{web}/images/{one}")
+    with pytest.raises(ConfigError, match=r"cannot be read \(.*[Cc]onnect.*\): check the address"):
+        list_remote("http://127.0.0.1:9/images")
+
+
+def test_names_on_a_web_server_are_those_of_the_folder(site: Site, web: str) -> None:
+    pytest.importorskip("aiohttp")
+    odd = site.image(0).rename(site.images / "Flug ü b&c#1 100%.jpg")
+    assert fetched(f"{web}/images", [odd.name]) == {odd.name: odd.read_bytes()}
 
 
 @pytest.fixture
@@ -161,7 +207,7 @@ def test_a_run_of_a_bucket_equals_that_of_a_folder(site: Site, bucket: str, cach
         outcome = site(*RUN, "--images", bucket, "--workspace", elsewhere, *more)
         assert outcome.code == 0, outcome.stderr
         assert verified(elsewhere) == verified(site.work)
-    assert len([path for path in cache.rglob("*") if path.is_file()]) == len(list(site.images.iterdir()))
+    assert len(list(cache.rglob("*.jpg"))) == len(list(site.images.iterdir()))
 
 
 def test_an_address_that_does_not_answer_is_named(site: Site, tmp_path: Path) -> None:

@@ -89,9 +89,13 @@ def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[S
     failures: list[ScanFailure] = []
     for name, size_bytes in sorted(sizes_bytes.items()):
         *parents, file = name.split("/")
-        if Path(file).suffix.lower() not in SUFFIXES or any(part.startswith(".") for part in parents):
+        if Path(file).suffix.lower() not in SUFFIXES:
             continue
-        if file.startswith("._"):
+        if name.startswith("/") or ".." in name.replace("\\", "/").split("/"):
+            failures.append(ScanFailure(name, "leads out of the folder: it is not read", True))
+        elif any(part.startswith(".") for part in parents):
+            continue
+        elif file.startswith("._"):
             failures.append(ScanFailure(name, _APPLE_DOUBLE, False))
         elif size_bytes == 0:
             failures.append(ScanFailure(name, _EMPTY, True))
