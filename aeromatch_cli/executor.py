@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
+from aeromatch_cli.dask_client import connected, offers_gpu
 from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError, lacks_memory
 
 T = TypeVar("T")
@@ -334,7 +335,7 @@ class Executor:
             ) from None
         client = self._dask_client(Client)
         # A worker that is lost takes its task with it: that is given to another one, so many times.
-        needs = {"GPU": 1.0} if network and _offers_gpu(client) else None
+        needs = {"GPU": 1.0} if network and offers_gpu(client) else None
         many = [function] * len(tasks)
         futures = client.map(guarded, many, tasks, pure=False, retries=_DASK_RETRIES, resources=needs)
         places = {future.key: index for index, future in enumerate(futures)}
@@ -357,26 +358,11 @@ class Executor:
 
     def _dask_client(self, connect: Callable[..., Any]) -> Any:
         if self._client is None:
-            # dask would write tracebacks of what is said here in words: a lost worker, a lost scheduler.
-            for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.worker"):
-                logging.getLogger(name).setLevel(logging.CRITICAL)
-            local = {"n_workers": self.jobs, "threads_per_worker": 1, "dashboard_address": None}
-            try:
-                self._client = connect(self._scheduler or None, **({"timeout": "10s"} if self._scheduler else local))
-            except (OSError, ValueError) as error:
-                raise ConfigError(
-                    f"no dask scheduler answers at {self._scheduler}: start one (`dask scheduler`), or leave out "
-                    f"--scheduler ({error})"
-                ) from None
+            self._client = connected(connect, self._scheduler, self.jobs)
             self._client.run(single_threaded)
             if self._scheduler and self._client.dashboard_link:
                 log.info("dask dashboard at %s", self._client.dashboard_link)
         return self._client
-
-
-def _offers_gpu(client: Any) -> bool:
-    """Whether a worker was started with `--resources GPU=1`."""
-    return any(worker.get("resources", {}).get("GPU") for worker in client.scheduler_info()["workers"].values())
 
 
 def available_cores() -> int:

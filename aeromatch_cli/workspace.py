@@ -139,6 +139,19 @@ class Workspace:
     def export(self, exporter: str) -> Path:
         return self.root / "export" / exporter
 
+    def changed_tables(self) -> list[str]:
+        """Names of the tables of the block that are not as they were written, or gone."""
+        if not self.block.is_file():
+            return []
+        record = read_json(self.block)
+        return changed_files(self.root, record) if "files" in record else []  # none of earlier versions
+
+    def check_tables(self) -> None:
+        """Raises WorkspaceError where a table of the block is not as it was written."""
+        for name in self.changed_tables():
+            words = "is damaged or was edited: run `aeromatch run`, which makes it again"
+            raise WorkspaceError(f"{self.root / name} {words}")
+
     def stage_report(self, stage: str, shard: str = "") -> Path:
         return self.reports / (f"{stage}.{shard}.json" if shard else f"{stage}.json")
 
@@ -221,6 +234,10 @@ def translated_os_errors(path: Path) -> Iterator[None]:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise WorkspaceError(
                 f"disk full while writing {path}; free space and run the same command again, it resumes"
+            ) from error
+        if error.errno in (errno.EISDIR, errno.ENOTEMPTY):
+            raise WorkspaceError(
+                f"cannot write {path}: a folder stands where the file belongs; move it away"
             ) from error
         if error.errno in (errno.EEXIST, errno.ENOTDIR):
             raise WorkspaceError(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -292,3 +293,17 @@ def test_a_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed")
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):
         Executor("dask", scheduler="tcp://127.0.0.1:9").run(slow_square, [1], "x")
+
+
+@pytest.mark.slow
+def test_a_server_of_another_kind_is_no_dask_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes the connection, and never says what dask waits for."""
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("aeromatch_cli.dask_client._ANSWER_S", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with (
+            Executor("dask", 1, scheduler=address) as executor,
+            pytest.raises(ConfigError, match=r"no dask scheduler answers at .* \(no answer within 1 s\)"),
+        ):
+            executor.run(slow_square, [1], "x")

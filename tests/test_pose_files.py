@@ -329,3 +329,14 @@ def test_names_that_are_numbers_and_decimal_commas_in_quotes(tmp_path: Path) -> 
     assert found.rows[0].position == (1.5, 2.0, 3.0)
     rows, _ = matched_rows(found, ["DJI_0001.JPG", "DJI_0002.JPG"], "list")
     assert list(rows) == ["DJI_0001.JPG"]
+
+
+@pytest.mark.parametrize("pose_format", ["metashape-xml", "blocks-exchange", "auto"])
+@pytest.mark.parametrize("damage", ["cut", "entities"])
+def test_xml_that_cannot_be_read_is_refused_in_words(tmp_path: Path, pose_format: str, damage: str) -> None:
+    sound = WORLD["metashape-xml/cameras.xml"]
+    bomb = '<?xml version="1.0"?><!DOCTYPE document [<!ENTITY a "aaaa">]><document>&a;</document>'
+    path = tmp_path / "cameras.xml"
+    path.write_text(sound[: len(sound) // 2] if damage == "cut" else bomb)
+    with pytest.raises(ConfigError, match=r"cameras\.xml is no XML that can be read: it is cut off, or declares"):
+        read_pose_file(path, pose_format)

@@ -15,16 +15,18 @@ from aeromatch_cli.orientation.probability import (
     fitted_weights,
     off_neighbours_px,
     probabilities,
+    usual_off_px,
 )
 
-# Score, error, known, confirming, off either way, angle: eleven usual matches of a pair; the first one is changed.
-USUAL = MatchEvidence(*(np.full(11, value) for value in (0.5, 0.3, 2.0, 2.0, 0.5, 0.5, 20.0)))
+# Score, error, confirming, off either way, angle: eleven usual matches of a pair; the first one is changed.
+USUAL = MatchEvidence(*(np.full(11, value) for value in (0.5, 0.3, 2.0, 0.5, 0.5, 20.0)))
+USUAL_PX = 0.5
 
 
 def probability(**changed: float) -> float:
     first = np.arange(11) == 0
     values = {key: np.where(first, value, getattr(USUAL, key)) for key, value in changed.items()}
-    return float(probabilities(replace(USUAL, **values))[0])
+    return float(probabilities(replace(USUAL, **values), USUAL_PX)[0])
 
 
 def test_the_usual_match_is_right() -> None:
@@ -35,9 +37,7 @@ def test_the_usual_match_is_right() -> None:
     "changed",
     [
         {"scores": 0.05},
-        {"error_px": 1.5},
         {"confirming": 0.0},
-        {"known": 0.0, "confirming": 0.0},
         {"off0_px": 8.0},
         {"off1_px": 8.0},
         {"angle_deg": 55.0},
@@ -48,12 +48,20 @@ def test_what_speaks_against_a_match_makes_it_less_probable(changed: dict[str, f
 
 
 def test_a_doubtful_match_without_support_falls_below_the_least_probability_of_auto() -> None:
-    assert probability(scores=0.05, error_px=1.0, known=0.0, confirming=0.0, off0_px=6.0, off1_px=6.0) < 0.5
+    assert probability(scores=0.05, confirming=0.0, off0_px=6.0, off1_px=6.0) < 0.5
 
 
 def test_distances_count_by_what_is_usual_in_the_pair() -> None:
     rough = replace(USUAL, off0_px=np.full(11, 2.0), error_px=np.full(11, 1.2))
-    np.testing.assert_allclose(probabilities(rough), probabilities(USUAL), atol=1e-3)
+    np.testing.assert_allclose(probabilities(rough, 2.0), probabilities(USUAL, USUAL_PX), atol=1e-3)
+
+
+def test_a_pair_that_is_looser_than_the_block_is_doubtful_as_a_whole() -> None:
+    """Keypoints on shadows of another hour: neighbours and third images agree to a pixel or two."""
+    rough = replace(USUAL, off0_px=np.full(11, 3.0), error_px=np.full(11, 1.8))
+    assert usual_off_px([USUAL, USUAL, rough]) == 0.5
+    assert probabilities(rough, 0.5).max() < 0.7
+    assert usual_off_px([]) == 0.0
 
 
 def two_views(heights_m: FloatArray) -> tuple[FloatArray, ...]:
@@ -92,4 +100,4 @@ def test_weights_are_found_again() -> None:
 
 
 def test_there_is_a_weight_for_every_column() -> None:
-    assert columns(USUAL).shape == (11, len(WEIGHTS))
+    assert columns(USUAL, USUAL_PX).shape == (11, len(WEIGHTS))

@@ -35,6 +35,7 @@ from aeromatch_cli.cli.options import (
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
 from aeromatch_cli.cli.progress import RUN_STAGES, progress_shown
+from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
@@ -164,6 +165,8 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.config import load
             from aeromatch_cli.stages.run import execute
 
+            if scheduler and executor not in (None, "dask"):
+                raise ConfigError(f"--scheduler is for --executor dask, not {executor}: leave out one of them")
             recipe, say = _recipe(config, name, workspace), said(quiet)
             if config is None and recipe == DEFAULT_PRESET:
                 say(f"preset           {recipe}, no other is named")

@@ -65,6 +65,7 @@ def evaluate_workspace(
     workspace.check_version()
     if not workspace.images.is_file():
         raise InputError(f"{work} is no workspace (it has no images.csv): give the folder that `aeromatch run` wrote")
+    workspace.check_tables()
     truth = open_truth(truth_folder)
     images, left_out = _judged(read_images(workspace.images), truth, truth_folder)
     if truth.kind == "rendered":

@@ -27,6 +27,7 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
+- `files`: SHA-256 of the tables below, as they were written.
 
 ### images.csv
 

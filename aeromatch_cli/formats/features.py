@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 import zipfile
 from collections.abc import Sequence
@@ -20,6 +21,8 @@ from aeromatch_cli.data import (
 )
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.reading import readable
+
+log = logging.getLogger("aeromatch")
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
 
@@ -77,7 +80,9 @@ def features_fingerprint(path: Path) -> str | None:
     try:
         check_sums(path)
         return str(load_arrays(path, ("fingerprint",))["fingerprint"])
-    except BrokenFileError:
+    except BrokenFileError as error:
+        if path.is_file():
+            log.warning("warning: %s is damaged (%s)", path, error.reason)
         return None
 
 

@@ -20,5 +20,7 @@ def readable(path: Path, *faults: type[Exception]) -> Iterator[None]:
         raise BrokenFileError(str(path), str(error) or type(error).__name__) from None
     except FileNotFoundError as error:
         raise BrokenFileError(str(path), error.strerror or "no such file") from None
+    except IsADirectoryError:
+        raise WorkspaceError(f"cannot read {path}: a folder stands where the file belongs; move it away") from None
     except OSError as error:
         raise WorkspaceError(f"cannot read {path}: {error.strerror or error}; check its permissions and disk") from None

@@ -156,7 +156,10 @@ def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
     """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError."""
     import cv2
 
-    mask = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        mask = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except ItemError as error:
+        raise ItemError(f"mask: {error}") from None
     if mask.shape != (height_px, width_px):
         mask = cv2.resize(mask, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
     return np.asarray(mask) > 0

@@ -119,4 +119,5 @@ def _opened(path: Path) -> Iterator[Any]:
             with rasterio.open(path) as source:
                 yield source
     except (RasterioError, OSError) as error:
-        raise ItemError(f"cannot decode image {path}: {error}") from None
+        words = str(error.__cause__ or error)  # rasterio's own refer to "previous exception"
+        raise ItemError(f"cannot decode image {path}: {words}; copy it again or remove it") from None

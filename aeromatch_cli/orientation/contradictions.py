@@ -15,7 +15,8 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
-from aeromatch_cli.orientation.probability import MatchEvidence, off_neighbours_px, probabilities
+from aeromatch_cli.orientation.bridges import probable_enough
+from aeromatch_cli.orientation.probability import MatchEvidence, off_neighbours_px, probabilities, usual_off_px
 
 # Rays that meet at a smaller angle do not tell whether they meet in front of the cameras.
 _LEAST_ANGLE_DEG = 0.5
@@ -37,14 +38,15 @@ class Limits:
     epipolar_px: distance from its epipolar line. medians: in a pair whose median distance times this is larger, that
     counts: an image that the block holds less exactly than others has larger distances in all of its matches. third_px:
     distance of a third image's keypoint from the place of the point there; where the rays leave that place open by more
-    than a pixel, it grows with that. min_probability: a match that is less likely to be right counts as contradicting;
-    0 for never.
+    than a pixel, it grows with that. min_probability: a match that is less likely to be right counts as contradicting
+    unless images would fall apart by that; 0 for never. min_matches: a pair with fewer ties nothing.
     """
 
     epipolar_px: float
     medians: float
     third_px: float
     min_probability: float = 0.0
+    min_matches: int = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +94,15 @@ def contradicting(
     ]
     left: list[FloatArray] = [np.zeros(0)]
     if limits.min_probability > 0.0:
-        for mask, evidence in zip(found, settled.evidence(), strict=True):
-            if evidence is not None:
-                probable = probabilities(evidence)
-                mask[~mask] = probable < limits.min_probability
-                left.append(probable[probable >= limits.min_probability])
+        known = settled.evidence()
+        usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
+        likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
+        ends = [(pair.image_id0, pair.image_id1) for pair in pairs]
+        stays = probable_enough(ends, likely, limits.min_probability, limits.min_matches)
+        for mask, p, keep in zip(found, likely, stays, strict=True):
+            if p is not None and keep is not None:
+                mask[~mask] = ~keep
+                left.append(p[keep])
     judged = np.concatenate(left)
     return Contradictions(found, sorted(settled.doubtful), float(judged.mean()) if len(judged) else None)
 
@@ -317,14 +323,13 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
 def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores: FloatArray) -> MatchEvidence:
     """Evidence of the matches (M,) of one pair, one at least."""
     meeting = _Meeting.of(view, ends0, ends1)
-    known, confirming = meeting.in_third_images(view, ties, ends0, ends1, _CONFIRMING_PX)
+    _, confirming = meeting.in_third_images(view, ties, ends0, ends1, _CONFIRMING_PX)
     image0, image1 = view.image[ends0[0]], view.image[ends1[0]]
     side0, side1 = (view.centers_m[image0], view.rays[ends0]), (view.centers_m[image1], view.rays[ends1])
     heights_m = meeting.points_m[:, 2]
     return MatchEvidence(
         scores=np.asarray(scores, dtype=np.float64),
         error_px=meeting.error_px,
-        known=known,
         confirming=confirming,
         off0_px=off_neighbours_px(*side0, *side1, heights_m, float(view.focal_px[image1])),
         off1_px=off_neighbours_px(*side1, *side0, heights_m, float(view.focal_px[image0])),

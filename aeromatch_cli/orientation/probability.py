@@ -6,6 +6,7 @@ A logistic model of a few properties that every match has. It was fitted on rend
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,33 +16,47 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 # Distances count in multiples of the pair's median distance from epipolar lines, which is at least so many pixels: some
 # images are held less exactly than others.
 _LEAST_UNIT_PX = 0.3
-# Beyond these, more says nothing more: units, images, units, degrees.
-_MOST_ERROR, _MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 6.0, 4, 50.0, 60.0
+# Beyond these, more says nothing more: images, units, degrees.
+_MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 4, 50.0, 60.0
+# A pair whose median distance from the neighbours' heights is more than so many times that of the block's matches, and
+# more than so many pixels, is loose: where the light on relief has moved with the sun, keypoints of either image lie on
+# what moved, and agree with their neighbours and with third images all the same.
+_LOOSE, _LEAST_LOOSE_PX = 1.5, 0.5
 # A match that has no neighbours, or lies where their heights are not seen, is as far off as this, pixels.
 _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (4.11, 2.51, 0.44, 1.49, 0.42, -0.93, -0.06, -1.23)
+WEIGHTS = (4.5, 2.29, 0.95, -0.31, -1.3, -2.33)
 
 
 @dataclass(frozen=True, eq=False)
 class MatchEvidence:
     """What is known of the matches of a pair, (M,) each, one at least.
 
-    scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. known, confirming: in
-    how many third images their keypoints are matched, and in how many of these within a pixel of the point's place.
-    off0_px, off1_px: how far the match lies from where it would be at the height of its neighbours (the second nearest
-    of these heights), with the neighbours in either image. angle_deg: between both rays.
+    scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. confirming: in how many
+    third images their keypoints are matched within a pixel of the point's place. off0_px, off1_px: how far the match
+    lies from where it would be at the height of its neighbours (the second nearest of these heights), with the
+    neighbours in either image. angle_deg: between both rays.
     """
 
     scores: FloatArray
     error_px: FloatArray
-    known: IntArray
     confirming: IntArray
     off0_px: FloatArray
     off1_px: FloatArray
     angle_deg: FloatArray
+
+    @property
+    def off_px(self) -> FloatArray:
+        """(M,) the larger of both distances from the neighbours' heights."""
+        return np.asarray(np.minimum(np.maximum(self.off0_px, self.off1_px), _NOWHERE_PX))
+
+
+def usual_off_px(pairs: Iterable[MatchEvidence]) -> float:
+    """Median distance of all matches of a block from where they would be at their neighbours' heights."""
+    every = [pair.off_px for pair in pairs]
+    return float(np.median(np.concatenate(every))) if every else 0.0
 
 
 def off_neighbours_px(
@@ -72,37 +87,37 @@ def off_neighbours_px(
     return np.asarray(np.sort(off_px, axis=1)[:, SUPPORTING - 1])
 
 
-def columns(evidence: MatchEvidence) -> FloatArray:
-    """(M, 8) what the model is linear in: one, score, not known in third images, confirmations, known and not
-    confirmed, angle between the rays, distance from the epipolar line, distance from the neighbours' heights."""
+def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
+    """(M, 6) what the model is linear in: one, score, confirmations by third images, angle between the rays, distance
+    from the neighbours' heights, and how loose the whole pair is. usual_px: `usual_off_px` of the block."""
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
-    off = np.minimum(np.maximum(evidence.off0_px, evidence.off1_px), _NOWHERE_PX) / unit_px
+    off = evidence.off_px / unit_px
+    tight_px = max(_LOOSE * usual_px, _LEAST_LOOSE_PX)
+    loose = float(np.log2(max(float(np.median(evidence.off_px)), tight_px) / tight_px))
     return np.column_stack(
         [
             np.ones(len(off)),
             evidence.scores,
-            evidence.known == 0,
             np.sqrt(np.minimum(evidence.confirming, _MOST_CONFIRMING)),
-            (evidence.known > 0) & (evidence.confirming == 0),
             np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
-            np.minimum(evidence.error_px / unit_px, _MOST_ERROR),
             np.log2(1.0 + np.minimum(off, _MOST_OFF)),
+            np.full(len(off), loose),
         ]
     ).astype(np.float64)
 
 
 def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities of matches with such `columns` (M, 8)."""
+    """(M,) probabilities of matches with such `columns` (M, 6)."""
     return _logistic(values @ np.array(WEIGHTS))
 
 
-def probabilities(evidence: MatchEvidence) -> FloatArray:
-    """(M,) that the matches of a pair are right, to 3 pixels."""
-    return stated(columns(evidence))
+def probabilities(evidence: MatchEvidence, usual_px: float) -> FloatArray:
+    """(M,) that the matches of a pair are right, to 3 pixels. usual_px: `usual_off_px` of the block."""
+    return stated(columns(evidence, usual_px))
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 8) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = _logistic(values @ weights)

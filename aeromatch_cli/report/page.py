@@ -133,7 +133,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
         pair_keys=keys,
         pairs_beside=bool(drawn.beside),
         has_steps=any(row.steps for row in pairs),
-        settled=settled_words(_facts(context, "match")) if context.settings.cascade else "",
+        settled=settled_words(matched) if "settled_by" in (matched := _facts(context, "match")) else "",
         pair_count=len(pairs),
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),

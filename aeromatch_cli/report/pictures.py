@@ -92,5 +92,4 @@ def _by_error(count: int, errors_px: FloatArray | None) -> NDArray[Any]:
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     """As PNG, with the folders above it. Raises WorkspaceError where it cannot be written."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda stream: write_png(stream, picture))

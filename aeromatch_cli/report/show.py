@@ -52,6 +52,7 @@ def opened(root: Path) -> Workspace:
     if not workspace.images.is_file():
         raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
     workspace.check_version()
+    workspace.check_tables()
     return workspace
 
 

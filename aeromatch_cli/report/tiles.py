@@ -118,7 +118,6 @@ def _figure(tile: Tile) -> str:
 def _write_gif(path: Path, tile: Tile) -> None:
     from PIL import Image
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     frames = [Image.fromarray(picture) for picture in (tile.picture, tile.other) if picture is not None]
     write_atomically(
         path,

@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from aeromatch_cli.config import Settings, differing, dump
+from aeromatch_cli.config import Settings, differing, dump, load
+from aeromatch_cli.errors import ConfigError
 
 # Most settings that are named.
 _NAMED = 4
@@ -33,10 +34,11 @@ _ORDER = tuple(dict.fromkeys(_FIRST_STAGE.values()))
 
 def changed_words(config: Path, settings: Settings) -> str:
     """The settings that differ from those in `config`, the workspace's own, and from where on results that depend on
-    them are made again; "" where there are none, or no readable file."""
+    them are made again; "" where there are none, or no sound file."""
     try:
+        load(str(config))  # one that is damaged holds other keys
         before = yaml.safe_load(config.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError):
         return ""
     if not isinstance(before, Mapping):
         return ""

@@ -109,10 +109,11 @@ def _match(trial: _PairTrial) -> int:
     return len(matches.indices)
 
 
-def run(context: Context, reading_s: float, *, oriented: bool) -> Check:
+def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Check:
     """Try every image, and the strategies on a few pairs.
 
-    reading_s: what it took to read the block. oriented: whether the orientation is on file, or is not wanted.
+    reading_s: what it took to read the block. lost: images that were found but are not part of it. oriented: whether
+    the orientation is on file, or is not wanted.
     """
     images = list(context.block.images)
     sampled = _sample(context)
@@ -132,7 +133,7 @@ def run(context: Context, reading_s: float, *, oriented: bool) -> Check:
     estimate["seconds_of_further_steps"] = _further_s(context, sampled)
     if estimate["seconds"] is not None:
         estimate["seconds"] = round(estimate["seconds"] + (estimate["seconds_to_orient"] or 0.0), 1)
-    return Check(_lines(context, estimate, len(images)), estimate, failures)
+    return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
 
 
 def _orientation_s(context: Context, sampled: Sequence[Pair]) -> float | None:

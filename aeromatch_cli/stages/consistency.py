@@ -28,7 +28,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
 
-VERSION = 3
+VERSION = 4
 
 
 def run(context: Context) -> StageReport:
@@ -66,7 +66,9 @@ def run(context: Context) -> StageReport:
             MatchedKeypoints(pair.image_id0, pair.image_id1, entry.matches.indices, entry.matches.scores)
             for pair, entry in entries
         ]
-        limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability)
+        limits = Limits(
+            recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
+        )
         found = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))

@@ -52,6 +52,6 @@ def jobs_within(budget: float, jobs: int, images: Iterable[Image], *, network: b
     if most >= 1:
         return most, f"memory: {most} of {jobs} workers, as {each}"
     return 1, (
-        f"memory: one worker needs about {need:.0f} MB for images of {megapixels:.0f} megapixels, and this program "
-        f"{_PARENT_MB:.0f} MB; {budget:.0f} MB may not do: give more, or smaller images"
+        f"memory: one worker needs about {need:.0f} MB for images of {megapixels:.1f} megapixels, and this program "
+        f"{_PARENT_MB:.0f} MB; {budget:.0f} MB are too few: give more, or smaller images"
     )

@@ -39,7 +39,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.exchanged import exchanged_columns
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.lines import frame_remarks
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
@@ -111,9 +111,19 @@ def run(
         similar=tuple((id0, id1) for id0, id1 in record["similar"]),
         outside=frozenset(record["facts"]["outside"]),
     )
+    report.failures = _failed_images(context, record["failed"])
     found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
     context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
     return context, report if dry else report.write(context.workspace)
+
+
+def _failed_images(context: Context, failed: Sequence[str]) -> list[tuple[str, str]]:
+    """Images that the first pass could not use, and why."""
+    images = context.image_by_id.keys() & set(failed)
+    if not images:
+        return []
+    rows = gather_failures(context.workspace.first_pass)
+    return sorted({(item, reason) for _, item, reason in rows if item in images})
 
 
 def groups(context: Context) -> list[Group]:

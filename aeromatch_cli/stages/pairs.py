@@ -25,7 +25,7 @@ from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
-from aeromatch_cli.workspace import Workspace, read_json, write_json, write_text
+from aeromatch_cli.workspace import Workspace, read_json, write_record, write_text
 
 log = logging.getLogger("aeromatch")
 
@@ -203,12 +203,13 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
 def _write(context: Context, pairs_csv: str) -> None:
     workspace, block = context.workspace, context.block
     texts = {
-        workspace.config: dump(context.settings),
         workspace.images: images_text(block.images, context.image_fingerprints),
         workspace.cameras: cameras_text(block.cameras),
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,
     }
-    write_json(workspace.block, block_record(block, context.given, context.settings))
+    write_text(workspace.config, dump(context.settings))
     for path, text in texts.items():
         write_text(path, text)
+    # Last: it vouches for the tables.
+    write_record(workspace.block, block_record(block, context.given, context.settings), [path.name for path in texts])

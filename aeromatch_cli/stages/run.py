@@ -34,7 +34,7 @@ from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures, owner
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import (
     Workspace,
@@ -87,7 +87,10 @@ def execute(
     part = Shard.parse(shard) if shard else None
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
+    root = Path(settings.workspace)
+    new = not root.exists()
     with ExitStack() as stack:
+        stack.callback(_without_empty_folder, root, new)
         if command != "check" and (not settings.block.images or _there(settings)):
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
@@ -102,6 +105,15 @@ def execute(
                 words = f"cannot read {error.filename} ({error.strerror}): check its permissions"
                 raise WorkspaceError(words) from error
             raise
+
+
+def _without_empty_folder(root: Path, new: bool) -> None:
+    """Where nothing could be started, no folder is left but one that was there before."""
+    lock = Workspace(root).lock
+    if new and root.is_dir() and list(root.iterdir()) == [lock]:
+        with translated_os_errors(root):
+            lock.unlink()
+            root.rmdir()
 
 
 class _Said:
@@ -130,6 +142,9 @@ def _repairing(
         except BrokenFileError as error:
             if command == "check" or error.path in repaired:
                 raise
+            if not _makes(command, Workspace(Path(settings.workspace)), Path(error.path)):
+                words = f"{error.path} is damaged ({error.reason}): run `aeromatch run`, which makes it again"
+                raise WorkspaceError(words) from None
             repaired.add(error.path)
             overwrite = False  # what this command has done already is up to date
             log.warning("warning: %s was damaged (%s): it is made again", error.path, error.reason)
@@ -137,11 +152,40 @@ def _repairing(
                 Path(error.path).unlink(missing_ok=True)
 
 
+# What each command makes again of what it finds damaged, besides the tables of the block and the orientation.
+_MAKES = {
+    "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",), "adjust": ("adjust",),
+    "export": ("adjust", "export"), "report": ("report",),
+}  # fmt: skip
+_MADE_BY = {
+    "features": "extract", "matches": "match", "verified": "filter", "export": "export", "report": "report",
+    "steps": "match",
+}  # fmt: skip
+
+
+def _makes(command: str, workspace: Workspace, path: Path) -> bool:
+    """Whether a command makes a file of the workspace."""
+    if command == "run":
+        return True
+    folder, *rest = path.absolute().relative_to(workspace.root.absolute()).parts
+    stage = _MADE_BY.get(folder, "")
+    if folder == "reports":
+        stage = path.name.partition(".")[0]
+    elif path.name in (workspace.adjusted.name, workspace.dropped.name) and rest:
+        stage = "adjust"
+    made = ("", "orient", "pairs", "enhance", "simulate", *_MAKES.get(command, ()))
+    return (stage if stage != "consistency" else "adjust") in made
+
+
 def _attempt(
     command: str, settings: Settings, executor: Executor, part: Shard | None, overwrite: bool, said: _Said
 ) -> Result:
     dry = command == "check"
-    if _there(settings) and (words := changed_words(Workspace(Path(settings.workspace)).config, settings)):
+    workspace = Workspace(Path(settings.workspace))
+    if _there(settings) and not dry:
+        for name in workspace.changed_tables():
+            log.warning("warning: %s is not as it was written: it is made again", workspace.root / name)
+    if _there(settings) and (words := changed_words(workspace.config, settings)):
         said(f"changed          {words}")
     context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
     if command == "check":
@@ -255,6 +299,8 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
     lines.append(f"workspace {context.workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {context.workspace.report}")
+    elif command == "run" and context.workspace.report.is_file() and _current_page(context) is None:
+        lines.append(f"report    {context.workspace.report} is of an earlier run: `aeromatch report` makes it anew")
     if command in ("run", "export") and context.shard is None:
         lines += [f"export    {context.workspace.export(e.name)}" for e in context.settings.export]
     if failures:
@@ -284,12 +330,12 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
     for stage, item, reason in gather_failures(context.workspace):
         if stage in before and context.owns(owner(item)):
             failures.add((stage, item, reason))
-    return tuple(sorted(failures))
+    return tuple(sorted(once(failures)))
 
 
 def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
     settled = bool(oriented.facts) or not isinstance(context.settings.orient, FirstPass)
-    found = check.run(context, time.perf_counter() - first.started, oriented=settled)
+    found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)
     lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     for _, item, reason in failures:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,7 +67,7 @@ class StageReport:
         if not self._says_nothing_new(path):
             write_json(path, value)
         gather_failures(context_workspace)
-        for item, reason in self.failures:
+        for item, reason in self.failures if self.stage != "orient" else ():  # its first pass has named them
             log.warning("%s: %s: %s", self.stage, item, reason)
         return self
 
@@ -107,9 +107,15 @@ def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
                     rows.add((stage, item, reason))
             label = path.stem.partition(".")[2]
             later.append(Shard.parse(label.replace("-of-", "/")) if label else None)
-    ordered = sorted(rows)
+    ordered = sorted(once(rows))
     write_text(workspace.failures, csv_text(("stage", "item", "reason"), ordered))
     return ordered
+
+
+def once(rows: Collection[tuple[str, str, str]]) -> list[tuple[str, str, str]]:
+    """Rows (stage, item, reason) without those of a first pass that extraction names too."""
+    extracted = {item for stage, item, _ in rows if stage == "extract"}
+    return [row for row in rows if row[0] != "orient" or row[1] not in extracted]
 
 
 def owner(item: str) -> str:

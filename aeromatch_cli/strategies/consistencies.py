@@ -37,7 +37,8 @@ class BlockConsistency(Strategy):
         ge=0.0,
         lt=1.0,
         description="Matches that are less likely to be right are dropped, by their score, their distance from the "
-        "epipolar line, third images and neighbouring matches; 0 = none. Larger: fewer matches, fewer of them wrong.",
+        "epipolar line, third images, neighbouring matches, and how loose the whole pair is; pairs without which "
+        "images would fall apart keep their best 30. 0 = none. Larger: fewer matches, fewer of them wrong.",
     )
     min_matches: int = Field(
         15,

@@ -29,7 +29,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
-from aeromatch_cli.orientation.probability import columns, fitted_weights, stated
+from aeromatch_cli.orientation.probability import columns, fitted_weights, stated, usual_off_px
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import Workspace
@@ -78,13 +78,15 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
     limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
     parts, right = [], []
     settled = Settled.of(block, cameras, keypoints.__getitem__, pairs, limits)
-    for pair, mask, evidence in zip(pairs, settled.masks, settled.evidence(), strict=True):
+    known = settled.evidence()
+    usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
+    for pair, mask, evidence in zip(pairs, settled.masks, known, strict=True):
         if mask is None or evidence is None:
             continue
         ends = pair.image_id0, pair.image_id1
         points = [keypoints[i][pair.indices[~mask, side]] for side, i in enumerate(ends)]
         errors_px, hidden = truth.errors(images[ends[0]].name, images[ends[1]].name, *points)
-        parts.append(columns(evidence))
+        parts.append(columns(evidence, usual_px))
         right.append((np.nan_to_num(errors_px, nan=np.inf) <= CORRECT_PX) & ~hidden)
     return np.concatenate(parts), np.concatenate(right)
 

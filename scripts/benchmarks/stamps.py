@@ -106,7 +106,12 @@ def of_settings(*every: Settings, families: Collection[str] = tuple(FAMILIES)) -
 
 def of_chain(preset: str, overrides: Sequence[str] = ()) -> dict[str, Version]:
     """Versions of all that `aeromatch run` rests on with a preset."""
-    return of_settings(load(preset, overrides)) | _ORIENTATION
+    return of_whole_runs(load(preset, overrides))
+
+
+def of_whole_runs(*every: Settings) -> dict[str, Version]:
+    """The same of several settings."""
+    return of_settings(*every) | (_ORIENTATION if every else {})
 
 
 def of_strategies(family: str, *strategies: Strategy) -> dict[str, Version]:

@@ -31,7 +31,7 @@ def is_blocks_exchange(source: Source) -> bool:
 
 def read_blocks_exchange(source: Source) -> PoseList:
     """Raises ConfigError naming the photo."""
-    root = source.xml
+    root = source.xml_root()
     systems = {srs.findtext("Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     rows: list[PoseRow] = []
     groups: list[str] = []

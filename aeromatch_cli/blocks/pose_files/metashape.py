@@ -146,7 +146,7 @@ def read_cameras_xml(source: Source) -> PoseList:
     cameras = CameraShelf(source.path.name)
     unaligned = 0
     georeferenced: set[bool] = set()
-    for chunk in source.xml.iter("chunk"):
+    for chunk in source.xml_root().iter("chunk"):
         for sensor in chunk.iter("sensor"):
             cameras.add(f"sensor{sensor.get('id')}", _sensor(sensor))
         whole = _similarity(source, chunk.find("transform"))

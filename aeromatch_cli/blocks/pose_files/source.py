@@ -95,6 +95,15 @@ class Source:
         except (ParseError, DefusedXmlException, ValueError, LookupError):
             return None
 
+    def xml_root(self) -> Any:
+        """The same. Raises ConfigError where the file is no XML."""
+        if self.xml is None:
+            raise ConfigError(
+                f"{self.path} is no XML that can be read: it is cut off, or declares entities (DOCTYPE), which are "
+                "refused"
+            )
+        return self.xml
+
     def records(self, comment: str = "#") -> Iterator[tuple[int, str]]:
         """Lines with their numbers, without empty ones and comments."""
         for number, line in enumerate(self.lines, start=1):

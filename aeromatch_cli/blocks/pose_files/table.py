@@ -145,6 +145,8 @@ def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
             f"pose list {path} is {kind} of a kind that is not read: docs/input.md lists those that are; a CSV whose "
             "first line names the columns always is"
         )
+    if source.text.lstrip().startswith("<"):
+        source.xml_root()
     return _named_columns(source)
 
 

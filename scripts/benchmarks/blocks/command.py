@@ -141,5 +141,5 @@ def main(arguments: Sequence[str]) -> None:
         write_rows(args.out / f"{section}.json", rows)
     options.publish(
         args, SECTIONS[section].table(rows) + "\n", args.out / f"{section}.md", table=f"bench_{section}",
-        command=options.command_line(parser, args), versions=stamps.of_settings(*settings_of(methods)),
+        command=options.command_line(parser, args), versions=stamps.of_whole_runs(*settings_of(methods)),
     )  # fmt: skip

@@ -1,0 +1,46 @@
+"""Which matches are probable enough to stay, so that no image loses its block by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray
+
+# Matches left to a pair without which images fall apart: enough for a relative orientation, few among all others.
+_BRIDGING = 30
+
+
+def probable_enough(
+    ends: Sequence[tuple[str, str]], likely: Sequence[FloatArray | None], least: float, min_matches: int
+) -> list[BoolArray | None]:
+    """Of every pair, which of its matches (M,) are as probable as asked; None where nothing is known of it.
+
+    Where images that pairs have tied would fall apart by that, the pairs between the parts keep their best 30 matches:
+    a block whose flights lie a few pixels off each other is worth more than flights that nothing connects. ends: image
+    ids. likely: probabilities (M,). min_matches: a pair with fewer ties nothing.
+    """
+    keep = [None if p is None else p >= least for p in likely]
+    part = _parts(
+        [both for both, mask in zip(ends, keep, strict=True) if mask is None or mask.sum() >= min_matches], ends
+    )
+    for n, (both, p) in enumerate(zip(ends, likely, strict=True)):
+        if p is not None and len(p) >= min_matches and part[both[0]] != part[both[1]]:
+            best = np.zeros(len(p), dtype=bool)
+            best[np.argsort(-p, kind="stable")[: max(_BRIDGING, min_matches)]] = True
+            keep[n] = best | (p >= least)
+    return keep
+
+
+def _parts(tied: Sequence[tuple[str, str]], ends: Sequence[tuple[str, str]]) -> dict[str, int]:
+    """image id -> number of its part: images that tied pairs connect. Images of all pairs have one."""
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    ids = sorted({image_id for both in ends for image_id in both})
+    row = {image_id: n for n, image_id in enumerate(ids)}
+    first, second = ([row[both[side]] for both in tied] for side in range(2))
+    graph = sparse.coo_matrix((np.ones(len(tied)), (first, second)), shape=(len(ids), len(ids)))
+    _, labels = connected_components(graph, directed=False)
+    return dict(zip(ids, labels.tolist(), strict=True))

@@ -1,0 +1,117 @@
+"""Workspaces that are damaged, half done or of an earlier run: every command says so and takes nothing for a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import PAGE, Site, contents, invoke
+
+pytestmark = pytest.mark.slow
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) * 2 // 3] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "cameras.csv", "images.csv", "pairs.csv"])
+def test_a_damaged_table_is_never_shown_as_a_result(done_site: Site, name: str) -> None:
+    expected = contents(done_site.work)
+    flip(done_site.work / name)
+    for words in (("show", done_site.work), ("evaluate", done_site.work, "--truth", done_site.root, "--no-mapping"),
+                  ("compare", done_site.work, done_site.work)):  # fmt: skip
+        outcome = invoke(*words)
+        assert outcome.code == 3, outcome.stderr
+        assert f"{name} is damaged or was edited: run `aeromatch run`" in outcome.stderr
+    outcome = done_site("run")
+    assert outcome.code == 0
+    assert f"{name} is not as it was written: it is made again" in outcome.stderr
+    assert contents(done_site.work) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [("orientation/adjusted.npz", "report"), ("verified/{0}.npz", "report"), ("matches/{0}.npz", "filter")],
+)
+def test_a_command_leaves_what_it_cannot_make_again(done_site: Site, name: str, command: str) -> None:
+    expected = contents(done_site.work)
+    path = done_site.work / name.format(done_site.names()[0].replace(".", "_"))
+    flip(path)
+    damaged = path.read_bytes()
+    outcome = done_site(command)
+    assert outcome.code == 3
+    assert f"{path} is damaged" in outcome.stderr
+    assert "run `aeromatch run`, which makes it again" in outcome.stderr
+    assert path.read_bytes() == damaged
+    assert done_site("run").code == 0
+    assert contents(done_site.work) == expected
+
+
+def test_damaged_settings_are_no_changed_ones(done_site: Site) -> None:
+    config = done_site.work / "config.yaml"
+    config.write_text(config.read_text().replace("contrast_threshold", "gontrast_threshold"))
+    outcome = done_site("run")
+    assert "changed " not in outcome.stdout
+    assert outcome.code == 0
+
+
+def test_a_page_of_an_earlier_run_is_named_as_such(done_site: Site) -> None:
+    assert "is of an earlier run" not in done_site("run").stdout
+    assert done_site("run", *PAGE).code == 0
+    outcome = done_site("run")
+    assert "is of an earlier run" not in outcome.stdout  # it still is the present one
+    outcome = done_site("run", "--set", "extract.keypoints=300")
+    assert "index.html is of an earlier run: `aeromatch report` makes it anew" in outcome.stdout
+
+
+def test_the_report_of_a_block_that_has_only_pairs(site: Site) -> None:
+    given = site.options("--set", "orient=none")
+    assert invoke("pairs", "auto", *given).code == 0
+    outcome = invoke("report", "auto", *given, *PAGE)
+    assert outcome.code in (0, 1)
+    assert (site.work / "report" / "index.html").is_file()
+
+
+def test_a_broken_image_is_told_by_the_commands_before_extraction(site: Site) -> None:
+    site.image(1).write_bytes(site.image(1).read_bytes()[:-400])
+    broken = site.names()[1].replace(".", "_")
+    for command in ("orient", "pairs"):
+        outcome = site(command)
+        assert outcome.code == 1
+        assert site.failures() == [("orient", broken)]
+    assert site("run").code == 1
+    assert site.failures() == [("extract", broken)]
+
+
+def test_nothing_is_left_of_a_run_that_could_not_begin(site: Site) -> None:
+    (site.root / "empty").mkdir()
+    for command in ("run", "report"):
+        outcome = invoke(command, "baseline", "--images", site.root / "empty", "--workspace", site.work)
+        assert outcome.code in (2, 3)
+        assert not site.work.exists()
+    site.work.mkdir()
+    invoke("run", "baseline", "--images", site.root / "empty", "--workspace", site.work)
+    assert site.work.is_dir()
+
+
+def test_a_folder_where_a_file_belongs_is_named(done_site: Site) -> None:
+    path = done_site.work / "cameras.csv"
+    path.unlink()
+    path.mkdir()
+    outcome = done_site("run")
+    assert outcome.code == 3
+    assert "a folder stands where the file belongs; move it away" in outcome.stderr
+
+
+def test_names_that_spreadsheets_run_are_said(site: Site) -> None:
+    site.image(0).rename(site.images / "=cmd calc.jpg")
+    outcome = site("pairs", "--poses", "none", "--set", "orient=none", "--set", "pairs=exhaustive")
+    assert "1 image names begin as formulas do: =cmd calc.jpg" in outcome.stderr
+
+
+def test_a_scheduler_is_for_dask_alone(site: Site) -> None:
+    outcome = site("run", "--scheduler", "tcp://127.0.0.1:9", "--executor", "serial")
+    assert outcome.code == 2
+    assert "--scheduler is for --executor dask, not serial" in outcome.stderr
