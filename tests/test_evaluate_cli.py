@@ -49,3 +49,13 @@ def test_wrong_arguments_say_what_to_do(site: Path, tmp_path: Path) -> None:
     nothing = invoke("evaluate", tmp_path, "--truth", tmp_path)
     assert nothing.code == 3
     assert "no workspace" in nothing.stderr
+
+
+def test_figures_of_an_archive_that_nobody_may_write_are_said(site: Path, rendered: Path, tmp_path: Path) -> None:
+    shutil.copytree(site / "work", tmp_path / "work")
+    shutil.rmtree(tmp_path / "work" / "evaluation", ignore_errors=True)
+    (tmp_path / "work" / "evaluation").write_text("a file where the folder belongs")
+    outcome = invoke("evaluate", tmp_path / "work", "--truth", rendered, "--no-mapping", "--json")
+    assert outcome.code == 1
+    assert outcome.facts["totals"]["correct"] > 100
+    assert "not written: cannot write" in outcome.stdout

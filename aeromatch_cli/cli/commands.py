@@ -60,12 +60,17 @@ def evaluate(
     """Evaluate the matches of a workspace against rendered truth or reference poses."""
 
     def call() -> Result:
+        from aeromatch_cli.errors import WorkspaceError
         from aeromatch_cli.evaluate import evaluate_workspace
         from aeromatch_cli.evaluate.output import facts, lines, refresh_report, write_evaluation
         from aeromatch_cli.stages.run import Result
 
         evaluation = evaluate_workspace(work, truth, mapping=mapping, progress=progress_shown(quiet))
-        written = write_evaluation(evaluation)
+        try:
+            written = write_evaluation(evaluation)
+        except WorkspaceError as error:  # an archive that nobody may write: its figures are no less true
+            failure = ("evaluate", str(work), str(error))
+            return Result((*lines(evaluation), f"not written: {error}"), facts(evaluation), (failure,))
         end = (f"written to {written[0].parent}", refresh_report(work))
         return Result((*lines(evaluation), *end), facts(evaluation))
 

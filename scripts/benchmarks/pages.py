@@ -54,8 +54,6 @@ PAGES: Mapping[str, str] = {
     "bench_growth": "orient.md",
     "bench_chains": "orient.md",
     "bench_similar": "orient.md",
-    "bench_growth_blocks": "large.md",
-    "bench_memory": "large.md",
     "bench_polar-1840x1350": "polar.md",
     "bench_polar-7360x5400": "polar.md",
     "bench_polar_blocks": "polar.md",
