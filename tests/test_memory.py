@@ -37,7 +37,9 @@ def test_workers_fit_the_budget() -> None:
     assert jobs_within(64000.0, 8, [image(4000, 3000)], network=False) == (8, "")
     assert jobs_within(64000.0, 8, [], network=False) == (8, "")
     assert jobs_within(4000.0, 8, [image(4000, 3000)], network=True)[0] == 1
-    jobs, remark = jobs_within(1000.0, 8, [image(12000, 9000)], network=False)
+    with pytest.raises(ConfigError, match=r"a\.jpg has 108\.0 megapixels and takes 1182 MB .* give more --memory"):
+        jobs_within(1000.0, 8, [image(12000, 9000)], network=False)
+    jobs, remark = jobs_within(1200.0, 8, [image(12000, 9000)], network=False)
     assert jobs == 1
     assert "give more, or smaller images" in remark
 

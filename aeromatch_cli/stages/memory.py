@@ -12,6 +12,8 @@ from aeromatch_cli.errors import ConfigError
 # together, whichever are more: a view of a turned or tilted image is larger than the image.
 _BASE_MB = 350.0
 _BYTES_PER_PIXEL = 12.0
+# Colours as decoded, and gray beside them.
+_DECODED_BYTES = 4.0
 _TILE_MB = 700.0
 _TILE_MEGAPIXELS = 4.0
 # PyTorch and the layers of a network.
@@ -39,13 +41,22 @@ def budget_mb(text: str) -> float | None:
 
 
 def jobs_within(budget: float, jobs: int, images: Iterable[Image], *, network: bool) -> tuple[int, str]:
-    """How many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer."""
+    """How many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer.
+
+    Raises ConfigError where it does not even hold the largest image decoded.
+    """
     largest = max(images, key=lambda image: image.width_px * image.height_px, default=None)
     if largest is None:
         return jobs, ""
     megapixels = largest.width_px * largest.height_px / 1e6
     need = worker_mb(megapixels, network=network)
     most = int((budget - _PARENT_MB) / need)
+    decoded = _BASE_MB + _DECODED_BYTES * megapixels + _PARENT_MB
+    if decoded > budget:
+        raise ConfigError(
+            f"memory: {largest.name} has {megapixels:.1f} megapixels and takes {decoded:.0f} MB with this program once "
+            f"it is decoded; {budget:.0f} MB do not hold it: give more --memory, or reduce the image"
+        )
     if most >= jobs:
         return jobs, ""
     each = f"each needs about {need:.0f} MB for images of {megapixels:.0f} megapixels"
