@@ -260,8 +260,9 @@ def _page(context: Context) -> StageReport:
     return page
 
 
-def _current_page(context: Context) -> StageReport | None:
-    """The page's report, where the page is as it was written and younger than everything that it tells of."""
+def _current_page(context: Context, *, settings: bool = True) -> StageReport | None:
+    """The page's report, where the page is as it was written and younger than everything that it tells of. settings:
+    also than the list of settings, as which a run without the page differs from one with it."""
     workspace = context.workspace
     own = workspace.stage_report("report")
     if context.overwrite or not (workspace.report.is_file() and own.is_file()):
@@ -269,7 +270,8 @@ def _current_page(context: Context) -> StageReport | None:
     if not whole_record(workspace.report_files):
         return None
     told = [path for path in workspace.reports.glob("*.json") if path != own]
-    told += [workspace.config, workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]
+    told += [workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]
+    told += [workspace.config] if settings else []
     made = workspace.report.stat().st_mtime_ns
     if any(path.stat().st_mtime_ns >= made for path in told):
         return None
@@ -299,7 +301,7 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
     lines.append(f"workspace {context.workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {context.workspace.report}")
-    elif command == "run" and context.workspace.report.is_file() and _current_page(context) is None:
+    elif command == "run" and context.workspace.report.is_file() and _current_page(context, settings=False) is None:
         lines.append(f"report    {context.workspace.report} is of an earlier run: `aeromatch report` makes it anew")
     if command in ("run", "export") and context.shard is None:
         lines += [f"export    {context.workspace.export(e.name)}" for e in context.settings.export]
