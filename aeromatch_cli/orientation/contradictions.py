@@ -65,12 +65,14 @@ class Contradictions:
 
 @dataclass(frozen=True, eq=False)
 class MatchedKeypoints:
-    """Verified matches of two images: keypoint indices (M, 2) and the matcher's scores (M,)."""
+    """Verified matches of two images: keypoint indices (M, 2) and the matcher's scores (M,). alone: both images placed
+    by these matches, for where the block does not hold them; None where that is not known."""
 
     image_id0: str
     image_id1: str
     indices: IntArray
     scores: FloatArray
+    alone: AdjustedBlock | None = None
 
 
 def contradicting(
@@ -85,7 +87,8 @@ def contradicting(
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
     images lie beside the place of its point there than lie on it; see also `Limits`. Groups of images that no point
-    connects have a frame each, less exact than matches: pairs between them are not judged.
+    connects have a frame each, less exact than matches: pairs between them are not judged by the block. How probable
+    their matches are is judged by the pair alone.
     """
     settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
     found = [
@@ -95,6 +98,11 @@ def contradicting(
     left: list[FloatArray] = [np.zeros(0)]
     if limits.min_probability > 0.0:
         known = settled.evidence()
+        for n, pair in enumerate(pairs):
+            if settled.masks[n] is None and pair.alone is not None and len(pair.indices):
+                own = Settled.of(pair.alone, cameras, keypoints_px, [pair], replace(limits, epipolar_px=np.inf))
+                known[n] = own.evidence()[0]
+                found[n] = found[n] if own.masks[0] is None else own.masks[0].copy()
         usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
         likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
         ends = [(pair.image_id0, pair.image_id1) for pair in pairs]

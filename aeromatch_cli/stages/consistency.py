@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, BoolArray, Pair, Verdict
+from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import check_sums, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
+from aeromatch_cli.orientation.alone import block_of_pair
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
@@ -28,7 +29,8 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
 
-VERSION = 4
+VERSION = 5
+_NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 
 def run(context: Context) -> StageReport:
@@ -40,6 +42,8 @@ def run(context: Context) -> StageReport:
         context, _ = with_current_pairs(context)
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
+    if adjusted is None and _judges_pairs(context):
+        adjusted = _NO_BLOCK
     if adjusted is None or not isinstance(recipe, BlockConsistency):
         report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}
         if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
@@ -60,12 +64,10 @@ def run(context: Context) -> StageReport:
     with translated_os_errors(last):
         last.unlink(missing_ok=True)
     with context.executor.step("consistency"):
-        cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
+        of_ids = {**context.block.cameras, **adjusted.cameras}
+        cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
-        pairs = [
-            MatchedKeypoints(pair.image_id0, pair.image_id1, entry.matches.indices, entry.matches.scores)
-            for pair, entry in entries
-        ]
+        pairs = [_matched(context, adjusted, pair, entry) for pair, entry in entries]
         limits = Limits(
             recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
         )
@@ -80,6 +82,28 @@ def run(context: Context) -> StageReport:
     report.facts = {**_facts(context, entries), **known}
     report.done = report.items
     return report.write(context.workspace)
+
+
+def _judges_pairs(context: Context) -> bool:
+    """Whether pairs are judged that no adjusted block holds."""
+    recipe, match = context.settings.consistency, context.settings.match
+    return isinstance(recipe, BlockConsistency) and recipe.min_probability > 0.0 and not match.reads_pixels
+
+
+def _matched(context: Context, adjusted: AdjustedBlock, pair: Pair, entry: VerifiedEntry) -> MatchedKeypoints:
+    """The matches of a verified pair; with its own geometry where the adjusted block lacks one of its images."""
+    ids, indices = (pair.image_id0, pair.image_id1), entry.matches.indices
+    verdict, alone = entry.verdict, None
+    calibrated = verdict.model_kind == "E" and verdict.relative_rotation is not None
+    if calibrated and not set(ids) <= adjusted.poses.keys() and _judges_pairs(context):
+        pose = context.block.poses.get(ids[0])
+        cameras = [context.block.cameras[context.image_by_id[i].camera_id] for i in ids]
+        points = [contents_of(context).keypoints_px(i)[indices[:, side]] for side, i in enumerate(ids)]
+        alone = block_of_pair(
+            ids, (cameras[0], cameras[1]), (points[0], points[1]), verdict.model,
+            cast("FloatArray", verdict.relative_rotation), None if pose is None else pose.world_rotation,
+        )  # fmt: skip
+    return MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:
