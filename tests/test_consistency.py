@@ -16,8 +16,9 @@ from test_export_colmap import Truth, make_truth
 from aeromatch_cli.data import AdjustedBlock, FloatArray, IntArray
 from aeromatch_cli.formats.dropped import read_dropped, write_dropped
 from aeromatch_cli.geometry.cameras import project, world_rays
-from aeromatch_cli.geometry.epipolar import triangulate
+from aeromatch_cli.geometry.epipolar import essential, relative_pose, triangulate
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.orientation.alone import block_of_pair
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 
 LIMITS = Limits(epipolar_px=1.5, medians=4.0, third_px=4.0)
@@ -189,3 +190,41 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before
     assert not (done_site.work / "orientation" / "dropped.npz").exists()
     assert json.loads((done_site.work / "reports" / "consistency.json").read_text())["facts"]["dropped_matches"] == 0
+
+
+def alone(truth: Truth, keypoints: dict[str, FloatArray], indices: IntArray, sign: float = 1.0) -> AdjustedBlock:
+    poses = [truth.block.poses[i] for i in ("img0", "img1")]
+    rotation, translation = relative_pose(*poses)
+    return block_of_pair(
+        ("img0", "img1"), (cameras(truth)["img0"], cameras(truth)["img1"]),
+        (keypoints["img0"][indices[:, 0]], keypoints["img1"][indices[:, 1]]),
+        sign * essential(rotation, translation), rotation, poses[0].world_rotation,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_pair_by_itself_lies_as_in_the_block_but_for_its_scale(truth: Truth, sign: float) -> None:
+    first, second = (truth.block.poses[i] for i in ("img0", "img1"))
+    found = alone(truth, noisy(truth), matched(truth)[0].indices, sign)
+    base_m = second.center_m - first.center_m
+    np.testing.assert_allclose(found.poses["img1"].center_m, base_m / np.linalg.norm(base_m), atol=1e-6)
+    np.testing.assert_allclose(found.poses["img1"].rotation, second.world_rotation, atol=1e-9)
+
+
+def test_improbable_matches_of_a_pair_that_no_block_holds_are_dropped(truth: Truth) -> None:
+    keypoints, pairs = noisy(truth), matched(truth)
+    keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices)
+    scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
+    pair = replace(pairs[0], indices=wrong, scores=scores, alone=alone(truth, keypoints, wrong))
+    nothing = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
+    limits = replace(LIMITS, min_probability=0.12)
+    found = contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], limits)
+    held = contradicting(
+        held_together(truth, [set(truth.block.poses)]), cameras(truth), keypoints.__getitem__, [pair], limits
+    )
+    assert found.masks[0][:WRONG].mean() >= 0.7
+    assert found.masks[0][WRONG:].mean() < 0.15
+    assert (found.masks[0] == held.masks[0]).mean() > 0.95
+    assert not contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], LIMITS).masks[0].any()
+    unknown = replace(pair, alone=None)
+    assert not contradicting(nothing, cameras(truth), keypoints.__getitem__, [unknown], limits).masks[0].any()
