@@ -140,7 +140,8 @@ class Workspace:
         return self.root / "export" / exporter
 
     def changed_tables(self) -> list[str]:
-        """Names of the tables of the block that are not as they were written, or gone."""
+        """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""
+        self.check_version()
         if not self.block.is_file():
             return []
         record = read_json(self.block)
