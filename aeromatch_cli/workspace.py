@@ -149,9 +149,9 @@ class Workspace:
 
     def check_tables(self) -> None:
         """Raises WorkspaceError where a table of the block is not as it was written."""
-        for name in self.changed_tables():
+        if changed := self.changed_tables():
             words = "is damaged or was edited: run `aeromatch run`, which makes it again"
-            raise WorkspaceError(f"{self.root / name} {words}")
+            raise WorkspaceError(f"{self.root / changed[0]} {words}")
 
     def stage_report(self, stage: str, shard: str = "") -> Path:
         return self.reports / (f"{stage}.{shard}.json" if shard else f"{stage}.json")

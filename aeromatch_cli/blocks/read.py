@@ -43,9 +43,9 @@ from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
 
 EXIF = "exif"
+FOLDER = "folder"
 # What cells begin with that spreadsheets take for formulas.
 _FORMULA = ("=", "+", "-", "@")
-FOLDER = "folder"
 
 
 class ReadFailure(NamedTuple):

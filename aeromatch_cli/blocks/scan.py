@@ -38,8 +38,8 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
     """Relative names (forward slashes, sorted) of the images below a folder, and what was passed over and why.
 
     Folders are searched at any depth, links included; hidden files and folders are skipped. A suffix in any case
-    counts. exclude: folders that are not searched, such as masks; nor is any folder that is
-    a workspace of this program. Raises ConfigError where the folder is missing or cannot be read.
+    counts. exclude: folders that are not searched, such as masks; nor is any folder that is a workspace of this
+    program. Raises ConfigError where the folder is missing or cannot be read.
     """
     if not folder.is_dir():
         what = "is not a folder" if folder.exists() else "does not exist"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import struct
 import zipfile
 from collections.abc import Sequence
@@ -20,9 +19,7 @@ from aeromatch_cli.data import (
     JoinedKeypoints,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.reading import readable
-
-log = logging.getLogger("aeromatch")
+from aeromatch_cli.formats.reading import readable, say_damaged
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
 
@@ -81,8 +78,7 @@ def features_fingerprint(path: Path) -> str | None:
         check_sums(path)
         return str(load_arrays(path, ("fingerprint",))["fingerprint"])
     except BrokenFileError as error:
-        if path.is_file():
-            log.warning("warning: %s is damaged (%s)", path, error.reason)
+        say_damaged(path, error)
         return None
 
 

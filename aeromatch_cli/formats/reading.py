@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from aeromatch_cli.errors import BrokenFileError, WorkspaceError
+
+log = logging.getLogger("aeromatch")
+
+
+def say_damaged(path: Path, error: BrokenFileError) -> None:
+    """A word on a file that counts as absent because it is broken; none on one that is absent."""
+    if path.is_file():
+        log.warning("warning: %s is damaged (%s)", path, error.reason)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,9 +19,7 @@ from aeromatch_cli.data import (
 )
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.features import ARCHIVE_FAULTS, check_sums, load_arrays
-from aeromatch_cli.formats.reading import readable
-
-log = logging.getLogger("aeromatch")
+from aeromatch_cli.formats.reading import readable, say_damaged
 
 # Features of rows that earlier versions wrote.
 UNKNOWN = ("", "")
@@ -140,8 +137,7 @@ def _cached_fingerprints(path: Path, stamp: int) -> Mapping[str, str]:
         with readable(path, *ARCHIVE_FAULTS):
             return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
     except BrokenFileError as error:
-        if path.is_file():
-            log.warning("warning: %s is damaged (%s)", path, error.reason)
+        say_damaged(path, error)
         return {}
 
 

@@ -6,7 +6,7 @@ for all who read final results.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -67,11 +67,12 @@ def run(context: Context) -> StageReport:
         of_ids = {**context.block.cameras, **adjusted.cameras}
         cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
-        pairs = [_matched(context, adjusted, pair, entry) for pair, entry in entries]
+        keypoints_px = contents_of(context).keypoints_px
+        pairs = [_matched(context, adjusted, keypoints_px, pair, entry) for pair, entry in entries]
         limits = Limits(
             recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
         )
-        found = contradicting(adjusted, cameras, contents_of(context).keypoints_px, pairs, limits)
+        found = contradicting(adjusted, cameras, keypoints_px, pairs, limits)
     dropped: Dropped = {
         (pair.image_id0, pair.image_id1): (entry.fingerprint, np.flatnonzero(mask).astype(np.int32))
         for (pair, entry), mask in zip(entries, found.masks, strict=True)
@@ -90,7 +91,13 @@ def _judges_pairs(context: Context) -> bool:
     return isinstance(recipe, BlockConsistency) and recipe.min_probability > 0.0 and not match.reads_pixels
 
 
-def _matched(context: Context, adjusted: AdjustedBlock, pair: Pair, entry: VerifiedEntry) -> MatchedKeypoints:
+def _matched(
+    context: Context,
+    adjusted: AdjustedBlock,
+    keypoints_px: Callable[[str], FloatArray],
+    pair: Pair,
+    entry: VerifiedEntry,
+) -> MatchedKeypoints:
     """The matches of a verified pair; with its own geometry where the adjusted block lacks one of its images."""
     ids, indices = (pair.image_id0, pair.image_id1), entry.matches.indices
     verdict, alone = entry.verdict, None
@@ -98,7 +105,7 @@ def _matched(context: Context, adjusted: AdjustedBlock, pair: Pair, entry: Verif
     if calibrated and not set(ids) <= adjusted.poses.keys() and _judges_pairs(context):
         pose = context.block.poses.get(ids[0])
         cameras = [context.block.cameras[context.image_by_id[i].camera_id] for i in ids]
-        points = [contents_of(context).keypoints_px(i)[indices[:, side]] for side, i in enumerate(ids)]
+        points = [keypoints_px(i)[indices[:, side]] for side, i in enumerate(ids)]
         alone = block_of_pair(
             ids, (cameras[0], cameras[1]), (points[0], points[1]), verdict.model,
             cast("FloatArray", verdict.relative_rotation), None if pose is None else pose.world_rotation,

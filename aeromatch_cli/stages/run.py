@@ -154,8 +154,8 @@ def _repairing(
 
 # What each command makes again of what it finds damaged, besides the tables of the block and the orientation.
 _MAKES = {
-    "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",), "adjust": ("adjust",),
-    "export": ("adjust", "export"), "report": ("report",),
+    "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",),
+    "adjust": ("adjust", "consistency"), "export": ("adjust", "consistency", "export"), "report": ("report",),
 }  # fmt: skip
 _MADE_BY = {
     "features": "extract", "matches": "match", "verified": "filter", "export": "export", "report": "report",
@@ -173,8 +173,7 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
         stage = path.name.partition(".")[0]
     elif path.name in (workspace.adjusted.name, workspace.dropped.name) and rest:
         stage = "adjust"
-    made = ("", "orient", "pairs", "enhance", "simulate", *_MAKES.get(command, ()))
-    return (stage if stage != "consistency" else "adjust") in made
+    return stage in ("", "orient", "pairs", "enhance", "simulate", *_MAKES.get(command, ()))
 
 
 def _attempt(

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +22,7 @@ from typing import Any
 from benchmarks import options, stamps
 from benchmarks.memory import peak_mb, texture
 from benchmarks.pages import FOLDER
+from benchmarks.processes import children_seconds
 from benchmarks.tables import Row, markdown, number, write_rows
 
 _WIDTH, _HEIGHT, _FOCAL, _GSD_M = 160, 120, 200.0, 0.5
@@ -69,25 +69,20 @@ def rows_of(args: Any, known: Sequence[Row]) -> Iterator[Row]:
         command += ["--cameras", str(folder / "cameras.json"), "--ground", "0", "--crs", "local"]
         command += ["--workspace", str(work), "--jobs", str(args.jobs), "--set", f"extract.keypoints={args.keypoints}"]
         for run in ("run", "again"):
-            log, used_s = args.out / f"{run}-{images}.log", _processor_s()
+            log, used_s = args.out / f"{run}-{images}.log", children_seconds()
             exit_code, seconds, peak = peak_mb(command, log)
             answer = _answer(log)
             if exit_code not in (0, 1) or not answer:
                 raise SystemExit(f"{run} of {images} images ended with exit code {exit_code}: see {log}")
             yield {
                 "images": images, "run": run, "seconds": seconds, "peak_mb": peak, "exit_code": exit_code,
-                "processor_seconds": _processor_s() - used_s,
+                "processor_seconds": children_seconds() - used_s,
                 "pairs": answer["stages"]["pairs"]["items"],
                 "stages": {stage: answer["stages"][stage]["seconds"] for stage in STAGES},
                 "report_mb": (work / "report" / "index.html").stat().st_size / 1e6,
                 "workspace_mb": sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) / 1e6,
             }  # fmt: skip
         shutil.rmtree(work, ignore_errors=True)
-
-
-def _processor_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _answer(log: Path) -> dict[str, Any]:

@@ -77,3 +77,9 @@ def median_seconds(call: Callable[[], Any], runs: int) -> tuple[float, Any]:
         call()
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds), value
+
+
+def children_seconds() -> float:
+    """Processor seconds of all processes that this one has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime

@@ -3,7 +3,6 @@ verified matches against reference poses; and the pairs across the two series of
 
 from __future__ import annotations
 
-import resource
 import shutil
 import sqlite3
 import tempfile
@@ -29,6 +28,7 @@ from benchmarks.blocks.steps import run_step
 from benchmarks.orient.cases import worsened
 from benchmarks.peers.base import MIN_INLIERS, prepared
 from benchmarks.peers.table import Named
+from benchmarks.processes import children_seconds
 from benchmarks.scenes import MIN_OVERLAP, brightness_of
 from benchmarks.sources import OUR_CODE, code_digest, library_versions
 from benchmarks.whole import budget_settings, whole_run
@@ -112,7 +112,7 @@ def _preset(case: Case, spec: str, folder: Path) -> Answer:
     settings = budget_settings(load(preset, own), case.keypoints)
     settings += [] if case.command else ["run.report=false"]
     settings += ["pairs=file", f"pairs.path={pairs}"] if pairs else []
-    work, before = folder / "workspace", _processor_seconds()
+    work, before = folder / "workspace", children_seconds()
     extra, settings = _given(case, folder), [*settings, *own]
     run = whole_run("run", preset, case.images, work, extra=extra, jobs=case.jobs, settings=settings)
     if not run.answer:
@@ -121,7 +121,7 @@ def _preset(case: Case, spec: str, folder: Path) -> Answer:
     return {
         "database": str(work / "export" / "colmap" / "database.db"),
         "seconds": run.seconds if case.command else sum(stages.get(stage, 0.0) for stage in TIMED),
-        "processor_seconds": _processor_seconds() - before,
+        "processor_seconds": children_seconds() - before,
         "stages": stages,
     }
 
@@ -133,11 +133,6 @@ def _given(case: Case, folder: Path) -> list[str]:
     names = [name for name, _ in case.pictures]
     made, _ = worsened(GIVEN[case.poses], case.reference, names, folder)
     return [*made, "--cameras", str(folder / "block.json")]  # the last one counts
-
-
-def _processor_seconds() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _colmap(case: Case, spec: str, folder: Path, store: Path) -> Answer:

@@ -15,12 +15,12 @@ SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
 
 Presets are given (--poses) the reference poses, positions alone with 5 m noise, or nothing; COLMAP uses none. All have
 the reference's cameras. The budget is exact, in COLMAP's sense of a keypoint (a place with two orientations counts
-twice); networks, which take longer for each, have half as many, as by default, and `auto` has both.
-pycolmap's max_num_features is not: it keeps whole scale levels, up to 45 % more. It is
-therefore cut to the budget after extraction, untimed, largest scales first as its own rule would; pycolmap-uncut is
-not. Verified matches are those of pairs with at least 15, each pair of places once (COLMAP counts a place with two
-orientations twice); within 3 and 5 px: by symmetric epipolar distance from the reference poses. Cells filled: of
-16 x 16 of each image, and ninths of 3 x 3, that hold a match within 3 px.
+twice); networks, which take longer for each, have half as many, as by default, and `auto` has both. pycolmap's
+max_num_features is not: it keeps whole scale levels, up to 45 % more. It is therefore cut to the budget after
+extraction, untimed, largest scales first as its own rule would; pycolmap-uncut is not. Verified matches are those of
+pairs with at least 15, each pair of places once (COLMAP counts a place with two orientations twice); within 3 and 5 px:
+by symmetric epipolar distance from the reference poses. Cells filled: of 16 x 16 of each image, and ninths of 3 x 3,
+that hold a match within 3 px.
 Writes OUT/SECTION.json and OUT/SECTION.md; OUT/answers keeps what every method answered: a killed run goes on there.
 """
 
