@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.errors import InputError, WorkspaceError
 from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.reading import readable
 
@@ -178,6 +178,23 @@ class Workspace:
                 f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
                 "use the version that wrote it, or choose another --workspace"
             )
+
+
+def opened_workspace(root: Path) -> Workspace:
+    """One that a command wrote, to look at.
+
+    Raises InputError where the folder is none, WorkspaceError where it has another format version or a table of the
+    block is not as it was written.
+    """
+    workspace = Workspace(root)
+    workspace.check_version()
+    if not workspace.images.is_file():
+        if workspace.orientation.is_dir():
+            state = "holds no results yet (images.csv is missing): its run is estimating the orientation, or was ended"
+            raise InputError(f"{root} {state} while it did; `aeromatch run` goes on with it")
+        raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
+    workspace.check_tables()
+    return workspace
 
 
 @contextlib.contextmanager

@@ -114,6 +114,9 @@ def test_a_folder_that_is_no_workspace(tmp_path: Path) -> None:
         outcome = invoke(*command)
         assert outcome.code == 3
         assert "is no workspace of aeromatch (images.csv is missing)" in outcome.stderr
+    (tmp_path / "orientation").mkdir()  # what is there while the orientation is estimated
+    outcome = invoke("show", tmp_path)
+    assert (outcome.code, "its run is estimating the orientation" in outcome.stderr) == (3, True)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.workspace import Workspace
+from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Pairs that truly share this much count, whether they were tried or not.
 MIN_OVERLAP = 0.20
@@ -61,11 +61,7 @@ def evaluate_workspace(
     belong together, BrokenFileError where a file of the workspace is missing or damaged.
     """
     started, progress = time.monotonic(), progress or SilentProgress()
-    workspace = Workspace(work)
-    workspace.check_version()
-    if not workspace.images.is_file():
-        raise InputError(f"{work} is no workspace (it has no images.csv): give the folder that `aeromatch run` wrote")
-    workspace.check_tables()
+    workspace = opened_workspace(work)
     truth = open_truth(truth_folder)
     images, left_out = _judged(read_images(workspace.images), truth, truth_folder)
     if truth.kind == "rendered":

@@ -13,10 +13,9 @@ from aeromatch_cli.config import differing, load
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER
-from aeromatch_cli.report.show import opened
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.workspace import read_json
+from aeromatch_cli.workspace import opened_workspace, read_json
 
 _LISTED = 10
 # Settings that change no result.
@@ -83,7 +82,7 @@ def _counts(words: str, first: float, second: float) -> str:
 
 
 def _side(root: Path) -> _Side:
-    workspace = opened(root)
+    workspace = opened_workspace(root)
     names = {image.image_id: image.name for image in read_images(workspace.images)}
     final = FinalEntries(workspace)
     matches: dict[tuple[str, str], int] = {}

@@ -29,7 +29,7 @@ from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features, stale_image
-from aeromatch_cli.workspace import Workspace, read_json
+from aeromatch_cli.workspace import opened_workspace, read_json
 
 # Partners that are listed one by one.
 _LISTED = 30
@@ -46,21 +46,11 @@ class Shown:
     picture: Path | None = None
 
 
-def opened(root: Path) -> Workspace:
-    """Raises InputError where the folder is no workspace, WorkspaceError for one of another format version."""
-    workspace = Workspace(root)
-    if not workspace.images.is_file():
-        raise InputError(f"{root} is no workspace of aeromatch (images.csv is missing): give the folder of --workspace")
-    workspace.check_version()
-    workspace.check_tables()
-    return workspace
-
-
 class _Work:
     """A workspace's tables, each read once."""
 
     def __init__(self, root: Path) -> None:
-        self.workspace = opened(root)
+        self.workspace = opened_workspace(root)
 
     @cached_property
     def images(self) -> dict[str, Image]:

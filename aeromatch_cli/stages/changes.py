@@ -36,11 +36,8 @@ def changed_words(config: Path, settings: Settings) -> str:
     """The settings that differ from those in `config`, the workspace's own, and from where on results that depend on
     them are made again; "" where there are none, or no sound file."""
     try:
-        load(str(config))  # one that is damaged holds other keys
-        before = yaml.safe_load(config.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ConfigError):
-        return ""
-    if not isinstance(before, Mapping):
+        before = yaml.safe_load(dump(load(str(config))))
+    except ConfigError:
         return ""
     changed = [
         (key, old, new)
