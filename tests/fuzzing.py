@@ -2,7 +2,8 @@
 
 Each case takes a sound file and damages it: bytes are flipped, parts are cut, repeated or moved, numbers become words,
 infinities, or numbers of absurd size, quotes and brackets get lost. A reader may refuse it by the project's own errors,
-and must not raise, hang or fill the memory otherwise. `scripts/fuzz` runs as many cases as are asked for.
+and must not raise, hang or fill the memory otherwise. `scripts/fuzz` runs as many cases as are asked for; with
+`--guided` the cases are those of atheris, which follows the lines of the program that they reach.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fuzzing_guided import guided_faults
 from make_features import random_features
 from make_images import DJI_XMP, gps_tags, write_image, write_jpeg_2000
 from make_pose_files import LOCAL, WORLD, patb, write_micmac
@@ -225,6 +227,15 @@ def faults(reader: Reader, cases: int, seed: int, folder: Path) -> Iterator[tupl
             yield name, data, f"took {took:.0f} s of the processor"
 
 
+def _said(reader: str, found: Iterator[tuple[str, bytes, str]], seen: dict[str, int]) -> None:
+    """Prints each kind of fault once, counts all."""
+    for file, data, what in found:
+        last = what.strip().splitlines()[-1]
+        seen[last] = seen.get(last, 0) + 1
+        if seen[last] == 1:
+            print(f"{reader} {file}: {what}\n{data[:300]!r}\n", file=sys.stderr)
+
+
 def main() -> None:
     table = readers()
     parser = argparse.ArgumentParser(
@@ -233,6 +244,7 @@ def main() -> None:
     parser.add_argument("readers", nargs="*", help=f"of {', '.join(table)}; all by default")
     parser.add_argument("--cases", type=int, default=20_000, help="of each reader (default 20000)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--guided", action="store_true", help="cases of atheris (pip install 'aeromatch[fuzz]')")
     args = parser.parse_args()
     if unknown := set(args.readers) - table.keys():
         parser.error(f"no such reader: {', '.join(sorted(unknown))}")
@@ -240,11 +252,11 @@ def main() -> None:
     for name in args.readers or table:
         started, seen = time.monotonic(), dict[str, int]()
         with tempfile.TemporaryDirectory() as scratch:
-            for file, data, what in faults(table[name], args.cases, args.seed, Path(scratch)):
-                last = what.strip().splitlines()[-1]
-                seen[last] = seen.get(last, 0) + 1
-                if seen[last] == 1:
-                    print(f"{name} {file}: {what}\n{data[:300]!r}\n", file=sys.stderr)
+            if args.guided:
+                found = guided_faults(name, args.cases, args.seed, Path(scratch))
+            else:
+                found = faults(table[name], args.cases, args.seed, Path(scratch))
+            _said(name, found, seen)
         whole += sum(seen.values())
         print(
             f"{name}: {args.cases} cases, {sum(seen.values())} faults, {time.monotonic() - started:.0f} s", flush=True
