@@ -102,6 +102,19 @@ def test_factors_are_against_the_first_method_of_a_block() -> None:
     assert lines[3].endswith("| 8.0 |")
 
 
+def test_speed_is_a_rate_with_the_share_of_every_stage() -> None:
+    head = {"block": "x", "images": 5, "pairs": 6, "within_3px": 900}
+    peer = head | {"method": "pycolmap", "seconds": 30.0, "tried_pairs": 10}
+    peer |= {"stages": {"extract": 24.0, "match+verify": 6.0}}
+    mine = head | {"method": "baseline", "seconds": 20.0, "tried_pairs": 8}
+    mine |= {"stages": {"orient": 1.0, "pairs": 1.0, "extract": 4.0, "match": 6.0, "filter": 5.0, "export": 3.0}}
+    first, second = tables.speed_table([peer, mine]).splitlines()[2:]
+    figures = "| 5 | 30.0 | 1.00 x | 10 | 20 | 6 | 12 | 900 | 1800 |"
+    assert first == f"| x | `pycolmap` {figures} 0 % | 0 % | 80 % | 20 % | 0 % | 0 % | 0 % |"
+    figures = "| 5 | 20.0 | 0.67 x | 8 | 24 | 6 | 18 | 900 | 2700 |"
+    assert second == f"| x | `baseline` {figures} 5 % | 5 % | 20 % | 30 % | 25 % | 0 % | 15 % |"
+
+
 def test_methods_are_checked_before_anything_runs(tmp_path: Path) -> None:
     for spec in ("pycolmap-uncut-guided", "baseline[match.ratio=0.7]"):
         check_method(spec, cases.COLMAP)

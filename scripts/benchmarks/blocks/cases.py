@@ -3,6 +3,7 @@ verified matches against reference poses; and the pairs across the two series of
 
 from __future__ import annotations
 
+import math
 import shutil
 import sqlite3
 import tempfile
@@ -119,6 +120,7 @@ def _preset(case: Case, spec: str, folder: Path) -> Answer:
         raise SystemExit(f"aeromatch run {preset} failed with exit code {run.code}:\n{run.said[-2000:]}")
     stages = {name: found["seconds"] for name, found in run.answer["stages"].items()}
     return {
+        "tried_pairs": run.answer["stages"]["pairs"]["items"],
         "database": str(work / "export" / "colmap" / "database.db"),
         "seconds": run.seconds if case.command else sum(stages.get(stage, 0.0) for stage in TIMED),
         "processor_seconds": children_seconds() - before,
@@ -153,7 +155,8 @@ def _colmap(case: Case, spec: str, folder: Path, store: Path) -> Answer:
     pairs, guided = _pair_list(case, folder, " "), spec.endswith("-guided")
     found = run_step(steps.colmap_match, database, case.jobs, guided, pairs)
     stages = {"extract": extracted, "match+verify": found["seconds"]}
-    return {"database": str(database), "seconds": sum(stages.values()), "stages": stages}
+    tried = len(case.pairs) if case.pairs is not None else math.comb(len(case.pictures), 2)
+    return {"tried_pairs": tried, "database": str(database), "seconds": sum(stages.values()), "stages": stages}
 
 
 def _pair_list(case: Case, folder: Path, separator: str) -> Path | None:

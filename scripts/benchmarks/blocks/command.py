@@ -11,6 +11,7 @@ SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
   thinned   the same where ordinary matching falls apart
   cross     only pairs across a block's darker and brighter series that share a fifth of the smaller footprint
   easy      wall clock of `aeromatch run`, everything included, against the first method
+  speed     the same as a rate: pairs and matches a minute, COLMAP beside presets, and the share of every stage
   orient    whole chains from pictures to an oriented block: `scripts/bench blocks orient --help`
 
 Presets are given (--poses) the reference poses, positions alone with 5 m noise, or nothing; COLMAP uses none. All have
@@ -39,7 +40,7 @@ from aeromatch_cli.synthetic.presets import PRESETS
 from benchmarks import options, stamps
 from benchmarks.blocks import chains
 from benchmarks.blocks.cases import COLMAP, GIVEN, Case, answer, chosen_images, count_matches, cross_pairs
-from benchmarks.blocks.tables import blocks_table, cross_table, easy_table
+from benchmarks.blocks.tables import blocks_table, cross_table, easy_table, speed_table
 from benchmarks.peers.table import Named, check_method, named_methods, settings_of
 from benchmarks.scenes import render_once
 from benchmarks.tables import Row, write_rows
@@ -63,7 +64,10 @@ SECTIONS = {
     "thinned": Section("ochota,lewis,seneca,caliterra", "2,3", 3000, "pycolmap-uncut,baseline", blocks_table, True),
     "cross": Section("ochota", "1", 4500, "pycolmap-uncut-guided,baseline", cross_table, False),
     "easy": Section("sheffield,brighton", "1", 4000, "baseline", easy_table, False),
+    "speed": Section("seneca,ochota", "1", 4000, "pycolmap,baseline,fusion,auto", speed_table, False),
 }
+# Sections whose seconds are those of the whole command.
+WHOLE = ("easy", "speed")
 QUICK_IMAGES, QUICK = 8, {"keypoints": 1000}
 RENDERED = {"seed": 3_000_001, "images": 20, "width_px": 1600, "height_px": 1200}
 
@@ -81,7 +85,7 @@ def rows_of(args: argparse.Namespace, section: str, methods: Sequence[Named]) ->
             for poses, name in product(args.poses, methods):
                 if name.spec in COLMAP and poses != args.poses[0]:
                     continue  # the same answer
-                case = Case(images, reference, pairs, args.keypoints, args.jobs, section == "easy", mapping, poses)
+                case = Case(images, reference, pairs, args.keypoints, args.jobs, section in WHOLE, mapping, poses)
                 found, database = answer(case, name, args.out / "answers")
                 only = None if pairs is None else set(pairs)
                 head = {"block": block, "every": every, "poses": None if name.spec in COLMAP else poses}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from benchmarks.tables import Column, Row, code, factor, number, percent, ratio, table
 
@@ -76,6 +76,40 @@ _EASY: list[Column[_Both]] = [
 ]
 
 
+def _per_minute(field: str) -> Callable[[Row], str]:
+    return lambda row: "-" if row.get(field) is None else number(60.0 * row[field] / row["seconds"])
+
+
+# Columns of a preset's stages; COLMAP matches and verifies in one.
+_SHARES: Mapping[str, Sequence[str]] = {
+    "orient": ("orient",), "pairs": ("pairs",), "extract": ("enhance", "simulate", "extract"),
+    "match": ("match", "match+verify"), "filter": ("filter",), "adjust": ("adjust", "consistency"),
+    "export": ("export",),
+}  # fmt: skip
+
+
+def _share(stages: Sequence[str]) -> Callable[[Row], str]:
+    return lambda row: percent(sum(row["stages"].get(stage, 0.0) for stage in stages) / sum(row["stages"].values()))
+
+
+_SPEED: list[Column[_Both]] = [
+    *_mine([
+        ("images", lambda row: row["images"]),
+        _SECONDS,
+    ]),
+    _over_first("x first", "seconds"),
+    *_mine([
+        ("pairs tried", lambda row: row.get("tried_pairs", "-")),
+        ("tried a minute", _per_minute("tried_pairs")),
+        ("verified", lambda row: row["pairs"]),
+        ("verified a minute", _per_minute("pairs")),
+        ("within 3 px", lambda row: row["within_3px"]),
+        ("within 3 px a minute", _per_minute("within_3px")),
+        *((title, _share(stages)) for title, stages in _SHARES.items()),
+    ]),
+]  # fmt: skip
+
+
 def blocks_table(rows: Sequence[Row]) -> str:
     """A line per block, thinning and method: matches, and what mapping makes of them."""
     lines = [((row["block"], row["every"], code(row["method"]), row["poses"] or "-"), row) for row in rows]
@@ -90,6 +124,11 @@ def cross_table(rows: Sequence[Row]) -> str:
 def easy_table(rows: Sequence[Row]) -> str:
     """A line per block and method: matches and time. Factors are against the first method of the block."""
     return table(("block", "method"), _beside_first(rows), _EASY)
+
+
+def speed_table(rows: Sequence[Row]) -> str:
+    """A line per block and method: pairs and matches a minute, and the share of every stage. Factors as in `easy`."""
+    return table(("block", "method"), _beside_first(rows), _SPEED)
 
 
 def _beside_first(rows: Sequence[Row]) -> list[tuple[tuple[str, str], _Both]]:
