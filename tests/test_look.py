@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,17 @@ def test_matches_of_keypoints_that_were_found_again_are_named_and_not_drawn(done
     assert "pairs were not judged" in (work / "report" / "index.html").read_text()
     assert done_site("run", "--set", "extract.keypoints=300").code == 0
     assert invoke("show", work, names[0], names[1]).code == 0
+
+
+@pytest.mark.slow
+def test_an_archive_that_nobody_may_write_is_shown_elsewhere(
+    done_site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = done_site.names()[:2]
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may write all
+    refused = invoke("show", done_site.work, *names)
+    assert (refused.code, "--out suburb_0001_jpg--suburb_0002_jpg.png" in refused.stderr) == (3, True), refused.stderr
+    assert invoke("show", done_site.work, *names, "--out", tmp_path / "p.png").code == 0
 
 
 @pytest.mark.slow

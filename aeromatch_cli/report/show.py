@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
-from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError
+from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
@@ -29,7 +30,7 @@ from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features, stale_image
-from aeromatch_cli.workspace import opened_workspace, read_json
+from aeromatch_cli.workspace import Workspace, opened_workspace, read_json
 
 # Partners that are listed one by one.
 _LISTED = 30
@@ -205,7 +206,7 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     for what, path in (("enhanced", workspace.enhanced(image_id, ".png")), ("views", workspace.views(image_id))):
         if path.exists():
             lines.append(f"{what:<11} {path}")
-    target = out or workspace.root / "show" / f"{image_id}.png"
+    target = out or _own_file(workspace, f"{image_id}.png")
     picture = image_picture(read_pixels(work.picture(image), colour=True), keypoints, matched)
     tiles = [Tile("keypoints: in verified matches green, others red", picture)]
     if views:
@@ -216,6 +217,14 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     partners = {name: count for count, name, *_ in rows}
     facts = {"image": image.name, "keypoints": len(keypoints), "partners": partners, "picture": str(target)}
     return Shown(lines, facts, target)
+
+
+def _own_file(workspace: Workspace, name: str) -> Path:
+    """Where a picture goes that no --out names. Raises WorkspaceError where nobody may write, as in an archive."""
+    folder = workspace.root / "show"
+    if not os.access(folder if folder.exists() else workspace.root, os.W_OK):
+        raise WorkspaceError(f"cannot write {folder}: name a file elsewhere, as in --out {name}")
+    return folder / name
 
 
 def _pose_words(pose: Pose | None, origin_m: Sequence[float]) -> Iterator[str]:
@@ -262,7 +271,7 @@ def _pair(work: _Work, image0: Image, image1: Image, out: Path | None, *, reject
     points = match_points(kept, *sides) if kept is not None else (np.zeros((0, 2)), np.zeros((0, 2)))
     dropped = match_points(raw.matches, *sides) if rejected or kept is None else None
     pixels = [read_pixels(work.picture(image), colour=True) for image in (image0, image1)]
-    target = out or workspace.root / "show" / f"{ids[0]}--{ids[1]}.png"
+    target = out or _own_file(workspace, f"{ids[0]}--{ids[1]}.png")
     words = f"green to yellow by error{', dropped ones red' if dropped is not None else ''}"
     tiles = [Tile(f"matches: {words}", pair_picture(pixels, points, errors, dropped))]
     if target.suffix.lower() != ".png":
