@@ -25,6 +25,8 @@ IMAGES, WIDTH, HEIGHT = 5, 320, 240
 # Most tests look at no page, which would take a third of their time.
 QUICK = ("--jobs", "1", "--set", "extract.keypoints=400", "--set", "run.report=false")
 PAGE = ("--set", "run.report=true")
+# A module's SETTINGS for `site` and `done_site`, where its tests are not about orientation: half of a run's time.
+UNORIENTED = ("--set", "orient=none")
 
 
 def heed_interrupts() -> None:
@@ -66,9 +68,10 @@ def invoke(*arguments: object) -> Outcome:
 
 @dataclass(frozen=True)
 class Site:
-    """A block that a test may change, and a workspace."""
+    """A block that a test may change, and a workspace. settings: of all its commands, besides QUICK."""
 
     root: Path
+    settings: tuple[str, ...] = ()
 
     @property
     def images(self) -> Path:
@@ -84,7 +87,7 @@ class Site:
 
     def options(self, *more: object) -> list[object]:
         block = ["--images", self.images, "--poses", self.poses, "--cameras", self.root / "block.json"]
-        return [*block, "--workspace", self.work, *QUICK, *more]
+        return [*block, "--workspace", self.work, *QUICK, *self.settings, *more]
 
     def __call__(self, command: str, *more: object) -> Outcome:
         return invoke(command, "baseline", *self.options("--json", *more))
@@ -129,26 +132,43 @@ def finished(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site.root
 
 
+@pytest.fixture(scope="session")
+def finished_unoriented(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same without orientation."""
+    site = _copied(rendered, tmp_path_factory.mktemp("unoriented"), UNORIENTED)
+    assert site("run").code == 0
+    return site.root
+
+
 @pytest.fixture
-def site(rendered: Path, tmp_path: Path) -> Site:
+def site(rendered: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Site:
     """A fresh copy of the block, without workspace."""
-    return _copied(rendered, tmp_path)
+    return _copied(rendered, tmp_path, _settings(request))
 
 
 @pytest.fixture
-def done_site(finished: Path, tmp_path: Path) -> Site:
+def done_site(tmp_path: Path, request: pytest.FixtureRequest) -> Site:
     """A copy of the block whose workspace is complete."""
-    shutil.copytree(finished, tmp_path / "site")  # modification times come along: images count as unchanged
-    site = Site(tmp_path / "site")
+    settings = _settings(request)
+    done = request.getfixturevalue("finished_unoriented" if settings else "finished")
+    shutil.copytree(done, tmp_path / "site")  # modification times come along: images count as unchanged
+    site = Site(tmp_path / "site", settings)
     assert site("run").done() == {}
     return site
 
 
-def _copied(rendered: Path, folder: Path) -> Site:
+def _settings(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    """Of the test's module."""
+    found: tuple[str, ...] = getattr(request.module, "SETTINGS", ())
+    assert found in ((), UNORIENTED)
+    return found
+
+
+def _copied(rendered: Path, folder: Path, settings: tuple[str, ...] = ()) -> Site:
     shutil.copytree(rendered / "images", folder / "images")
     for name in ("poses.csv", "block.json"):
         shutil.copy2(rendered / name, folder / name)
-    return Site(folder)
+    return Site(folder, settings)
 
 
 # --- comparing workspaces -----------------------------------------------------------------------------------------

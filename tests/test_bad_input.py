@@ -10,11 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import HEIGHT, IMAGES, WIDTH, contents, invoke
+from conftest import HEIGHT, IMAGES, UNORIENTED, WIDTH, contents, invoke
 
 from aeromatch_cli.blocks import scan
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 

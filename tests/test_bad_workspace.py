@@ -9,12 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import IMAGES, Site, contents
+from conftest import IMAGES, UNORIENTED, Site, contents
 
 from aeromatch_cli import workspace as workspace_module
 from aeromatch_cli.workspace import read_json
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 
 def test_workspace_below_a_file(site):

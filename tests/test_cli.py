@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import IMAGES, PAGE, Site, contents, invoke
+from conftest import IMAGES, PAGE, UNORIENTED, Site, contents, invoke
 from typer.testing import CliRunner
 
 from aeromatch_cli import __version__
@@ -19,6 +19,8 @@ from aeromatch_cli.cli import app, output
 from aeromatch_cli.cli.progress import RUN_STAGES, LineProgress
 from aeromatch_cli.cli.stage_commands import STAGES
 from aeromatch_cli.stages.shard import Shard
+
+SETTINGS = UNORIENTED
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 OPTIONS = (

@@ -7,12 +7,13 @@ import shlex
 from pathlib import Path
 
 import pytest
-from conftest import QUICK, Site, invoke
+from conftest import QUICK, UNORIENTED, Site, invoke
 from read_pages import ROOT, commands, text_of
 
 from aeromatch_cli.cli.look_commands import LOOK
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 RUN_PAGES = [ROOT / "README.md", ROOT / "docs" / "guide.md", *sorted((ROOT / "docs" / "methods").glob("*.md"))]
 # What needs files of its own: a DEM in a CRS, a configuration. tests/test_docs_links.py parses these commands.

@@ -11,9 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import Site, contents, heed_interrupts
+from conftest import UNORIENTED, Site, contents, heed_interrupts
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 
 def start(site: Site, work: Path, *more: object) -> subprocess.Popen[str]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import PAGE, QUICK, Site, invoke
+from conftest import PAGE, QUICK, UNORIENTED, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config.text import default_yaml
@@ -14,6 +14,7 @@ from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.workspace import read_json
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 BESIDE = ("--set", "enhance=clahe", "--set", "enhance.keep_source=true")
 _EXIF_IFD, _DATE_TIME_ORIGINAL = 0x8769, 36867

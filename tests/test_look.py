@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from conftest import IMAGES, Site, invoke
+from conftest import IMAGES, UNORIENTED, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.tiles import aligned
+
+SETTINGS = UNORIENTED
 
 GRAY = np.full((60, 80, 3), 128, np.uint8)
 

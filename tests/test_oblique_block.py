@@ -22,7 +22,7 @@ def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def arguments(suburb: Path, work: Path, *recipe: str) -> tuple[str | Path | int, ...]:
     block = ("--images", suburb / "images", "--poses", suburb / "poses_noisy.csv", "--cameras", suburb / "block.json")
-    budget = ("--set", "extract.keypoints=1000")
+    budget = ("--set", "extract.keypoints=1000", "--set", "run.report=false")
     return ("run", *recipe, *budget, *block, "--workspace", work, "--jobs", 1, "--json")
 
 

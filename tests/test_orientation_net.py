@@ -86,7 +86,8 @@ def test_a_patch_cut_along_its_orientation_is_upright(unseen: TurnedPairs) -> No
 
 @pytest.mark.slow
 def test_bfloat16_is_close_to_float32(unseen: TurnedPairs) -> None:
-    exact, quick = (degrees(unseen.patches0, load_orientation(precision=kind)) for kind in ("float32", "bfloat16"))
+    patches = unseen.patches0[:400]
+    exact, quick = (degrees(patches, load_orientation(precision=kind)) for kind in ("float32", "bfloat16"))
     assert np.percentile(np.abs(wrapped_deg(exact - quick)), 95) < 5.0
 
 

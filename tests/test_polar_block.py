@@ -17,6 +17,7 @@ from aeromatch_cli.synthetic import render_block
 pytestmark = pytest.mark.slow
 
 MAX_IMAGE_ID = 2147483647
+PLAIN = ("--set", "run.report=false")
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def grass(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def work(grass: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("run")
     block = ["--images", grass / "images", "--poses", grass / "poses_noisy.csv", "--cameras", grass / "block.json"]
-    outcome = invoke("run", "polar", *block, "--workspace", root / "work", "--jobs", 1, "--json")
+    outcome = invoke("run", "polar", *block, "--workspace", root / "work", "--jobs", 1, "--json", *PLAIN)
     assert outcome.code == 0, outcome.stderr
     return root / "work"
 
@@ -71,6 +72,6 @@ def test_the_export_joins_what_several_images_see(work: Path) -> None:
 
 def test_a_second_run_makes_nothing(work: Path, grass: Path) -> None:
     block = ["--images", grass / "images", "--poses", grass / "poses_noisy.csv", "--cameras", grass / "block.json"]
-    outcome = invoke("run", "polar", *block, "--workspace", work, "--jobs", 1, "--json")
+    outcome = invoke("run", "polar", *block, "--workspace", work, "--jobs", 1, "--json", *PLAIN)
     assert outcome.code == 0
     assert not {"extract", "match", "filter"} & outcome.done().keys()

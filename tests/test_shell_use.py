@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import Site
+from conftest import UNORIENTED, Site
+
+SETTINGS = UNORIENTED
 
 GUIDE = (Path(__file__).parent.parent / "docs" / "guide.md").read_text()
 

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site, invoke
+from conftest import IMAGES, UNORIENTED, Site, invoke
 
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import context
 from aeromatch_cli.workspace import Workspace, read_json
 
 pytestmark = pytest.mark.slow
+SETTINGS = UNORIENTED
 
 
 def write_dem(path: Path, far_m: float) -> None:
@@ -36,7 +37,7 @@ def test_a_dem_replaced_in_place_does_everything_again(site: Site) -> None:
     again = site("match", "--ground", dem)
     after = read_json(Workspace(site.work).block)["gsd_m"]
     assert again.counts("extract")[0] > 0
-    fresh = Site(site.root)
+    fresh = Site(site.root, site.settings)
     invoke("pairs", "baseline", *fresh.options("--ground", dem, "--workspace", site.root / "fresh"))
     assert after == read_json(Workspace(site.root / "fresh").block)["gsd_m"]
     assert after != before
