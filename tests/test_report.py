@@ -20,6 +20,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
 from aeromatch_cli.report import page as report
+from aeromatch_cli.report.pair_viewer import PairTables
 from aeromatch_cli.report.previews import chosen_previews
 from aeromatch_cli.report.rows import ImageRow, PairRow, gather, stage_rows
 from aeromatch_cli.stages.context import Context
@@ -357,7 +358,7 @@ def test_large_block_stays_a_small_page(tmp_path):
         if k + step < 1000
     ]
     rows = [ImageRow(i, f"{i[:-4]}.jpg", "", "full", 4000, 20, 14, 5000, 0.8) for i in ids]
-    page = report.render(large, pairs, rows)
+    page = report.render(large, pairs, rows, PairTables(large))
     Structure.of(page)
     assert len(page.encode()) < 3_000_000
     assert page.count("<tr>") < 3100

@@ -17,7 +17,7 @@ from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a
 
 from aeromatch_cli.report import pair_viewer, thumbnails
 from aeromatch_cli.report.pair_viewer import PairData
-from aeromatch_cli.report.rows import PairRow, gather
+from aeromatch_cli.report.rows import gather
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.stages.context import Context
 
@@ -29,12 +29,20 @@ def stored(page: str) -> dict[str, object]:
     return dict(json.loads(text))
 
 
-def pair_data(context: Context, rows: list[PairRow]) -> tuple[PairData, dict[tuple[str, str], str]]:
-    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context))
+def pair_data(context: Context) -> tuple[PairData, dict[tuple[str, str], str]]:
+    tables = pair_viewer.PairTables(context)
+    rows, _ = gather(context, tables.add)
+    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context), tables)
+
+
+def test_tables_made_while_pairs_are_gathered_are_those_of_their_files(full: Context) -> None:  # noqa: F811
+    nothing = pair_viewer.PairTables(full)
+    again = pair_viewer.pair_data(full, gather(full)[0], thumbnails.thumbnails(full), nothing)
+    assert again == pair_data(full)
 
 
 def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Context) -> None:  # noqa: F811
-    data, keys = pair_data(full, gather(full)[0])
+    data, keys = pair_data(full)
     # d has no picture, a-d no matches; c-d is neither verified nor rejected.
     assert keys == {("a", "b"): "0,1", ("a", "c"): "0,2", ("b", "c"): "1,2"}
     sizes = [(width, height) for _, width, height in data.pictures]
@@ -55,7 +63,7 @@ def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Contex
 
 def test_a_pair_has_some_of_its_matches(full: Context, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     monkeypatch.setattr(pair_viewer, "MAX_MATCHES", 10)
-    data, _ = pair_data(full, gather(full)[0])
+    data, _ = pair_data(full)
     assert len(base64.b64decode(data.pairs["0,1"][0])) == 50
     assert data.pairs["0,1"][1:] == (60, 80, "verified")
     assert data.pairs["0,2"][1:] == (0, 12, "rejected")

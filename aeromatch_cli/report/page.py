@@ -23,7 +23,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
-from aeromatch_cli.report.pair_viewer import pair_data
+from aeromatch_cli.report.pair_viewer import PairTables, pair_data
 from aeromatch_cli.report.places import ground_figures, point_figures
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
@@ -37,7 +37,6 @@ from aeromatch_cli.report.rows import (
 )
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
-from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
@@ -66,8 +65,9 @@ class Notice:
 def run(context: Context) -> StageReport:
     """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
     report = StageReport("report", items=1)
-    pairs, images = gather(context)
-    page = render(context, pairs, images)
+    tables = PairTables(context)
+    pairs, images = gather(context, tables.add)
+    page = render(context, pairs, images, tables)
     write_text(context.workspace.report, page)
     record = context.workspace.report_files
     folder = record.parent
@@ -79,8 +79,8 @@ def run(context: Context) -> StageReport:
     return report.write(context.workspace)
 
 
-def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow]) -> str:
-    """The page as text."""
+def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow], tables: PairTables) -> str:
+    """The page as text. tables: what the pair viewer draws of the verified pairs."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -89,7 +89,8 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     environment.filters["number"] = number
     source = resources.files("aeromatch_cli.report") / "page.html.jinja"
     template = environment.from_string(source.read_text(encoding="utf-8"))
-    facts = summarise(context, final_pairs)
+    judged = (row for row in pairs if row.state != NOT_JUDGED)
+    facts = summarise(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
     wrong = {i: float(angle) for i, angle in _facts(context, "orient").get("wrong_attitudes", {}).items()}
     input_facts = _facts(context, "pairs")
     failures = failure_rows(context)
@@ -98,7 +99,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     adjusted = _adjusted_block(context) if any(row.state == "verified" for row in pairs) else None
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context)
-    drawn, keys = pair_data(context, pairs, pictures)
+    drawn, keys = pair_data(context, pairs, pictures, tables)
     drawn.write_beside(context.workspace.report.parent / "pairs")
     return template.render(
         version=__version__,

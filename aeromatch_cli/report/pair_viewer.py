@@ -60,10 +60,24 @@ def _json(value: object) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
+class PairTables:
+    """What is drawn of the verified pairs; `gather` has it made while it reads them."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self.by_pair: dict[tuple[str, str], str] = {}
+
+    def add(self, row: PairRow, places: tuple[FloatArray, FloatArray], errors_px: FloatArray | None) -> None:
+        """Stored pixels (M, 2) of a pair's matches in either image, errors (M,) in pixels."""
+        ids = row.image_id0, row.image_id1
+        self.by_pair[ids] = _table(self._context, ids, places, errors_px)
+
+
 def pair_data(
-    context: Context, rows: Sequence[PairRow], pictures: Thumbnails
+    context: Context, rows: Sequence[PairRow], pictures: Thumbnails, tables: PairTables
 ) -> tuple[PairData, dict[tuple[str, str], str]]:
-    """What can be drawn of the pairs, and under which key of PairData.pairs each is."""
+    """What can be drawn of the pairs, and under which key of PairData.pairs each is. tables: of verified pairs; those
+    of rejected ones are made here."""
     data = PairData()
     number_of = {image_id: number for number, image_id in enumerate(pictures)}
     for image_id in pictures:
@@ -75,14 +89,13 @@ def pair_data(
     for row in sorted(drawable(rows), key=lambda row: (row.image_id0, row.image_id1)):
         ids = row.image_id0, row.image_id1
         if ids[0] in number_of and ids[1] in number_of:
-            try:
-                places, errors_px = drawn.of(row)
-            except WorkspaceError:
-                continue  # its files have gone: the row stays, without a picture
+            if ids not in tables.by_pair:
+                try:
+                    tables.add(row, *drawn.of(row))
+                except WorkspaceError:
+                    continue  # its files have gone: the row stays, without a picture
             keys[ids] = f"{number_of[ids[0]]},{number_of[ids[1]]}"
-            data.pairs[keys[ids]] = (
-                _table(context, ids, places, errors_px), int(row.verified), int(row.matches_in or 0), row.state,
-            )  # fmt: skip
+            data.pairs[keys[ids]] = (tables.by_pair[ids], int(row.verified), int(row.matches_in or 0), row.state)
     if pictures.beside:
         data.beside = sorted({int(key.partition(",")[0]) for key in data.pairs})
     return data, keys

@@ -130,6 +130,10 @@ class EvaluationFigures:
     outdated: bool
 
 
+# Gets a verified pair, stored pixels (M, 2) of its matches in either image, and errors (M,) in pixels.
+Visitor = Callable[[PairRow, tuple[FloatArray, FloatArray], FloatArray | None], None]
+
+
 class _Coverage:
     """Which cells of every image hold a verified match."""
 
@@ -148,11 +152,12 @@ class _Coverage:
                 self._keypoints_px[image_id] = None
         return self._keypoints_px[image_id]
 
-    def add(self, pair: Pair, entry: VerifiedEntry) -> None:
-        """Mark the cells of both images that this pair's matches touch."""
+    def add(self, pair: Pair, entry: VerifiedEntry) -> tuple[FloatArray, FloatArray] | None:
+        """Mark the cells of both images that this pair's matches touch. Stored pixels (M, 2) of these in either image,
+        None where it has no readable features."""
         keypoints0, keypoints1 = self.keypoints_px(pair.image_id0), self.keypoints_px(pair.image_id1)
         if keypoints0 is None or keypoints1 is None:
-            return
+            return None
         points = match_points(entry.matches, keypoints0, keypoints1)
         for image_id, points_px in zip((pair.image_id0, pair.image_id1), points, strict=True):
             image = self._images[image_id]
@@ -160,6 +165,7 @@ class _Coverage:
             cells = np.clip(cells, 0, COVERAGE_CELLS - 1)
             seen = self._seen.setdefault(image_id, np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), dtype=bool))
             seen[cells[:, 1], cells[:, 0]] = True
+        return points
 
     def share(self, image_id: str) -> float | None:
         if self.keypoints_px(image_id) is None:
@@ -167,8 +173,9 @@ class _Coverage:
         return float(self._seen[image_id].mean()) if image_id in self._seen else 0.0
 
 
-def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
-    """Pairs in the order of pairs.csv and images in the order of images.csv."""
+def gather(context: Context, visit: Visitor | None = None) -> tuple[list[PairRow], list[ImageRow]]:
+    """Pairs in the order of pairs.csv and images in the order of images.csv. visit: sees the verified pairs meanwhile,
+    as reading their files is what takes time."""
     coverage = _Coverage(context)
     judged: dict[tuple[str, str], PairRow] = {}
     tied: Counter[str] = Counter()
@@ -176,7 +183,9 @@ def gather(context: Context) -> tuple[list[PairRow], list[ImageRow]]:
     for pair, entry in final_pairs(context):
         row = judged[pair.image_id0, pair.image_id1] = _pair_row(context, pair, entry)
         if row.state == "verified":
-            coverage.add(pair, entry)
+            points = coverage.add(pair, entry)
+            if visit is not None and points is not None:
+                visit(row, points, entry.verdict.errors_px)
             tied.update((pair.image_id0, pair.image_id1))
             matches.update({pair.image_id0: row.verified, pair.image_id1: row.verified})
     pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(context, p, None) for p in context.pairs]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -222,23 +222,27 @@ def verified_pairs(context: Context) -> Judged:
             yield pair, entry
 
 
-def summarise(context: Context, verified: Callable[[Context], Judged] = verified_pairs) -> dict[str, Any]:
+def summarise(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> dict[str, Any]:
     """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and weakly tied
     images.
 
-    verified: where the verified matches come from.
+    judged: ids of both images, state and number of matches of every judged pair; by default those of this stage.
     """
+    if judged is None:
+        judged = (
+            (pair.image_id0, pair.image_id1, entry.verdict.state, len(entry.matches.indices))
+            for pair, entry in verified_pairs(context)
+        )
     states: Counter[str] = Counter()
     ties: Counter[str] = Counter()
     links: list[tuple[str, str]] = []
     matches = 0
-    for pair, entry in verified(context):
-        states[entry.verdict.state] += 1
-        if entry.verdict.state == "verified":
-            count = len(entry.matches.indices)
+    for id0, id1, state, count in judged:
+        states[state] += 1
+        if state == "verified":
             matches += count
-            ties.update({pair.image_id0: count, pair.image_id1: count})
-            links.append((pair.image_id0, pair.image_id1))
+            ties.update({id0: count, id1: count})
+            links.append((id0, id1))
     ids = [image.image_id for image in context.block.images]
     return {
         "pairs": dict(sorted(states.items())),
