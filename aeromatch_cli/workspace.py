@@ -78,6 +78,15 @@ class Workspace:
         return self.orientation / "adjusted.npz"
 
     @property
+    def final(self) -> Path:
+        """The adjusted block without what only dropped matches have held; absent where that is nothing."""
+        return self.orientation / "final.npz"
+
+    @property
+    def final_or_adjusted(self) -> Path:
+        return self.final if self.final.is_file() else self.adjusted
+
+    @property
     def dropped(self) -> Path:
         """Verified matches that contradict the adjusted block."""
         return self.orientation / "dropped.npz"

@@ -14,12 +14,12 @@ NAMES = {i: f"{i}.jpg" for i in "abcd"}
 
 def reports(**changes: Any) -> list[StageReport]:
     filtered = {"components": [4], "weakly_tied": [], **changes.get("filter", {})}
-    adjusted = {"outside": {}, "groups": [{}], **changes.get("adjust", {})}
+    adjusted = {"outside": {}, "groups": [{}], "images": 4, **changes.get("adjust", {})}
     spread = {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})
     return [
         StageReport("filter", facts=filtered),
         StageReport("adjust", facts=adjusted),
-        StageReport("consistency", facts={"spread": spread}),
+        StageReport("consistency", facts={"spread": spread, **changes.get("consistency", {})}),
     ]
 
 
@@ -39,6 +39,11 @@ def test_a_sound_block_is_called_so() -> None:
             ["not sound: not oriented: b.jpg", "aeromatch show WORK b.jpg"],
         ),
         ({"adjust": {"groups": [{}, {}]}}, ["2 parts whose scale and place nothing ties", "--poses"]),
+        ({"adjust": {"images": 0}}, ["sound: all 4 images are connected; they are not oriented"]),
+        (
+            {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
+            ["not sound: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
+        ),
         ({"filter": {"weakly_tied": ["c"]}}, ["sound: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
         ({"spread": {"d": [9, 0, 3]}}, ["sound", "weak: d.jpg, with fewer than 20 points that three images see"]),
         ({"spread": {"a": [7, 2, 99]}}, ["sound", "parts without a point though other images show them: a.jpg"]),

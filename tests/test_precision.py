@@ -33,6 +33,20 @@ def test_no_movement_of_the_whole_changes_the_normal_equations() -> None:
     assert (moved < 1e-8 * usual).all()
 
 
+@pytest.mark.parametrize("place", [(20.0, 20.0, 300.0), (np.nan, 0.0, 0.0), (20.0, np.inf, 0.0)])
+def test_a_point_behind_the_images_or_nowhere_changes_nothing(place: tuple[float, float, float]) -> None:
+    seen = network()
+    more = replace(
+        seen,
+        image=np.append(seen.image, np.arange(9)),
+        point=np.append(seen.point, np.full(9, 200)),
+        points_m=np.vstack([seen.points_m, place]),
+    )
+    known = np.full(9, 0.1), np.full(9, np.inf), np.array([0.01])
+    for found, expected in zip(pose_sigmas(more, *known), pose_sigmas(seen, *known), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
 def adjusted(seen: Observations, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Errors of centres (N, 3) in metres and of attitudes (N, 3) in radians, the frame as the true centres have it:
     one linear adjustment, measured once more with noise."""

@@ -70,7 +70,9 @@ class ConsistencyFacts(Facts):
     """Of `consistency`: the final matches."""
 
     verified_matches: int | None = Field(None, description="Matches that are exported.")
-    dropped_matches: int | None = Field(None, description="Matches that the adjusted block contradicts.")
+    dropped_matches: int | None = Field(None, description="Matches that contradict the adjusted block or are unlikely.")
+    points: int | None = Field(None, description="Points of the adjusted block.")
+    points_left: int | None = Field(None, description="Those of them that the exported matches hold.")
     expected_right: float | None = Field(None, description="Share (0-1) of the exported ones that is right to 3 px.")
     doubtful: list[str] = Field([], description="Images that the block seems to hold in a wrong place.")
 
@@ -128,6 +130,7 @@ class Stages(BaseModel):
     consistency: Consistency | None = None
     export: StageOutcome | None = None
     report: StageOutcome | None = None
+    steps: dict[str, dict[str, StageOutcome]] = Field({}, description="Of a shard: what its cascade's steps did.")
 
 
 class Line(BaseModel):

@@ -93,5 +93,14 @@ def differing(first: Any, second: Any, place: str = "") -> Iterator[tuple[str, A
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         for key in dict.fromkeys([*first, *second]):
             yield from differing(first.get(key), second.get(key), f"{place}.{key}" if place else key)
+    elif _names(first) and _names(first) == _names(second):  # steps of a cascade, filters, exporters
+        for one, other in zip(first, second, strict=True):
+            yield from differing(one, other, f"{place}.{one['name']}")
     elif first != second:
         yield place, first, second
+
+
+def _names(value: Any) -> list[Any]:
+    """Of a list of strategies; nothing of other values."""
+    strategies = isinstance(value, list) and all(isinstance(one, Mapping) and "name" in one for one in value)
+    return [one["name"] for one in value] if strategies else []

@@ -108,10 +108,15 @@ N images, P points, O observations, C cameras.
   `points_m`.
 - `cameras` (2, C) str: camera_id, and model, width and height; `params` (C,) str: as in `cameras.csv`.
 
+### orientation/final.npz
+
+As `adjusted.npz`, with the points and observations that are left once the matches of `dropped.npz` are gone; absent
+where that is all. `export` and `report` show these.
+
 ### orientation/dropped.npz
 
-Verified matches that contradict the adjusted block, of D pairs. Whoever reads results goes without them: `export`,
-`report` and `evaluate` do.
+Verified matches that contradict the adjusted block or are not likely to be right, of D pairs. Whoever reads results
+goes without them: `export`, `report` and `evaluate` do.
 
 - `images` (D, 2) str: image ids; `fingerprints` (D,) str: of the pair's entry in `verified/`, for which alone this
   holds.
@@ -202,10 +207,12 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
-- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`,
+- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
+  `weakly_tied` (as of filter, of those that stay), `points` (of the adjusted block), `points_left` (that those that
+  stay hold),
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
   `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
-  (image_id -> ninths of the image that hold a point of the adjusted block, ninths that hold none though other images
+  (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images
   show them, and its points that three or more images see).
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
   matches than their overlap promises). Of extract with a cascade: `images_by_step`.

@@ -6,7 +6,7 @@ Unknowns are the rotation and centre of every image, one focal length per camera
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,6 +62,7 @@ def pose_sigmas(
     """
     from scipy import sparse
 
+    seen = _in_front(seen)
     normal = _reduced(seen)
     images = len(seen.centers_m)
     size = 6 * images
@@ -89,6 +90,14 @@ def pose_sigmas(
     sigmas_m[unseen], sigmas_deg[unseen] = np.nan, np.nan
     sigmas_deg[sigmas_deg > _UNDETERMINED_DEG] = np.nan
     return sigmas_m, sigmas_deg
+
+
+def _in_front(seen: Observations) -> Observations:
+    """Without those of points that lie behind the image or nowhere: they say nothing, and one spoils all equations."""
+    away_m = seen.points_m[seen.point] - seen.centers_m[seen.image]
+    local = np.einsum("mij,mj->mi", seen.rotations[seen.image], away_m)
+    front = np.isfinite(local).all(axis=1) & (local[:, 2] > 0.0)
+    return seen if front.all() else replace(seen, image=seen.image[front], point=seen.point[front])
 
 
 def _levelling(seen: Observations, sigma_deg: float) -> sparse.csr_matrix:

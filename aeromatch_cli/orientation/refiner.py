@@ -31,7 +31,7 @@ from aeromatch_cli.orientation.adjusting import (
 )
 from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import quiet_pycolmap
-from aeromatch_cli.orientation.results import arrays, figures, image_numbers, sigmas_of, tracks_of
+from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, image_numbers, sigmas_of, tracks_of
 from aeromatch_cli.orientation.spread import take_poses, thinned
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
@@ -276,11 +276,12 @@ def _once_per_image(model: Any) -> None:
 
 
 def _drop_weak_points(model: Any) -> None:
-    """Points of two images hold only images that have few others."""
+    """Points behind a camera or without a place, by errors that are up to date, go; those of two images hold only
+    images that have few others."""
     weak = _weak_images(model)
     for number, point in list(model.points3D.items()):
         seen = {element.image_id for element in point.track.elements}
-        if len(seen) < 3 and not seen & weak:
+        if not point.error < BEHIND_PX or (len(seen) < 3 and not seen & weak):
             model.delete_point3D(number)
 
 

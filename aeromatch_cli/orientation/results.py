@@ -16,7 +16,7 @@ from aeromatch_cli.orientation.precision import Observations, pose_sigmas
 # No coordinate of a keypoint is measured more exactly, in pixels.
 _LEAST_ERROR_PX = 0.03
 # Errors of points behind a camera are as large as a number can be.
-_BEHIND_PX = 1e6
+BEHIND_PX = 1e6
 
 
 def image_numbers(model: Any) -> list[int]:
@@ -94,18 +94,21 @@ def _error_px(model: Any) -> float:
     """Standard deviation of a keypoint's coordinate, from the residuals and what the unknowns have taken from them.
 
     Distances of normally distributed residuals have the mean sqrt(pi / 2) times the standard deviation of a coordinate.
+    Points behind a camera tell nothing.
     """
     coordinates = 2 * model.compute_num_observations()
     unknowns = 3 * model.num_points3D() + 6 * model.num_reg_images()
     taken = np.sqrt(coordinates / max(coordinates - unknowns, 1))
-    spread_px = model.compute_mean_reprojection_error() / np.sqrt(np.pi / 2.0)
+    points = [(point.error, len(point.track.elements)) for point in model.points3D.values() if point.error < BEHIND_PX]
+    errors_px, counts = np.array(points).reshape(-1, 2).T
+    spread_px = float(errors_px @ counts / max(counts.sum(), 1.0)) / np.sqrt(np.pi / 2.0)
     return max(float(spread_px * taken), _LEAST_ERROR_PX)
 
 
 def figures(model: Any) -> dict[str, Any]:
     """Counts and errors of a model, JSON-ready. Points behind a camera, whose errors are not finite, do not count."""
     errors_px = np.array([point.error for point in model.points3D.values()])
-    errors_px = errors_px[errors_px < _BEHIND_PX]
+    errors_px = errors_px[errors_px < BEHIND_PX]
     return {
         "images": model.num_reg_images(),
         "points": model.num_points3D(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
 
@@ -141,6 +142,7 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     return svg(axes.figure, label, "histogram", {"bar": titles})
 
 
+@lru_cache(maxsize=1 << 12)
 def evenly_chosen(count: int, limit: int) -> IntArray:
     """At most `limit` of the indices 0 .. count-1, evenly spaced, ends included."""
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, limit))).astype(np.int64))

@@ -323,9 +323,9 @@ def _settings_text(context: Context) -> str:
 
 
 def _adjusted_block(context: Context) -> AdjustedBlock | None:
-    """Of the last adjustment; None where it found no points."""
-    known = _facts(context, "adjust").get("points") and context.workspace.adjusted.is_file()
-    return read_adjusted(context.workspace.adjusted) if known else None
+    """With the points that final matches hold; None where the last adjustment found none."""
+    path = context.workspace.final_or_adjusted
+    return read_adjusted(path) if _facts(context, "adjust").get("points") and path.is_file() else None
 
 
 def _ground_figures(context: Context, adjusted: AdjustedBlock | None) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tile
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
-from aeromatch_cli.stages.rows import check_features, stale_image
+from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
 from aeromatch_cli.workspace import Workspace, opened_workspace, read_json
 
 # Partners that are listed one by one.
@@ -152,6 +152,10 @@ def _workspace(work: _Work) -> Shown:
             if stage == "filter":
                 states = ", ".join(f"{count} {state}" for state, count in found["facts"].get("pairs", {}).items())
                 lines.append(f"            {states}; {found['facts'].get('verified_matches', 0)} verified matches")
+            if stage == "consistency" and found["facts"].get("verified_matches") is not None:
+                keys = "dropped_matches", "rejected_pairs", "verified_matches"
+                gone, pairs, left = (found["facts"][key] for key in keys)
+                lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} matches are left")
     written = set(stages.get("export", {}).get("facts", {}))
     folders = sorted(workspace.export("x").parent.glob("[!.]*"))
     lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
@@ -168,7 +172,9 @@ def _stale(work: _Work) -> str:
     every = max(1, len(work.pairs) // _TRIED)
     for pair in work.pairs[::every]:
         entry = read_verified_row(work.workspace.verified(pair.image_id0)).get(pair.image_id1)
-        if entry is not None and (image_id := stale_image(work.workspace, pair.image_id0, entry)):
+        if entry is not None and (
+            image_id := stale_image(pair.image_id0, entry, partial(features_on_file, work.workspace))
+        ):
             return work.images[image_id].name
     return ""
 

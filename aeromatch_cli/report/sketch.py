@@ -36,8 +36,12 @@ def ground_sketch(
     heights = np.asarray(ground.height_m(places.reshape(-1, 2)), np.float64).reshape(height, width)
     points = np.dstack([places, heights])
     canvas, nearest = np.zeros((height, width, 4), np.uint8), np.full((height, width), _FARTHEST)
+    lowest_m = float(np.nanmin(heights))
     for image_id, picture in pictures.items():
-        _lay(context, image_id, picture, points, canvas, nearest)
+        pose = context.pose(image_id)
+        if pose is not None and pose.world_rotation is not None:
+            window = _around(points, pose.center_m, lowest_m)
+            _lay(context, image_id, picture, points[window], canvas[window], nearest[window])
     return canvas if canvas[..., 3].any() else None
 
 
@@ -49,14 +53,11 @@ def _lay(
     canvas: NDArray[np.uint8],
     nearest: FloatArray,
 ) -> None:
-    """Paint what an image shows of points_m (h, w, 3) where it is nearer, in flying heights aside, than `nearest`."""
+    """Paint what an image with an attitude shows of points_m (h, w, 3) where it is nearer, in flying heights aside,
+    than `nearest`."""
     import cv2
 
-    pose, image = context.pose(image_id), context.image_by_id[image_id]
-    if pose is None or pose.world_rotation is None:
-        return
-    window = _around(points_m, pose.center_m)
-    points_m, canvas, nearest = points_m[window], canvas[window], nearest[window]
+    pose, image = context.block.poses[image_id], context.image_by_id[image_id]
     aside = np.hypot(points_m[..., 0] - pose.center_m[0], points_m[..., 1] - pose.center_m[1])
     above = pose.center_m[2] - points_m[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -65,7 +66,7 @@ def _lay(
     if not len(rows):
         return
     camera = context.block.cameras[image.camera_id]
-    seen = project(camera, pose.world_rotation, pose.center_m, points_m[rows, columns])
+    seen = project(camera, np.asarray(pose.world_rotation), pose.center_m, points_m[rows, columns])
     scale = np.array([picture.shape[1] / image.width_px, picture.shape[0] / image.height_px])
     seen = (seen + 0.5) * scale - 0.5
     with np.errstate(invalid="ignore"):
@@ -80,10 +81,10 @@ def _lay(
     nearest[rows, columns] = distance[rows, columns]
 
 
-def _around(points_m: FloatArray, center_m: FloatArray) -> tuple[slice, slice]:
+def _around(points_m: FloatArray, center_m: FloatArray, lowest_m: float) -> tuple[slice, slice]:
     """Rows and columns of points_m (h, w, 3), x right and y up, that can be within _FARTHEST of a camera above them: an
-    image shows a small part of a large block."""
-    reach_m = _FARTHEST * max(0.0, float(center_m[2] - np.nanmin(points_m[..., 2])))
+    image shows a small part of a large block. lowest_m: of all their heights."""
+    reach_m = _FARTHEST * max(0.0, float(center_m[2]) - lowest_m)
     columns = np.searchsorted(points_m[0, :, 0], [center_m[0] - reach_m, center_m[0] + reach_m])
     rows = np.searchsorted(-points_m[:, 0, 1], [-center_m[1] - reach_m, -center_m[1] + reach_m])
     return slice(*rows.tolist()), slice(*columns.tolist())

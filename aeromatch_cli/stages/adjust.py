@@ -104,7 +104,7 @@ def _on_file(context: Context) -> Mapping[str, Any]:
 
 def _remove(context: Context) -> None:
     folder = context.workspace.orientation
-    for name in ("adjusted.json", "adjusted.npz", "orientation.csv"):
+    for name in ("adjusted.json", "adjusted.npz", "orientation.csv", context.workspace.final.name):
         with translated_os_errors(folder / name):
             (folder / name).unlink(missing_ok=True)
 

@@ -67,14 +67,14 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     },
     LearnedFeatures: lambda step, settings: {
         "simulate": NeighbourViews(),
-        "extract": Learned(keypoints=_keypoints(step, settings)),
+        "extract": Learned(keypoints=_keypoints(step, settings), precision=step.precision, device=step.device),
         "match": Bidirectional(ratio=0.9, guided=True),
     },
     LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
         "extract": Sift(keypoints=_keypoints(step, settings)),
-        "match": LightGlue(guided=True),
+        "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },
 }
 
@@ -84,8 +84,9 @@ class Evidence:
     """What steps have found of a pair.
 
     verified: matches. overlap: share of the image that the other one shows, of the image where it is larger. coverage:
-    share of the overlap's cells that verified matches lie in; both NaN where poses or ground are unknown. keypoints: of
-    the first step, in the image that has fewer. candidates: matches before verification.
+    share of the overlap's cells that verified matches lie in; both NaN where poses or ground are unknown, coverage also
+    where there is no overlap. keypoints: of the first step, in the image that has fewer. candidates: matches before
+    verification.
     """
 
     verified: int
@@ -99,9 +100,16 @@ class Evidence:
         """Whether one of the images has next to no keypoints."""
         return self.keypoints < _LEAST_MATCHES
 
+    @property
+    def apart(self) -> bool:
+        """Whether the images show different ground, by poses as well as matches."""
+        return self.overlap == 0.0 and self.verified < _LEAST_MATCHES
+
     def falls_short_of(self, step: Step) -> str:
         """Why the pair takes the step, "" where it need not."""
-        known = bool(np.isfinite(self.overlap))
+        if self.apart:
+            return ""
+        known = self.overlap > 0.0  # matches contradict an overlap of nothing
         share = self.overlap if known else 1.0
         promised = step.below_matches * share * min(1.0, share / _TYING_OVERLAP)
         least = max(_LEAST_MATCHES, round(promised * min(1.0, self.keypoints / _ENOUGH_KEYPOINTS)))
@@ -208,8 +216,13 @@ def further(context: Context) -> list[StepContext]:
     return [_further_step(context, recipe, reasons) for recipe in context.settings.cascade]
 
 
+def strategies_of(step: Step, settings: Settings) -> dict[str, Strategy]:
+    """Family -> strategy that a step takes instead of the settings' own."""
+    return _RECIPES[type(step)](step, settings)
+
+
 def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) -> StepContext:
-    changed = {"cascade": (), **_RECIPES[type(recipe)](recipe, context.settings)}
+    changed = {"cascade": (), **strategies_of(recipe, context.settings)}
     features_of = recipe.name if recipe.own_features else FIRST
     return _step(context, recipe.name, features_of, context.settings.model_copy(update=changed), reasons)
 
@@ -269,8 +282,9 @@ def _evidence(
     geometry = context.geometry(pair)
     points0, points1 = (np.concatenate([one[side] for one in found]) for side in range(2))
     shared, overlap, coverage = shared_cells(geometry), float("nan"), float("nan")
-    if shared is not None and shared.share > 0.0:
+    if shared is not None:
         overlap = shared.share
+    if shared is not None and overlap > 0.0:
         if shared.cells0.mean() >= shared.cells1.mean():
             coverage = covered_share(shared.cells0, geometry.camera0, points0)
         else:
@@ -287,7 +301,9 @@ def settled_by(context: Context, steps: Sequence[StepContext]) -> dict[Key, tupl
     answer: dict[Key, tuple[str, str]] = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
-        lacks = found[key].falls_short_of(last) if key in found else "not matched"
+        lacks = "not matched"
+        if key in found:
+            lacks = "no overlap by poses and matches" if found[key].apart else found[key].falls_short_of(last)
         needed = [s.name for s in steps[1:] if s.reasons.get(key, _BOTH_KNOWN) != _BOTH_KNOWN]
         answer[key] = ("", lacks) if lacks else (needed[-1] if needed else FIRST, "")
     return answer

@@ -25,7 +25,8 @@ def closing_lines(reports: Sequence[StageReport], names: Mapping[str, str]) -> l
             [f"not sound: {faults[0][0]}", *(words for words, _ in faults[1:])],
             [*(remedy for _, remedy in faults), *weak],
         )
-    whole = f"sound: all {count} images are connected and oriented" if count > 2 else "both images are connected"
+    oriented = " and oriented" if facts["adjust"].get("images", 0) == count else "; they are not oriented"
+    whole = f"sound: all {count} images are connected{oriented}" if count > 2 else "both images are connected"
     return _said([whole], weak)
 
 
@@ -37,7 +38,7 @@ def _said(first: Sequence[str], then: Sequence[str]) -> list[str]:
 def _faults(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[tuple[str, str]]:
     """What is wrong with the block as a whole, and what helps."""
     found = []
-    groups = facts["filter"]["components"]
+    groups = _final(facts)["components"]
     if len(groups) > 1:
         sizes = ", ".join(map(str, groups[:_NAMED])) + (", ..." if len(groups) > _NAMED else "")
         found.append(
@@ -67,10 +68,16 @@ def _faults(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[tuple[st
     return found
 
 
+def _final(facts: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The stage that says how the final matches connect the images."""
+    consistency: Mapping[str, Any] = facts.get("consistency", {})
+    return consistency if "components" in consistency else facts["filter"]
+
+
 def _weak(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
     """Images that hang loosely on a block."""
     lines = []
-    tied = facts["filter"]["weakly_tied"]
+    tied = _final(facts)["weakly_tied"]
     if tied:
         lines.append(f"weak: {_listed(tied, names)}, with fewer than {WEAK_MATCHES} verified matches")
     spread = facts.get("consistency", {}).get("spread", {})

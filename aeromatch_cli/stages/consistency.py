@@ -6,7 +6,7 @@ for all who read final results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -14,16 +14,18 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
 from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import check_sums, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
 from aeromatch_cli.orientation.alone import block_of_pair
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.orientation.remaining import without_dropped
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import Judged, select, verified_pairs
+from aeromatch_cli.stages.filter import Judged, select, summarise, verified_pairs
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
@@ -34,7 +36,7 @@ _NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 
 def run(context: Context) -> StageReport:
-    """Write dropped.npz where it is not up to date."""
+    """Write dropped.npz and final.npz where they are not up to date."""
     report = StageReport("consistency")
     recipe = context.settings.consistency
     adjusted = None
@@ -48,16 +50,16 @@ def run(context: Context) -> StageReport:
         report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}
         if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
             report.facts["remark"] = f"not done: match {context.settings.match.name} measures points without keypoints"
-        with translated_os_errors(path):
-            path.unlink(missing_ok=True)
+        for stale in (path, context.workspace.final):
+            with translated_os_errors(stale):
+                stale.unlink(missing_ok=True)
         return report.write(context.workspace)
     report.items = len(context.pairs)
     report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context))
     last = context.workspace.stage_report("consistency")
     if not context.overwrite and path.is_file() and last.is_file():
-        check_sums(path)
         before = read_json(last)
-        if before.get("fingerprint") == report.fingerprint:
+        if before.get("fingerprint") == report.fingerprint and _whole(context.workspace, before["facts"]):
             report.skipped, report.facts = report.items, before["facts"]
             return report.write(context.workspace)
     # A killed run must not leave what the report of an earlier one vouches for.
@@ -79,7 +81,11 @@ def run(context: Context) -> StageReport:
         if mask.any()
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
-    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, "spread": _spread(context, adjusted)}
+    block = _left_of(context, adjusted, entries)
+    _write_final(context.workspace, None if block is adjusted else block)
+    spread = _spread(context, block)
+    counts = {"points": len(adjusted.points_m), "points_left": len(block.points_m)}
+    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, **counts, "spread": spread}
     report.facts = {**_facts(context, entries), **known}
     report.done = report.items
     return report.write(context.workspace)
@@ -114,18 +120,54 @@ def _matched(
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:
-    """What is left of the verified entries."""
+    """What is left of the verified entries, and how it connects the images."""
     final = FinalEntries(context.workspace)
-    left = [final(pair.image_id0, entry) for pair, entry in entries]
-    counts = [
-        (len(before.matches.indices), len(after.matches.indices), after.verdict.state == "verified")
-        for (_, before), after in zip(entries, left, strict=True)
-    ]
+    left = [(pair, final.left(pair.image_id0, entry)) for pair, entry in entries]
+    judged = ((p.image_id0, p.image_id1, after.verdict.state, len(after.matches.indices)) for p, after in left)
+    facts = summarise(context, judged)
     return {
-        "verified_matches": sum(after for _, after, verified in counts if verified),
-        "dropped_matches": sum(before - after for before, after, _ in counts),
-        "rejected_pairs": sum(not verified for _, _, verified in counts),
+        "verified_matches": facts["verified_matches"],
+        "dropped_matches": sum(len(before.matches.indices) for _, before in entries) - facts["verified_matches"],
+        "rejected_pairs": facts["pairs"].get("rejected", 0),
+        "components": facts["components"],
+        "weakly_tied": facts["weakly_tied"],
     }
+
+
+def final_block(context: Context) -> AdjustedBlock | None:
+    """The adjusted block with those points and observations that final matches hold; None as for `adjusted_block`.
+    Of a workspace whose stage consistency is up to date."""
+    adjusted = adjust.adjusted_block(context)
+    path = context.workspace.final_or_adjusted
+    return adjusted if adjusted is None or path == context.workspace.adjusted else read_adjusted(path)
+
+
+def _whole(workspace: Workspace, facts: Mapping[str, Any]) -> bool:
+    """Whether the files that a report vouches for are there. Raises BrokenFileError where one is damaged."""
+    check_sums(workspace.dropped)
+    if workspace.final.is_file():
+        check_sums(workspace.final)
+    return "points_left" in facts and (workspace.final.is_file() or facts["points_left"] == facts["points"])
+
+
+def _write_final(workspace: Workspace, block: AdjustedBlock | None) -> None:
+    """None: all points of the adjusted block are left, and its own file tells them."""
+    path = workspace.final
+    if block is not None:
+        write_atomically(path, lambda stream: write_adjusted(stream, block))
+        return
+    with translated_os_errors(path):
+        path.unlink(missing_ok=True)
+
+
+def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[Pair, VerifiedEntry]]) -> AdjustedBlock:
+    """What final matches hold of a block. entries: all verified ones."""
+    final = FinalEntries(context.workspace)
+    pairs = (
+        (pair.image_id0, pair.image_id1, entry.matches.indices, final.kept(pair.image_id0, entry))
+        for pair, entry in entries
+    )
+    return without_dropped(adjusted, pairs)
 
 
 def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
@@ -163,7 +205,7 @@ def final_pairs(context: Context) -> Judged:
     """Judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block."""
     final = FinalEntries(context.workspace)
     for pair, entry in verified_pairs(context):
-        yield pair, final(pair.image_id0, entry)
+        yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs
 
 
 class FinalEntries:
@@ -176,19 +218,36 @@ class FinalEntries:
         self._workspace = workspace
         self._dropped, self._least = read_dropped(workspace.dropped)
 
-    def __call__(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
-        check_features(self._workspace, image_id0, entry)
+    def kept(self, image_id0: str, entry: VerifiedEntry) -> BoolArray:
+        """(M,) of an entry's matches: none where so few are left that the pair is rejected."""
+        keep = self._not_dropped(image_id0, entry)
+        if keep is None:
+            return np.ones(len(entry.matches.indices), dtype=bool)
+        return keep if keep.sum() >= self._least else np.zeros(len(keep), dtype=bool)
+
+    def _not_dropped(self, image_id0: str, entry: VerifiedEntry) -> BoolArray | None:
+        """(M,) of an entry's matches; None where none is dropped."""
         made_of, rows = self._dropped.get((image_id0, entry.image_id1), ("", None))
         if rows is None or made_of != entry.fingerprint:
-            return entry
+            return None
         keep = np.ones(len(entry.matches.indices), dtype=bool)
         keep[rows] = False
+        return keep
+
+    def __call__(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
+        check_features(self._workspace, image_id0, entry)
+        return self.left(image_id0, entry)
+
+    def left(self, image_id0: str, entry: VerifiedEntry) -> VerifiedEntry:
+        """The same of an entry whose matches are known to be of the present features."""
+        if (keep := self._not_dropped(image_id0, entry)) is None:
+            return entry
         left, verdict = select(entry.matches, keep), entry.verdict
         errors = None if verdict.errors_px is None else verdict.errors_px[keep]
         rejected = {**verdict.rejected, "consistency": int((~keep).sum())}
         verdict = replace(verdict, keep=np.ones(len(left.indices), dtype=bool), errors_px=errors, rejected=rejected)
         if len(left.indices) < self._least:
-            words = f"contradicts the adjusted block: {len(left.indices)} of {len(keep)} matches agree with it"
+            words = f"{len(left.indices)} of {len(keep)} matches are left: others contradict the block, or are unlikely"
             nothing = np.zeros(0, dtype=bool)
             rejected["consistency"] = len(keep)
             verdict = Verdict(nothing, "rejected", words, rejected=rejected)

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import file_digest, fingerprint
-from aeromatch_cli.stages.adjust import adjusted_block
-from aeromatch_cli.stages.consistency import final_pairs
+from aeromatch_cli.stages.consistency import final_block, final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint
@@ -23,11 +23,12 @@ log = logging.getLogger("aeromatch")
 
 @dataclass(frozen=True, eq=False)
 class ExportTask:
-    """One exporter and where it writes."""
+    """One exporter, where it writes, and the adjusted block that it writes."""
 
     exporter: Strategy
     context: Context
     folder: Path
+    adjusted: AdjustedBlock | None
 
 
 def run(context: Context) -> StageReport:
@@ -35,7 +36,7 @@ def run(context: Context) -> StageReport:
     report = StageReport("export")
     block = context.block
     context, outdated = with_current_pairs(context)
-    adjusted = adjusted_block(context)
+    adjusted = final_block(context)
     contents: list[Any] = [
         block.images,
         sorted(block.cameras.items()),
@@ -45,7 +46,7 @@ def run(context: Context) -> StageReport:
         block.origin_m,
         sorted(context.guessed_cameras),
         [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in context.pairs],
-        None if adjusted is None else file_digest(context.workspace.adjusted),
+        None if adjusted is None else file_digest(context.workspace.final_or_adjusted),
         file_digest(context.workspace.dropped) if context.workspace.dropped.is_file() else None,
     ]
     wanted = fingerprint(context.settings.export, contents)
@@ -65,7 +66,7 @@ def run(context: Context) -> StageReport:
     # A killed export must not be vouched for by the report of an earlier one.
     with translated_os_errors(last):
         last.unlink(missing_ok=True)
-    tasks = [ExportTask(e, context, f) for e, f in zip(context.settings.export, folders, strict=True)]
+    tasks = [ExportTask(e, context, f, adjusted) for e, f in zip(context.settings.export, folders, strict=True)]
     names = [exporter.name for exporter in context.settings.export]
     # In this process, one after the other: a task holds the whole context.
     alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
@@ -94,7 +95,7 @@ def _complete(workspace: Workspace) -> bool:
 
 
 def _run_task(task: ExportTask) -> dict[str, Any]:
-    contents = contents_of(task.context, adjusted_block(task.context), final_pairs)
+    contents = contents_of(task.context, task.adjusted, final_pairs)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
     files = [path.relative_to(task.folder).as_posix() for path in summary.files]
     return {"name": task.folder.name, **asdict(summary), "files": files}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -214,11 +214,12 @@ def verified_pairs(context: Context) -> Judged:
     """Judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again since,
     cannot leak."""
     row_id, row = "", dict[str, VerifiedEntry]()
+    features = cache(partial(rows.features_on_file, context.workspace))
     for pair in context.pairs:
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_verified_row(context.workspace.verified(pair.image_id0))
         entry = row.get(pair.image_id1)
-        if entry is not None and not rows.stale_image(context.workspace, pair.image_id0, entry):
+        if entry is not None and not rows.stale_image(pair.image_id0, entry, features):
             yield pair, entry
 
 

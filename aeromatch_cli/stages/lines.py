@@ -152,8 +152,10 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
         spread = facts["spread"].values()
         held, empty = (sum(row[place] for row in spread) for place in range(2))
         many = sorted(row[2] for row in spread)[len(spread) // 2]
+        lacking = f", none in {empty} that other images show" if empty else ""
+        left = f"{facts['points_left']} of {facts['points']} points are left, " if facts["points_left"] else ""
         lines.append(
-            f"          points in {held} ninths of the images (3 x 3 each), none in {empty} that other images show; "
+            f"          {left}in {held} ninths of the images (3 x 3 each){lacking}; "
             f"{many} points per image are seen by three or more (median)"
         )
     if "remark" in facts:
@@ -163,9 +165,10 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     rejected = facts["rejected_pairs"]
     pairs = f", all of {rejected} {'pair' if rejected == 1 else 'pairs'} among them" if rejected else ""
     expected = facts["expected_right"]
-    unlikely = "" if expected is None else " or are not likely to be right"
+    why = ["contradict the adjusted block"] if facts["points"] or expected is None else []
+    why += [] if expected is None else ["are not likely to be right"]
     right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
-    words = f"{facts['dropped_matches']} matches contradict the adjusted block{unlikely}{pairs}"
+    words = f"{facts['dropped_matches']} matches {' or '.join(why)}{pairs}"
     return [f"          {words}; {facts['verified_matches']} verified matches are left{right}", *lines]
 
 

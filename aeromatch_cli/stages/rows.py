@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
@@ -72,25 +73,28 @@ def missing(pairs: Sequence[PairTask], old: Mapping[str, E]) -> list[PairTask]:
 
 def features_of(workspace: Workspace, image_id0: str, image_id1: str) -> tuple[str, str]:
     """Fingerprints of the features on file: what an entry that is made now points into."""
-    first, second = (known_fingerprint(workspace.features(i)) or "" for i in (image_id0, image_id1))
-    return first, second
+    return features_on_file(workspace, image_id0), features_on_file(workspace, image_id1)
 
 
-def stale_image(workspace: Workspace, image_id0: str, entry: MatchEntry | VerifiedEntry) -> str:
+def features_on_file(workspace: Workspace, image_id: str) -> str:
+    """Fingerprint of an image's features, "" of none."""
+    return known_fingerprint(workspace.features(image_id)) or ""
+
+
+def stale_image(image_id0: str, entry: MatchEntry | VerifiedEntry, features: Callable[[str], str]) -> str:
     """The image whose features were made again after the pair was matched, so that its matches' numbers mean other
-    keypoints; "" where there is none."""
+    keypoints; "" where there is none. features: `features_on_file` of a workspace."""
     if entry.features == UNKNOWN:
         return ""
-    now = features_of(workspace, image_id0, entry.image_id1)
-    for image_id, made_of, present in zip((image_id0, entry.image_id1), entry.features, now, strict=True):
-        if present not in (made_of, ""):
+    for image_id, made_of in zip((image_id0, entry.image_id1), entry.features, strict=True):
+        if features(image_id) not in (made_of, ""):
             return image_id
     return ""
 
 
 def check_features(workspace: Workspace, image_id0: str, entry: MatchEntry | VerifiedEntry) -> None:
     """Raises WorkspaceError where an entry's matches point into features that are no longer there."""
-    if image_id := stale_image(workspace, image_id0, entry):
+    if image_id := stale_image(image_id0, entry, partial(features_on_file, workspace)):
         raise WorkspaceError(
             f"{workspace.root}: the keypoints of {image_id} were found again with other settings or inputs after it "
             "was matched, so that its matches no longer hold: run `aeromatch match` and then `aeromatch filter`, or "

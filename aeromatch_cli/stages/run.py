@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -171,7 +171,7 @@ def _makes(command: str, workspace: Workspace, path: Path) -> bool:
     stage = _MADE_BY.get(folder, "")
     if folder == "reports":
         stage = path.name.partition(".")[0]
-    elif path.name in (workspace.adjusted.name, workspace.dropped.name) and rest:
+    elif path.name in (workspace.adjusted.name, workspace.dropped.name, workspace.final.name) and rest:
         stage = "adjust"
     return stage in ("", "orient", "pairs", "enhance", "simulate", *_MAKES.get(command, ()))
 
@@ -308,20 +308,27 @@ def _result(command: str, context: Context, reports: list[StageReport], said: _S
         lines.append(f"{len(failures)} failed, listed in {context.workspace.failures}")
     facts = {
         "workspace": str(context.workspace.root),
-        "stages": {
-            r.part + r.stage: {
-                "items": r.items,
-                "done": r.done,
-                "skipped": r.skipped,
-                "failed": len(r.failures),
-                "seconds": r.seconds,
-                "facts": r.facts,
-            }
-            for r in reports
-        },
+        "stages": _stage_facts(reports),
         "failures": len(failures),
     }
     return Result(tuple(lines), facts, failures)
+
+
+def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
+    """By stage; those of the steps of a shard's cascade below the key `steps`, by step."""
+    found: dict[str, Any] = {}
+    for r in reports:
+        step = r.part.removeprefix("step ").removesuffix(": ")
+        stages = found.setdefault("steps", {}).setdefault(step, {}) if step else found
+        stages[r.stage] = {
+            "items": r.items,
+            "done": r.done,
+            "skipped": r.skipped,
+            "failed": len(r.failures),
+            "seconds": r.seconds,
+            "facts": r.facts,
+        }
+    return found
 
 
 def _all_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:

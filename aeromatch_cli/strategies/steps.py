@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from aeromatch_cli.nets.precision import DEVICE, Device, Precision
 from aeromatch_cli.strategies import Strategy
 
 _KEYPOINTS: int | None = Field(
@@ -63,6 +64,13 @@ class GuidedSearch(Step):
     below_matches: int = _below_matches(1500)
 
 
+_PRECISION: Precision = Field(
+    "auto",
+    description="Number type of the networks' layers; auto is bfloat16 where the processor has it. Results depend on "
+    "it: set it explicitly for shards on different processors.",
+)
+
+
 class LearnedFeatures(Step):
     """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search."""
 
@@ -72,6 +80,8 @@ class LearnedFeatures(Step):
     # pair; on easy ground (hills, suburb, sheffield, seneca) no pair has fewer.
     below_matches: int = _below_matches(1000)
     keypoints: int | None = _KEYPOINTS
+    precision: Precision = _PRECISION
+    device: Device = DEVICE
 
 
 class LiftedShadows(Step):
@@ -79,6 +89,8 @@ class LiftedShadows(Step):
 
     name: Literal["shadow"] = "shadow"
     keypoints: int | None = _KEYPOINTS
+    precision: Precision = _PRECISION
+    device: Device = DEVICE
 
 
 STEPS: Mapping[str, type[Strategy]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}

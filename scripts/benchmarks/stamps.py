@@ -13,6 +13,7 @@ from aeromatch_cli.config import FAMILIES, Settings, load
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.stages import adjust, consistency, orient
+from aeromatch_cli.stages.cascade import strategies_of
 from aeromatch_cli.stages.versions import PIPELINE_VERSION
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
@@ -95,12 +96,16 @@ def trained_on(versions: Iterable[str]) -> list[str]:
 
 
 def of_settings(*every: Settings, families: Collection[str] = tuple(FAMILIES)) -> dict[str, Version]:
-    """Versions of the pipeline, of all strategies of these families, and of their networks."""
+    """Versions of the pipeline, of all strategies of these families, of those of a cascade's steps, and of their
+    networks."""
     found: dict[str, Version] = {"pipeline": PIPELINE_VERSION} if every else {}
     for settings in every:
         for family in families:
             value = getattr(settings, family)
             found |= of_strategies(family, *(value if isinstance(value, tuple) else (value,)))
+        for step in settings.cascade if "cascade" in families else ():
+            for family, strategy in strategies_of(step, settings).items():
+                found |= of_strategies(family, strategy)
     return found
 
 
