@@ -47,7 +47,7 @@ def settled_words(facts: Mapping[str, Any]) -> str:
     by, lacking = facts["settled_by"], facts["not_settled"]
     whole = sum(by.values()) + lacking
     counts = ", ".join(f"{count} by {name}" for name, count in by.items())
-    lack = f"; {lacking} with fewer matches than their overlap promises" if lacking else ""
+    lack = f"; {lacking} with fewer matches, or less of the overlap covered, than asked for" if lacking else ""
     return f"of {whole} pairs settled: {counts}{lack}"
 
 
