@@ -87,8 +87,8 @@ def contradicting(
     cameras: image_id -> adjusted camera. A match contradicts the block where it lies beside the epipolar line, where
     its rays meet behind a camera, or where more of the keypoints that its two keypoints are matched with in third
     images lie beside the place of its point there than lie on it; see also `Limits`. Groups of images that no point
-    connects have a frame each, less exact than matches: pairs between them are not judged by the block. How probable
-    their matches are is judged by the pair alone.
+    connects have a frame each, less exact than matches: pairs between them are not judged. Of a pair that comes with
+    its own geometry, as the block lacks one of its images, the matches are judged by that.
     """
     settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
     found = [
