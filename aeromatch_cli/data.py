@@ -79,6 +79,11 @@ class AdjustedBlock:
     tracks: Mapping[str, IntArray]
     frames: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def observations(self) -> int:
+        """Of points by images."""
+        return sum(len(track) for track in self.tracks.values())
+
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:

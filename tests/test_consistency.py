@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from conftest import PAGE, Site
 from test_control import adjusted_truth, cameras
@@ -174,6 +175,10 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert facts["verified_matches"] == before - facts["dropped_matches"]
     assert stages["export"]["facts"]["colmap"]["verified_matches"] == facts["verified_matches"]
     assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
+    model = pycolmap.Reconstruction(done_site.work / "export" / "colmap" / "sparse")
+    assert model.num_points3D() == facts["points_left"] <= facts["points"]
+    assert model.compute_num_observations() == facts["observations_left"] < facts["observations"]
+    assert f"{facts['points_left']} of {facts['points']} points are left" in outcome.stdout
     spread = facts["spread"].values()
     assert all(0 < ninths <= 9 and 0 < points < 1000 for ninths, _, points in spread)
     assert all(ninths + empty <= 9 for ninths, empty, _ in spread)
@@ -186,7 +191,12 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     with sqlite3.connect(done_site.work / "export" / "colmap" / "database.db") as database:
         (rows,) = database.execute("SELECT COALESCE(SUM(rows), 0) FROM two_view_geometries").fetchone()
     assert rows == facts["verified_matches"]
+    final = done_site.work / "orientation" / "final.npz"
+    final.unlink()  # by somebody
+    assert done_site("run", "--set", "consistency.epipolar_px=0.3").done() == {"consistency": 10, "export": 1}
+    assert final.is_file()
     none = done_site("run", "--set", "consistency=none")
+    assert not final.exists()
     assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before
     assert not (done_site.work / "orientation" / "dropped.npz").exists()
     assert json.loads((done_site.work / "reports" / "consistency.json").read_text())["facts"]["dropped_matches"] == 0

@@ -208,8 +208,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
   `images_without_keypoints`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
-  `weakly_tied` (as of filter, of those that stay), `points` (of the adjusted block), `points_left` (that those that
-  stay hold),
+  `weakly_tied` (as of filter, of those that stay), `points`, `observations` (of the adjusted block), `points_left`,
+  `observations_left` (that those that stay hold),
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
   `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
   (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images

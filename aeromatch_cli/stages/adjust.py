@@ -120,12 +120,11 @@ def _write(context: Context, adjusted: AdjustedBlock, report: StageReport) -> No
 
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
-    observations = sum(len(track) for track in adjusted.tracks.values())
     control = _control(context, adjusted)
     return {
         "images": len(adjusted.poses),
         "points": len(adjusted.points_m),
-        "track_length": round(observations / max(1, len(adjusted.points_m)), 3),
+        "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
         "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
         "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in adjusted.poses.values()]),
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),

@@ -63,8 +63,9 @@ def run(context: Context) -> StageReport:
             report.skipped, report.facts = report.items, before["facts"]
             return report.write(context.workspace)
     # A killed run must not leave what the report of an earlier one vouches for.
-    with translated_os_errors(last):
-        last.unlink(missing_ok=True)
+    for stale in (last, context.workspace.final):
+        with translated_os_errors(stale):
+            stale.unlink(missing_ok=True)
     with context.executor.step("consistency"):
         of_ids = {**context.block.cameras, **adjusted.cameras}
         cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
@@ -82,9 +83,11 @@ def run(context: Context) -> StageReport:
     }
     write_atomically(path, lambda stream: write_dropped(stream, dropped, recipe.min_matches))
     block = _left_of(context, adjusted, entries)
-    _write_final(context.workspace, None if block is adjusted else block)
+    if block is not adjusted:
+        write_atomically(context.workspace.final, lambda stream: write_adjusted(stream, block))
     spread = _spread(context, block)
     counts = {"points": len(adjusted.points_m), "points_left": len(block.points_m)}
+    counts |= {"observations": adjusted.observations, "observations_left": block.observations}
     known = {"expected_right": found.expected_right, "doubtful": found.doubtful, **counts, "spread": spread}
     report.facts = {**_facts(context, entries), **known}
     report.done = report.items
@@ -147,17 +150,9 @@ def _whole(workspace: Workspace, facts: Mapping[str, Any]) -> bool:
     check_sums(workspace.dropped)
     if workspace.final.is_file():
         check_sums(workspace.final)
-    return "points_left" in facts and (workspace.final.is_file() or facts["points_left"] == facts["points"])
-
-
-def _write_final(workspace: Workspace, block: AdjustedBlock | None) -> None:
-    """None: all points of the adjusted block are left, and its own file tells them."""
-    path = workspace.final
-    if block is not None:
-        write_atomically(path, lambda stream: write_adjusted(stream, block))
-        return
-    with translated_os_errors(path):
-        path.unlink(missing_ok=True)
+    if "observations_left" not in facts:
+        return False  # of an earlier version
+    return workspace.final.is_file() == (facts["observations_left"] < facts["observations"])
 
 
 def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[Pair, VerifiedEntry]]) -> AdjustedBlock:
