@@ -33,7 +33,7 @@ def test_a_damaged_table_is_never_shown_as_a_result(done_site: Site, name: str) 
 
 @pytest.mark.parametrize(
     ("name", "command"),
-    [("orientation/adjusted.npz", "report"), ("verified/{0}.npz", "report"), ("matches/{0}.npz", "filter")],
+    [("orientation/final.npz", "report"), ("verified/{0}.npz", "report"), ("matches/{0}.npz", "filter")],
 )
 def test_a_command_leaves_what_it_cannot_make_again(done_site: Site, name: str, command: str) -> None:
     expected = contents(done_site.work)
