@@ -19,7 +19,8 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.placing import Placement, place
-from aeromatch_cli.orientation.results import centers_of, image_numbers, points_of
+from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, image_numbers, points_of
+from aeromatch_cli.orientation.spread import take_poses
 
 # A prior focal length is taken where the cost with it is larger by no more than this share, or by so
 # many times the mean of a residual: chance lowers it by one for every unknown. The share holds for twice the prior's
@@ -191,20 +192,22 @@ def _adjust(
 
     if distorted and few > unknown:  # their focal lengths first, without anybody's distortion
         _adjuster(pycolmap, model, used, positions_m, sigmas_m, unknown, False, tolerance).solve()
+    start = copy.deepcopy(model)
     cost = adjuster(model, False).solve().ceres_summary.final_cost
     own = {number: prior for number, prior in cameras.items() if int(number) not in held}
-    _prefer_prior_focal_lengths(model, own, cost, adjuster)
+    _prefer_prior_focal_lengths(model, start, own, cost, adjuster)
 
 
 def _prefer_prior_focal_lengths(
-    model: Any, priors: dict[str, Any], cost: float, adjuster: Callable[[Any, bool], Any]
+    model: Any, start: Any, priors: dict[str, Any], cost: float, adjuster: Callable[[Any, bool], Any]
 ) -> None:
     """Take focal lengths back towards their priors, as far as the pictures say little against the priors.
 
     Where all images look straight down on flat ground, any focal length goes with some flying height, and what an
     adjustment finds is chance. A prior far away is taken where the cost of an adjustment with it is nearly the same.
-    Nearer ones are weighed: the cost grows with the square of the distance, and the prior's with it. cost: of the model
-    as it is.
+    Nearer ones are weighed: the cost grows with the square of the distance, and the prior's with it. start: the model
+    before its adjustment: one with a far prior starts there, since points at the heights of another focal length end up
+    behind the images, where they cost nothing. cost: of the model as it is.
     """
     lenses = {number: model.cameras[int(number)] for number in priors if int(number) in model.cameras}
     away = {
@@ -215,16 +218,22 @@ def _prefer_prior_focal_lengths(
     moved = far or {number: priors[number] for number, sigmas in away.items() if sigmas > _NEAR}
     if not moved:
         return
-    trial = copy.deepcopy(model)
-    for number, prior in moved.items():
-        trial.cameras[int(number)].params = prior["params"]
+    trial = start if far else copy.deepcopy(model)
+    for number, camera in model.cameras.items():
+        trial.cameras[number].params = moved[str(number)]["params"] if str(number) in moved else camera.params
     spare = 2 * model.compute_num_observations() - 3 * model.num_points3D() - 6 * model.num_reg_images()
     most = max(away.values())
     same = max(_SAME_COST * (most if far else most**2), _CHANCE / max(spare, 1))
     rise = max(adjuster(trial, True).solve().ceres_summary.final_cost / cost - 1.0, 0.0)
-    if far and rise > same:
+    if far:
+        trial.update_point_3d_errors()
+        errors_px = np.array([point.error for point in trial.points3D.values()])
+        if rise <= same and np.median(errors_px) < BEHIND_PX:
+            take_poses(model, trial)
+            for number, point in trial.points3D.items():
+                model.points3D[number].xyz = point.xyz
         return
-    share = 1.0 if far else same / (same + rise)
+    share = same / (same + rise)
     for number, prior in moved.items():
         found = model.cameras[int(number)]
         found.params = found.params + share * (np.array(prior["params"]) - found.params)
