@@ -69,8 +69,8 @@ def test_without_attitudes_no_overlap_is_known() -> None:
             Evidence(599, float("nan"), float("nan"), MANY),
             "599 verified matches of 600 that are enough, overlap unknown",
         ),
-        # A quarter of 2000 keypoints, a quarter of the matches.
         (Evidence(30, 0.0, np.nan, MANY), "30 verified matches of 600 that are enough, no overlap predicted"),
+        # A quarter of 2000 keypoints, a quarter of the matches.
         (Evidence(75, 0.5, 0.9, 500), ""),
         (Evidence(74, 0.5, 0.9, 500), "74 verified matches of 75 that an overlap of 50 % promises"),
     ],

@@ -280,7 +280,6 @@ def _evidence(
     shared, overlap, coverage = shared_cells(geometry), float("nan"), float("nan")
     if shared is not None:
         overlap = shared.share
-    if shared is not None and overlap > 0.0:
         if shared.cells0.mean() >= shared.cells1.mean():
             coverage = covered_share(shared.cells0, geometry.camera0, points0)
         else:
