@@ -33,7 +33,13 @@ def truth() -> Truth:
 
 def matched(truth: Truth) -> list[MatchedKeypoints]:
     return [
-        MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified, np.full(len(p.verified), 0.5))
+        MatchedKeypoints(
+            p.pair.image_id0,
+            p.pair.image_id1,
+            p.verified,
+            np.full(len(p.verified), 0.5),
+            np.zeros(len(p.verified), bool),
+        )
         for p in truth.pairs
     ]
 

@@ -25,12 +25,13 @@ def without_dropped(adjusted: AdjustedBlock, pairs: Iterable[JudgedPair]) -> Adj
     ids = sorted(adjusted.tracks)
     first = dict(zip(ids, np.cumsum([0, *(len(adjusted.tracks[i]) for i in ids)]).tolist(), strict=False))
     point_of = np.concatenate([np.zeros(0, np.int64), *(adjusted.tracks[i][:, 1] for i in ids)]).astype(np.int64)
+    order = {i: np.argsort(track[:, 0], kind="stable") for i, track in adjusted.tracks.items()}
     lost = np.zeros(len(adjusted.points_m), dtype=bool)
     ties = [np.zeros((0, 2), np.int32)]
     for id0, id1, indices, kept in pairs:
         if id0 not in first or id1 not in first:
             continue
-        rows = [_rows(adjusted.tracks[i], indices[:, side]) for side, i in enumerate((id0, id1))]
+        rows = [_rows(adjusted.tracks[i], order[i], indices[:, side]) for side, i in enumerate((id0, id1))]
         nodes = np.column_stack([row + first[i] for row, i in zip(rows, (id0, id1), strict=True)])
         inside = (rows[0] >= 0) & (rows[1] >= 0)
         inside[inside] = point_of[nodes[inside, 0]] == point_of[nodes[inside, 1]]
@@ -45,9 +46,8 @@ def without_dropped(adjusted: AdjustedBlock, pairs: Iterable[JudgedPair]) -> Adj
     return _with(adjusted, ids, ~lost[point_of] | _in_largest(part, point_of, len(lost)))
 
 
-def _rows(track: IntArray, keypoints: IntArray) -> IntArray:
-    """Rows of a track (n, 2) that hold these keypoints (M,); -1 where it has none."""
-    order = np.argsort(track[:, 0], kind="stable")
+def _rows(track: IntArray, order: IntArray, keypoints: IntArray) -> IntArray:
+    """Rows of a track (n, 2) that hold these keypoints (M,); -1 where it has none. order: (n,) rows by keypoint."""
     found = np.searchsorted(track[order, 0], keypoints)
     rows = order[np.minimum(found, len(order) - 1)] if len(order) else np.full(len(keypoints), -1)
     known = track[rows, 0] == keypoints if len(order) else np.zeros(len(keypoints), dtype=bool)
