@@ -70,6 +70,11 @@ class Workspace:
         return self.root / "failures.csv"
 
     @property
+    def finished(self) -> Path:
+        """What a run that ended without a failure has left, to know whether anything has changed since."""
+        return self.root / "finished.json"
+
+    @property
     def orientation(self) -> Path:
         return self.root / "orientation"
 

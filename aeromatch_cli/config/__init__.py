@@ -2,10 +2,12 @@
 
 from aeromatch_cli.config.load import dump, load, parse_method, preset_names, validate
 from aeromatch_cli.config.merge import differing
+from aeromatch_cli.config.paths import PATH_KEYS
 from aeromatch_cli.config.schema import FAMILIES, BlockSettings, RunSettings, Settings
 
 __all__ = [
     "FAMILIES",
+    "PATH_KEYS",
     "BlockSettings",
     "RunSettings",
     "Settings",

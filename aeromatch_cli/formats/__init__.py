@@ -29,6 +29,13 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `ground_fingerprint`: of the setting that the ground comes from.
 - `files`: SHA-256 of the tables below, as they were written.
 
+### finished.json
+
+Written at the end of a run without a failure: `settings`, `program`, `inputs` and `files` are digests of the settings,
+of the program and its libraries, and of the size and times of every input and every file of the workspace; `stages`:
+items of each stage, and its facts where no report holds them. Where all are as they were, `aeromatch run` says at once
+that everything is up to date; anything else is looked into. May be deleted.
+
 ### images.csv
 
 One line per image: `image_id` (unique slug of the relative path), `name` (relative path), `width_px`, `height_px`,

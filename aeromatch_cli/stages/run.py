@@ -14,6 +14,7 @@ from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages import (
     adjust,
@@ -27,6 +28,7 @@ from aeromatch_cli.stages import (
     match,
     pairs,
     simulate,
+    unchanged,
     union,
 )
 from aeromatch_cli.stages.changes import changed_words
@@ -94,9 +96,16 @@ def execute(
         if command != "check" and (not settings.block.images or _there(settings)):
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
+            whole = command == "run" and part is None
+            inputs = unchanged.state_of_inputs(settings) if whole else {}
+            if not overwrite and unchanged.is_unchanged(Workspace(root), inputs):
+                return _unchanged(settings, _Said(say))
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
-                return _repairing(command, settings, executor, part, overwrite, _Said(say))
+                result = _repairing(command, settings, executor, part, overwrite, _Said(say))
+            if not result.failures:
+                unchanged.remember(Workspace(root), inputs, result.facts["stages"])
+            return result
         except BaseException as error:
             # Workers are stopped in the middle of what they write.
             if command != "check":
@@ -105,6 +114,19 @@ def execute(
                 words = f"cannot read {error.filename} ({error.strerror}): check its permissions"
                 raise WorkspaceError(words) from error
             raise
+
+
+def _unchanged(settings: Settings, said: _Said) -> Result:
+    """Of a whole run that has nothing to do."""
+    workspace = Workspace(Path(settings.workspace).absolute())
+    reports = unchanged.up_to_date_reports(workspace)
+    names = {image.image_id: image.name for image in read_images(workspace.images)}
+    block = next(report for report in reports if report.stage == "pairs")
+    for line in block.facts["summary"]:
+        said(line)
+    for warning in block.facts["warnings"]:
+        log.warning("warning: %s", warning)
+    return _result("run", settings, workspace, names, reports, (), said)
 
 
 def _without_empty_folder(root: Path, new: bool) -> None:
@@ -206,7 +228,11 @@ def _attempt(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
             "(`aeromatch run` does everything)"
         )
-    return _result(command, context, reports, said)
+    names = {image.image_id: image.name for image in context.block.images}
+    failures = _all_failures(command, context, reports)
+    return _result(
+        command, context.settings, context.workspace, names, reports, failures, said, part=context.shard is not None
+    )
 
 
 def _there(settings: Settings) -> bool:
@@ -252,19 +278,18 @@ def _run_all(context: Context) -> list[StageReport]:
 
 
 def _page(context: Context) -> StageReport:
-    page = _current_page(context)
+    page = None if context.overwrite else _current_page(context.workspace)
     if page is None:
         with context.executor.step("report"):
             page = report.run(context)
     return page
 
 
-def _current_page(context: Context, *, settings: bool = True) -> StageReport | None:
+def _current_page(workspace: Workspace, *, settings: bool = True) -> StageReport | None:
     """The page's report, where the page is as it was written and younger than everything that it tells of. settings:
     also than the list of settings, as which a run without the page differs from one with it."""
-    workspace = context.workspace
     own = workspace.stage_report("report")
-    if context.overwrite or not (workspace.report.is_file() and own.is_file()):
+    if not (workspace.report.is_file() and own.is_file()):
         return None
     if not whole_record(workspace.report_files):
         return None
@@ -289,25 +314,34 @@ def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
     return context, [features, match.run(context), filter.run(context)]
 
 
-def _result(command: str, context: Context, reports: list[StageReport], said: _Said) -> Result:
-    failures = _all_failures(command, context, reports)
-    lines = said.rest(reports[1].facts["summary"])
-    names = {image.image_id: image.name for image in context.block.images}
+def _result(
+    command: str,
+    settings: Settings,
+    workspace: Workspace,
+    names: Mapping[str, str],
+    reports: list[StageReport],
+    failures: tuple[tuple[str, str, str], ...],
+    said: _Said,
+    *,
+    part: bool = False,
+) -> Result:
+    """names: of the files, by image_id. part: of a shard."""
+    lines = said.rest(next(report for report in reports if report.stage == "pairs").facts["summary"])
     for stage in reports:
-        lines += stage_lines(stage, names, part=context.shard is not None)
-    if command == "run" and context.shard is None:
+        lines += stage_lines(stage, names, part=part)
+    if command == "run" and not part:
         lines += closing_lines(reports, names)
-    lines.append(f"workspace {context.workspace.root}")
+    lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
-        lines.append(f"report    {context.workspace.report}")
-    elif command == "run" and context.workspace.report.is_file() and _current_page(context, settings=False) is None:
-        lines.append(f"report    {context.workspace.report} is of an earlier run: `aeromatch report` makes it anew")
-    if command in ("run", "export") and context.shard is None:
-        lines += [f"export    {context.workspace.export(e.name)}" for e in context.settings.export]
+        lines.append(f"report    {workspace.report}")
+    elif command == "run" and workspace.report.is_file() and _current_page(workspace, settings=False) is None:
+        lines.append(f"report    {workspace.report} is of an earlier run: `aeromatch report` makes it anew")
+    if command in ("run", "export") and not part:
+        lines += [f"export    {workspace.export(e.name)}" for e in settings.export]
     if failures:
-        lines.append(f"{len(failures)} failed, listed in {context.workspace.failures}")
+        lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
     facts = {
-        "workspace": str(context.workspace.root),
+        "workspace": str(workspace.root),
         "stages": _stage_facts(reports),
         "failures": len(failures),
     }

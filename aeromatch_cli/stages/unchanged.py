@@ -1,0 +1,154 @@
+"""unchanged: a finished run of which nothing has changed since, so that the same command need not look into it.
+
+The record WORK/finished.json holds digests of the status (size, times of the last change of contents and of the file)
+of every input and every file of the workspace, and of the settings, the program and its libraries. Where all are the
+same, every stage is up to date. Anything else, and any failure, takes the long way, which looks at contents.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.config import PATH_KEYS, Settings, dump
+from aeromatch_cli.errors import BrokenFileError, ConfigError
+from aeromatch_cli.images.remote import is_remote
+from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.strategies import Strategy
+from aeromatch_cli.workspace import Workspace, read_json, write_json
+
+# Their arithmetic decides results.
+_LIBRARIES = ("numpy", "opencv-python-headless", "poselib", "pycolmap", "torch")
+# What readers of poses and cameras look for beside the file or folder that is named, and one folder above.
+_KINDS_BESIDE, _NAMES_BESIDE = (".bin", ".xml", ".xyz"), ("block.json", "world.json")
+
+
+def state_of_inputs(settings: Settings) -> dict[str, str]:
+    """Digests of what a run starts from; {} where that cannot be told, as images lie on another machine.
+
+    To be asked before anything is read: what is replaced while a run reads it is no longer what it was then.
+    """
+    if not settings.block.images or is_remote(settings.block.images):
+        return {}
+    root = Path(settings.workspace)
+    libraries = [f"{name} {library_version(name)}" for name in _LIBRARIES]
+    own = (path for path in _files_below(Path(__file__).parent.parent, ()) if path.suffix != ".pyc")
+    try:
+        inputs = sorted(set(_inputs(settings, root)))
+    except ConfigError:  # a file that a setting names is missing: the run itself says so
+        return {}
+    return {
+        "settings": _digest([dump(settings)]),
+        "program": _digest([*libraries, *_statuses(own)]),
+        "inputs": _digest(_statuses(inputs)),
+    }
+
+
+def is_unchanged(workspace: Workspace, inputs: dict[str, str]) -> bool:
+    """Whether the workspace is as the run from these inputs has left it, without a failure."""
+    if not inputs or not workspace.finished.is_file():
+        return False
+    try:
+        record = read_json(workspace.finished)
+    except BrokenFileError:
+        return False
+    return all(record.get(key) == value for key, value in {**inputs, "files": _state_of_files(workspace)}.items())
+
+
+def remember(workspace: Workspace, inputs: dict[str, str], stages: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write the record of a run that has ended without a failure. inputs: from before it began. stages: facts of its
+    stages, in order; those that their reports on file tell are not written once more."""
+    if not inputs:
+        return
+    told = {
+        stage: {"items": own["items"], "facts": None if own["facts"] == _told(workspace, stage) else own["facts"]}
+        for stage, own in stages.items()
+    }
+    write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
+
+
+def up_to_date_reports(workspace: Workspace) -> list[StageReport]:
+    """Reports of the stages of a run that is unchanged, which have made nothing."""
+    stages = read_json(workspace.finished)["stages"]
+    return [
+        StageReport(stage, items=own["items"], skipped=own["items"], facts=own["facts"] or _told(workspace, stage))
+        for stage, own in stages.items()
+    ]
+
+
+def _told(workspace: Workspace, stage: str) -> dict[str, Any]:
+    """Facts in the report of a stage; none without one."""
+    path = workspace.stage_report(stage)
+    return dict(read_json(path)["facts"]) if path.is_file() else {}
+
+
+def _inputs(settings: Settings, root: Path) -> Iterator[Path]:
+    block = settings.block
+    for key in PATH_KEYS:
+        path = Path(getattr(block, key) or os.devnull)
+        if path.is_dir():
+            yield from _files_below(path, [root])
+        elif path.is_file():
+            yield path
+            yield from path.parent.glob(f"{path.stem}.*")  # of a raster: its world file, its projection
+            yield from path.parent.glob(f"*{path.suffix}")  # of a table: those that belong to it
+            yield from _beside(path.parent)
+        if key != "images":
+            yield from _beside(path.parent.parent if path.is_file() else path.parent)
+    for strategy in _strategies(settings):
+        yield from (Path(name) for name in strategy.fingerprint_files())
+        for name, field in type(strategy).model_fields.items():
+            extra, value = field.json_schema_extra, getattr(strategy, name)
+            if isinstance(extra, dict) and extra.get("path") and value and Path(value).is_file():
+                yield Path(value)
+
+
+def _strategies(settings: Settings) -> Iterator[Strategy]:
+    for name in type(settings).model_fields:
+        value = getattr(settings, name)
+        yield from (one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Strategy))
+
+
+def _beside(folder: Path) -> Iterator[Path]:
+    found = folder.iterdir() if folder.is_dir() else ()
+    return (path for path in found if path.suffix.lower() in _KINDS_BESIDE or path.name in _NAMES_BESIDE)
+
+
+def _files_below(folder: Path, passed_over: Iterable[Path]) -> Iterator[Path]:
+    """All files, links followed, but of hidden folders and those passed over."""
+    visited = {os.path.realpath(path) for path in passed_over}
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(parent)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (Path(parent, name) for name in sorted(files))
+
+
+def _state_of_files(workspace: Workspace) -> str:
+    passing = {workspace.lock, workspace.finished}
+    return _digest(_statuses(path for path in _files_below(workspace.root, ()) if path not in passing))
+
+
+def _statuses(paths: Iterable[Path]) -> Iterator[str]:
+    """Name, size and times of each file; what cannot be asked is no file that was asked before."""
+    for path in paths:
+        try:
+            status = path.stat()
+        except OSError as error:
+            yield f"{path} {error.errno}"
+        else:
+            yield f"{path} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}"
+
+
+def _digest(lines: Iterable[str]) -> str:
+    digest = hashlib.sha256()
+    for line in lines:
+        digest.update(line.encode("utf-8", "surrogateescape") + b"\n")
+    return digest.hexdigest()

@@ -1,0 +1,129 @@
+"""A finished run of which nothing has changed is not looked into again; whatever changes takes the long way."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import PAGE, UNORIENTED, Site, invoke
+
+from aeromatch_cli.stages import pairs, unchanged
+from aeromatch_cli.workspace import read_json
+
+SETTINGS = UNORIENTED
+
+
+class LongWayError(Exception):
+    pass
+
+
+@pytest.fixture
+def no_long_way(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> Site:
+    """A finished site whose inputs cannot be read any more."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise LongWayError
+
+    monkeypatch.setattr(pairs, "prepare", refuse)
+    return done_site
+
+
+def test_the_same_command_again_says_the_same_without_reading_anything(
+    done_site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def said() -> list[str]:
+        """Without seconds."""
+        lines = invoke("run", "baseline", *done_site.options()).stdout.splitlines()
+        return [line.rpartition(",")[0] if line.endswith(" s") else line for line in lines]
+
+    (done_site.work / "finished.json").unlink()
+    before = said()
+    assert any(line.startswith("result") for line in before)
+    monkeypatch.setattr(pairs, "prepare", None)
+    assert said() == before
+    short = done_site("run")
+    assert short.code == 0
+    assert short.done() == {}
+    assert short.facts["stages"]["filter"]["facts"]["verified_matches"] > 100
+
+
+def _touched(site: Site) -> None:
+    os.utime(site.image(2), (1_700_000_000, 1_700_000_000))
+
+
+def _flipped(site: Site) -> None:
+    """A byte of a file of features, with the times of its contents as before."""
+    path = sorted((site.work / "features").iterdir())[0]
+    status, data = path.stat(), bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def _without_export(site: Site) -> None:
+    (site.work / "export" / "colmap" / "database.db").unlink()
+
+
+def _another_image(site: Site) -> None:
+    shutil.copy2(site.image(0), site.images / "zz.png")
+
+
+def _another_world(site: Site) -> None:
+    (site.root / "world.json").write_text("{}")
+
+
+def _damaged_record(site: Site) -> None:
+    (site.work / "finished.json").write_text("{")
+
+
+@pytest.mark.parametrize(
+    "change", [_touched, _flipped, _without_export, _another_image, _another_world, _damaged_record]
+)
+def test_what_changes_takes_the_long_way(no_long_way: Site, change: Callable[[Site], None]) -> None:
+    assert no_long_way("run").done() == {}
+    change(no_long_way)
+    with pytest.raises((LongWayError, AssertionError)):
+        no_long_way("run")
+
+
+@pytest.mark.parametrize("more", [("--set", "match.ratio=0.7"), ("--overwrite",), ("--shard", "1/2"), PAGE])
+def test_other_commands_take_the_long_way(no_long_way: Site, more: tuple[str, ...]) -> None:
+    with pytest.raises((LongWayError, AssertionError)):
+        no_long_way("run", *more)
+
+
+def test_a_version_of_a_library_takes_the_long_way(no_long_way: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unchanged, "library_version", lambda name: f"another {name}")
+    with pytest.raises((LongWayError, AssertionError)):
+        no_long_way("run")
+
+
+def test_a_run_with_failures_is_tried_again(site: Site) -> None:
+    site.image(1).write_bytes(site.image(1).read_bytes()[:2000])
+    assert site("run").code == 1
+    assert not (site.work / "finished.json").exists()
+
+
+def test_an_input_that_is_replaced_during_a_run_is_seen(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare = pairs.prepare
+
+    def replacing(*arguments: object, **more: object) -> object:
+        found = prepare(*arguments, **more)  # type: ignore[arg-type]
+        _touched(done_site)
+        return found
+
+    monkeypatch.setattr(pairs, "prepare", replacing)
+    (done_site.work / "finished.json").unlink()
+    done_site("run")
+    monkeypatch.setattr(pairs, "prepare", prepare)
+    assert done_site("run").done()
+
+
+def test_files_of_the_workspace_and_the_record_itself_do_not_count_as_inputs(done_site: Site, tmp_path: Path) -> None:
+    before = read_json(done_site.work / "finished.json")
+    (tmp_path / "site" / "run.log").write_text("of the shell")
+    done_site("run")
+    assert read_json(done_site.work / "finished.json") == before
