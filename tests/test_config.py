@@ -351,3 +351,12 @@ def test_parse_method() -> None:
     assert parse_method("fusion[enhance=none,match.ratio=0.7]") == ("fusion", ["enhance=none", "match.ratio=0.7"])
     with pytest.raises(ConfigError):
         parse_method("fusion[")
+
+
+def test_a_workspace_stands_for_its_settings(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(dump(load("baseline", ["extract.keypoints=321"])))
+    with pytest.raises(ConfigError, match="is a folder: give a folder of images"):
+        load(str(tmp_path))
+    (tmp_path / "block.json").write_text("{}")
+    assert load(str(tmp_path)).extract.keypoints == 321
+    assert load(str(tmp_path)).workspace == str(tmp_path)

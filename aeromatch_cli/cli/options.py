@@ -33,8 +33,8 @@ Config = Annotated[
     str | None,
     typer.Argument(
         metavar="CONFIG|PRESET",
-        help="Preset (auto, baseline, fusion, polar, oblique), or a YAML file. Default: auto; for a single stage the "
-        "settings that the workspace has.",
+        help="Preset (auto, baseline, fusion, polar, oblique), a YAML file, or a workspace, whose settings are taken. "
+        "Default: auto; for a single stage the settings that the workspace has.",
     ),
 ]
 Images = Annotated[

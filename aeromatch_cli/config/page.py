@@ -22,9 +22,10 @@ _HEADING = """\
 
 This page is made from the settings' own descriptions: `python -m aeromatch_cli.config.page > docs/configuration.md`.
 
-A configuration is a preset's name or a YAML file. A file holds only what differs from a preset: the one that its key
-`preset` names, `auto` if it names none. What neither sets has the default below;
-[configs/default.yaml](../configs/default.yaml) has all of them. Paths in a file are relative to that file.
+A configuration is a preset's name, a YAML file or a workspace, which stands for the settings in it. A file holds only
+what differs from a preset: the one that its key `preset` names, `auto` if it names none. What neither sets has the
+default below; [configs/default.yaml](../configs/default.yaml) has all of them. Paths in a file are relative to that
+file.
 
     aeromatch run fusion --images IMGS --poses poses.csv --workspace WORK --set extract.keypoints=12000
 

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.stages.context import Context
 
 # Longer side of the sketch, pixels.
 _SIDE_PX = 640
 # Ground that is seen from farther than this many flying heights aside is left out.
 _FARTHEST = 2.0
+# So much of its size is looked at around an image's footprint, whose border is found by a few rays.
+_MARGIN = 0.2
 
 
 def ground_sketch(
@@ -37,10 +40,11 @@ def ground_sketch(
     points = np.dstack([places, heights])
     canvas, nearest = np.zeros((height, width, 4), np.uint8), np.full((height, width), _FARTHEST)
     lowest_m = float(np.nanmin(heights))
+    footprints = block_footprints(context.block)
     for image_id, picture in pictures.items():
-        pose = context.pose(image_id)
-        if pose is not None and pose.world_rotation is not None:
-            window = _around(points, pose.center_m, lowest_m)
+        pose, footprint = context.pose(image_id), footprints.get(image_id)
+        if pose is not None and footprint is not None:
+            window = _around(points, pose.center_m, lowest_m, footprint.polygon_m)
             _lay(context, image_id, picture, points[window], canvas[window], nearest[window])
     return canvas if canvas[..., 3].any() else None
 
@@ -81,10 +85,16 @@ def _lay(
     nearest[rows, columns] = distance[rows, columns]
 
 
-def _around(points_m: FloatArray, center_m: FloatArray, lowest_m: float) -> tuple[slice, slice]:
-    """Rows and columns of points_m (h, w, 3), x right and y up, that can be within _FARTHEST of a camera above them: an
-    image shows a small part of a large block. lowest_m: of all their heights."""
+def _around(
+    points_m: FloatArray, center_m: FloatArray, lowest_m: float, footprint_m: FloatArray
+) -> tuple[slice, slice]:
+    """Rows and columns of points_m (h, w, 3), x right and y up, that lie about the footprint (N, 2) and within
+    _FARTHEST of a camera above them: an image shows a small part of a large block. lowest_m: of all their heights."""
     reach_m = _FARTHEST * max(0.0, float(center_m[2]) - lowest_m)
-    columns = np.searchsorted(points_m[0, :, 0], [center_m[0] - reach_m, center_m[0] + reach_m])
-    rows = np.searchsorted(-points_m[:, 0, 1], [-center_m[1] - reach_m, -center_m[1] + reach_m])
+    low_m, high_m = footprint_m.min(axis=0), footprint_m.max(axis=0)
+    margin_m = _MARGIN * (high_m - low_m)
+    low_m = np.maximum(low_m - margin_m, center_m[:2] - reach_m)
+    high_m = np.minimum(high_m + margin_m, center_m[:2] + reach_m)
+    columns = np.searchsorted(points_m[0, :, 0], [low_m[0], high_m[0]])
+    rows = np.searchsorted(-points_m[:, 0, 1], [-high_m[1], -low_m[1]])
     return slice(*rows.tolist()), slice(*columns.tolist())
