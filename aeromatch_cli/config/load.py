@@ -42,7 +42,7 @@ def _preset_folder() -> Path:
 
 
 def load(source: str, overrides: Sequence[str] = (), block: Mapping[str, Any] | None = None, **top: Any) -> Settings:
-    """Settings of a preset name, a YAML file or a workspace, with `--set` overrides and command-line block options on top.
+    """Settings of a preset name, a YAML file or a workspace, with `--set` overrides and options on top.
 
     overrides: "key.sub=value" texts. block, top: values from the command line; None means not given. Paths in a file
     are relative to that file, all others to the current folder.
@@ -100,7 +100,8 @@ def _merge_preset(tree: dict[str, Any], name: Any, origin: str) -> None:
 def _read_tree(source: str) -> tuple[dict[str, Any], str]:
     """Defaults with the differences of a preset or file merged in, and the source in words.
 
-    A workspace stands for its config.yaml. A file stands on a preset: the one that its key `preset` names, else the default preset.
+    A workspace stands for its config.yaml. A file stands on a preset: the one that its key `preset` names, else the
+    default preset.
     """
     tree: dict[str, Any] = Settings().model_dump(mode="json")
     path = Path(source)
