@@ -80,7 +80,7 @@ def test_surveyed_poses_are_held_against_single_wrong_ones(site: Site, rendered:
 
     site.rewrite_poses(change)
     outcome = site("orient", "--set", "orient=given")
-    assert f"wrong attitudes given and kept, as orient=given asks: {site.names()[1]} (1" in outcome.stdout
+    assert f"wrong attitudes given; kept, as orient=given asks: {site.names()[1]} (1" in outcome.stdout
     assert attitude_errors(site, rendered)[1] > 100.0
 
 

@@ -28,6 +28,7 @@ from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
+from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct
 from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirectional
 from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
@@ -50,6 +51,8 @@ _LEAST_MATCHES = 30
 _ENOUGH_KEYPOINTS = 2000
 # An image that no step has tied yet may show another place. So many partners, those with most matches, tell.
 _TRIED_PARTNERS = 3
+# Matches of two steps that are nearer than this in both images are one.
+SAME_MATCH_PX = 1.0
 # Largest number of descriptors of features that are slow to make, unless a step's settings say another.
 _SLOW_KEYPOINTS = 4000
 
@@ -84,10 +87,10 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
 class Evidence:
     """What steps have found of a pair.
 
-    verified: matches. overlap: share of the image that the other one shows, of the image where it is larger. coverage:
-    share of the overlap's cells that verified matches lie in; both NaN where poses or ground are unknown, coverage also
-    where there is no overlap. keypoints: of the first step, in the image that has fewer. candidates: matches before
-    verification.
+    verified: matches, those of two steps in one place once. overlap: share of the image that the other one shows, of
+    the image where it is larger. coverage: share of the overlap's cells that verified matches lie in; both NaN where
+    poses or ground are unknown, coverage also where there is no overlap. keypoints: of the first step, in the image
+    that has fewer. candidates: matches before verification.
     """
 
     verified: int
@@ -294,6 +297,10 @@ def _evidence(
     """found: verified places of either image, by step."""
     geometry = context.geometry(pair)
     points0, points1 = (np.concatenate([one[side] for one in found]) for side in range(2))
+    if len(found) > 1:
+        places = np.column_stack([points0, points1]).astype(np.float64)
+        once = distinct(places, np.zeros(len(places)), SAME_MATCH_PX)
+        points0, points1 = points0[once], points1[once]
     shared, overlap, coverage = shared_cells(geometry), float("nan"), float("nan")
     if shared is not None:
         overlap = shared.share

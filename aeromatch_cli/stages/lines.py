@@ -97,8 +97,8 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
     for what, unit in (("wrong_attitudes", "degrees"), ("wrong_positions", "m")):
         if facts[what]:
             named = _listed([f"{names[i]} ({value:.0f} {unit})" for i, value in facts[what].items()])
-            done = "kept, as orient=given asks" if facts["stays"] else "corrected"
-            words.append(f"{what.replace('_', ' ')} given and {done}: {named}")
+            done = "kept, as orient=given asks" if facts["stays"] else "those that the pictures give are used"
+            words.append(f"{what.replace('_', ' ')} given; {done}: {named}")
     if facts["outside"]:
         words.append(f"not oriented: {_listed([names[i] for i in facts['outside']])}")
     return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]

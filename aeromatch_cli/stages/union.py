@@ -38,8 +38,6 @@ from aeromatch_cli.workspace import Workspace, write_atomically, write_text
 VERSION = 1
 # Keypoints of two steps that are nearer than this are one.
 SAME_PX = 0.5
-# Matches that are nearer than this in both images are one.
-_SAME_MATCH_PX = 1.0
 
 Key = tuple[str, str]
 
@@ -282,7 +280,7 @@ def joined_matches(
     places = np.concatenate(
         [keypoints0.keypoints_px[pairs[kept, 0]], keypoints1.keypoints_px[pairs[kept, 1]]], axis=1, dtype=np.float64
     )
-    kept = kept[distinct(places, cost[kept], _SAME_MATCH_PX)]
+    kept = kept[distinct(places, cost[kept], cascade.SAME_MATCH_PX)]
     kept = kept[np.argsort(pairs[kept, 0], kind="stable")]
     return Matches(pairs[kept].astype(np.int32), np.concatenate(scores)[kept], np.concatenate(views)[kept])
 
