@@ -16,13 +16,16 @@ from read_html import Structure, shapes
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
+from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
+from aeromatch_cli.report import gathering
 from aeromatch_cli.report import page as report
-from aeromatch_cli.report.pair_viewer import PairTables
+from aeromatch_cli.report.gathering import Gathered, gather
+from aeromatch_cli.report.pair_viewer import pair_table
 from aeromatch_cli.report.previews import chosen_previews
-from aeromatch_cli.report.rows import ImageRow, PairRow, gather, stage_rows
+from aeromatch_cli.report.rows import ImageRow, PairRow, stage_rows
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace, write_atomically, write_json
@@ -153,7 +156,8 @@ def row_with(page: str, table: str, *cells: str) -> list[str]:
 
 
 def test_rows_hold_the_numbers_of_the_workspace(full):
-    pairs, images = gather(full)
+    found = gather(full)
+    pairs, images = found.pairs, found.images
     assert [(p.image_id0, p.image_id1, p.state, p.matches_in, p.verified) for p in pairs] == [
         ("a", "b", "verified", 80, 60),
         ("a", "c", "rejected", 12, 0),
@@ -175,10 +179,25 @@ def test_rows_hold_the_numbers_of_the_workspace(full):
     assert [(i.views, i.shadow) for i in images] == [(None, None)] * 4
 
 
+def test_several_processes_gather_the_same(full, monkeypatch):
+    whole = gather(full, pair_table)
+    assert set(whole.drawn) == {("a", "b"), ("b", "c")}
+    monkeypatch.setattr(gathering, "_FEW_PAIRS", 1)
+    with Executor("processes", 2) as executor:
+        parts = gather(replace(full, executor=executor), pair_table)
+    assert vars(parts).keys() == vars(whole).keys()
+    for one, other in zip(whole.pairs + whole.images, parts.pairs + parts.images, strict=True):
+        np.testing.assert_equal(vars(other), vars(one))
+    assert parts.drawn == whole.drawn
+    full.workspace.verified("b").write_bytes(b"damaged")
+    with Executor("processes", 2) as executor, pytest.raises(BrokenFileError, match=r"b\.npz"):
+        gather(replace(full, executor=executor), pair_table)
+
+
 def test_images_tell_their_views_and_shadow(full):
     write_json(full.workspace.views("b"), {"views": [{"name": "source"}, {"name": "ground"}]})
     write_json(full.workspace.enhanced("b", ".json"), {"shadow_share": 0.34, "fingerprint": "x"})
-    of_b = gather(full)[1][1]
+    of_b = gather(full).images[1]
     assert (of_b.views, of_b.shadow) == (2, 0.34)
 
 
@@ -358,7 +377,7 @@ def test_large_block_stays_a_small_page(tmp_path):
         if k + step < 1000
     ]
     rows = [ImageRow(i, f"{i[:-4]}.jpg", "", "full", 4000, 20, 14, 5000, 0.8) for i in ids]
-    page = report.render(large, pairs, rows, PairTables(large))
+    page = report.render(large, Gathered(pairs, rows, {}))
     Structure.of(page)
     assert len(page.encode()) < 3_000_000
     assert page.count("<tr>") < 3100

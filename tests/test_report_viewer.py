@@ -16,8 +16,8 @@ from PIL import Image as PilImage
 from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a fixture
 
 from aeromatch_cli.report import pair_viewer, thumbnails
+from aeromatch_cli.report.gathering import gather
 from aeromatch_cli.report.pair_viewer import PairData
-from aeromatch_cli.report.rows import gather
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.stages.context import Context
 
@@ -30,14 +30,12 @@ def stored(page: str) -> dict[str, object]:
 
 
 def pair_data(context: Context) -> tuple[PairData, dict[tuple[str, str], str]]:
-    tables = pair_viewer.PairTables(context)
-    rows, _ = gather(context, tables.add)
-    return pair_viewer.pair_data(context, rows, thumbnails.thumbnails(context), tables)
+    found = gather(context, pair_viewer.pair_table)
+    return pair_viewer.pair_data(context, found.pairs, thumbnails.thumbnails(context), found.drawn)
 
 
 def test_tables_made_while_pairs_are_gathered_are_those_of_their_files(full: Context) -> None:  # noqa: F811
-    nothing = pair_viewer.PairTables(full)
-    again = pair_viewer.pair_data(full, gather(full)[0], thumbnails.thumbnails(full), nothing)
+    again = pair_viewer.pair_data(full, gather(full).pairs, thumbnails.thumbnails(full), {})
     assert again == pair_data(full)
 
 

@@ -22,8 +22,9 @@ from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
+from aeromatch_cli.report.gathering import Gathered, gather
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
-from aeromatch_cli.report.pair_viewer import PairTables, pair_data
+from aeromatch_cli.report.pair_viewer import pair_data, pair_table
 from aeromatch_cli.report.places import ground_figures, point_figures
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
 from aeromatch_cli.report.rows import (
@@ -32,7 +33,6 @@ from aeromatch_cli.report.rows import (
     PairRow,
     evaluation_figures,
     failure_rows,
-    gather,
     stage_rows,
 )
 from aeromatch_cli.report.sketch import ground_sketch
@@ -65,9 +65,9 @@ class Notice:
 def run(context: Context) -> StageReport:
     """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
     report = StageReport("report", items=1)
-    tables = PairTables(context)
-    pairs, images = gather(context, tables.add)
-    page = render(context, pairs, images, tables)
+    found = gather(context, pair_table)
+    pairs, images = found.pairs, found.images
+    page = render(context, found)
     write_text(context.workspace.report, page)
     record = context.workspace.report_files
     folder = record.parent
@@ -79,10 +79,11 @@ def run(context: Context) -> StageReport:
     return report.write(context.workspace)
 
 
-def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow], tables: PairTables) -> str:
-    """The page as text. tables: what the pair viewer draws of the verified pairs."""
+def render(context: Context, found: Gathered) -> str:
+    """The page as text."""
     import jinja2
 
+    pairs, images = found.pairs, found.images
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -99,7 +100,7 @@ def render(context: Context, pairs: Sequence[PairRow], images: Sequence[ImageRow
     adjusted = _adjusted_block(context) if any(row.state == "verified" for row in pairs) else None
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context)
-    drawn, keys = pair_data(context, pairs, pictures, tables)
+    drawn, keys = pair_data(context, pairs, pictures, found.drawn)
     drawn.write_beside(context.workspace.report.parent / "pairs")
     return template.render(
         version=__version__,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -60,42 +60,30 @@ def _json(value: object) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-class PairTables:
-    """What is drawn of the verified pairs; `gather` has it made while it reads them."""
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-        self.by_pair: dict[tuple[str, str], str] = {}
-
-    def add(self, row: PairRow, places: tuple[FloatArray, FloatArray], errors_px: FloatArray | None) -> None:
-        """Stored pixels (M, 2) of a pair's matches in either image, errors (M,) in pixels."""
-        ids = row.image_id0, row.image_id1
-        self.by_pair[ids] = _table(self._context, ids, places, errors_px)
-
-
 def pair_data(
-    context: Context, rows: Sequence[PairRow], pictures: Thumbnails, tables: PairTables
+    context: Context, rows: Sequence[PairRow], pictures: Thumbnails, tables: Mapping[tuple[str, str], str]
 ) -> tuple[PairData, dict[tuple[str, str], str]]:
-    """What can be drawn of the pairs, and under which key of PairData.pairs each is. tables: of verified pairs; those
-    of rejected ones are made here."""
+    """What can be drawn of the pairs, and under which key of PairData.pairs each is. tables: `pair_table` of verified
+    pairs; those of rejected ones are made here."""
     data = PairData()
     number_of = {image_id: number for number, image_id in enumerate(pictures)}
     for image_id in pictures:
         data.names.append(context.image_by_id[image_id].name)
         data.pictures.append(pictures.link(image_id))
-    drawn = DrawnMatches(context.workspace)
+    drawn, images = DrawnMatches(context.workspace), context.image_by_id
     keys: dict[tuple[str, str], str] = {}
     # One row of files after the other: each is read once.
     for row in sorted(drawable(rows), key=lambda row: (row.image_id0, row.image_id1)):
         ids = row.image_id0, row.image_id1
         if ids[0] in number_of and ids[1] in number_of:
-            if ids not in tables.by_pair:
+            table = tables.get(ids)
+            if table is None:
                 try:
-                    tables.add(row, *drawn.of(row))
+                    table = pair_table((images[ids[0]], images[ids[1]]), *drawn.of(row))
                 except WorkspaceError:
                     continue  # its files have gone: the row stays, without a picture
             keys[ids] = f"{number_of[ids[0]]},{number_of[ids[1]]}"
-            data.pairs[keys[ids]] = (tables.by_pair[ids], int(row.verified), int(row.matches_in or 0), row.state)
+            data.pairs[keys[ids]] = (table, int(row.verified), int(row.matches_in or 0), row.state)
     if pictures.beside:
         data.beside = sorted({int(key.partition(",")[0]) for key in data.pairs})
     return data, keys
@@ -106,12 +94,10 @@ def drawable(rows: Sequence[PairRow]) -> list[PairRow]:
     return [row for row in rows if row.matches_in and row.state in ("verified", "rejected")]
 
 
-def _table(
-    context: Context, ids: tuple[str, str], places: tuple[FloatArray, FloatArray], errors_px: FloatArray | None
-) -> str:
-    """Matches (M, 2) of either image as PairData.pairs has them."""
+def pair_table(images: tuple[Image, Image], places: tuple[FloatArray, FloatArray], errors_px: FloatArray | None) -> str:
+    """Matches, stored pixels (M, 2) in either image, and their errors (M,) in pixels, as PairData.pairs has them."""
     chosen = evenly_chosen(len(places[0]), MAX_MATCHES)
-    columns = [_steps(context.image_by_id[i], points[chosen]) for i, points in zip(ids, places, strict=True)]
+    columns = [_steps(image, points[chosen]) for image, points in zip(images, places, strict=True)]
     classes = error_classes(errors_px, len(places[0]))[chosen]
     table = np.column_stack([*columns, classes]).astype(np.uint8)
     return base64.b64encode(table.tobytes()).decode("ascii")

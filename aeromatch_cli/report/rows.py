@@ -7,32 +7,15 @@ Of reports/*.json every stage's counts and plain facts are shown as they are nam
 from __future__ import annotations
 
 import base64
-import os
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, TypeVar
-from urllib.parse import quote
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from aeromatch_cli.data import FloatArray, Image, Pair
-from aeromatch_cli.errors import WorkspaceError
-from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
-from aeromatch_cli.images.remote import RemoteFile
-from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.workspace import Workspace, read_json
 
-T = TypeVar("T")
-# Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
-COVERAGE_CELLS = 16
 NOT_JUDGED = "not judged"
 STAGE_ORDER = (
     "orient",
@@ -128,158 +111,6 @@ class EvaluationFigures:
     summary: Sequence[tuple[str, str]]
     pictures: Sequence[tuple[str, str]]
     outdated: bool
-
-
-# Gets a verified pair, stored pixels (M, 2) of its matches in either image, and errors (M,) in pixels.
-Visitor = Callable[[PairRow, tuple[FloatArray, FloatArray], FloatArray | None], None]
-
-
-class _Coverage:
-    """Which cells of every image hold a verified match."""
-
-    def __init__(self, context: Context) -> None:
-        self._images = context.image_by_id
-        self._workspace = context.workspace
-        self._keypoints_px: dict[str, FloatArray | None] = {}
-        self._seen: dict[str, NDArray[np.bool_]] = {}
-
-    def keypoints_px(self, image_id: str) -> FloatArray | None:
-        """(K, 2), or None where the image has no readable features."""
-        if image_id not in self._keypoints_px:
-            try:
-                self._keypoints_px[image_id] = read_keypoints(self._workspace.features(image_id))[0]
-            except WorkspaceError:
-                self._keypoints_px[image_id] = None
-        return self._keypoints_px[image_id]
-
-    def add(self, pair: Pair, entry: VerifiedEntry) -> tuple[FloatArray, FloatArray] | None:
-        """Mark the cells of both images that this pair's matches touch. Stored pixels (M, 2) of these in either image,
-        None where it has no readable features."""
-        keypoints0, keypoints1 = self.keypoints_px(pair.image_id0), self.keypoints_px(pair.image_id1)
-        if keypoints0 is None or keypoints1 is None:
-            return None
-        points = match_points(entry.matches, keypoints0, keypoints1)
-        for image_id, points_px in zip((pair.image_id0, pair.image_id1), points, strict=True):
-            image = self._images[image_id]
-            cells = np.floor((points_px + 0.5) * COVERAGE_CELLS / (image.width_px, image.height_px)).astype(np.int64)
-            cells = np.clip(cells, 0, COVERAGE_CELLS - 1)
-            seen = self._seen.setdefault(image_id, np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), dtype=bool))
-            seen[cells[:, 1], cells[:, 0]] = True
-        return points
-
-    def share(self, image_id: str) -> float | None:
-        if self.keypoints_px(image_id) is None:
-            return None
-        return float(self._seen[image_id].mean()) if image_id in self._seen else 0.0
-
-
-def gather(context: Context, visit: Visitor | None = None) -> tuple[list[PairRow], list[ImageRow]]:
-    """Pairs in the order of pairs.csv and images in the order of images.csv. visit: sees the verified pairs meanwhile,
-    as reading their files is what takes time."""
-    coverage = _Coverage(context)
-    judged: dict[tuple[str, str], PairRow] = {}
-    tied: Counter[str] = Counter()
-    matches: Counter[str] = Counter()
-    for pair, entry in final_pairs(context):
-        row = judged[pair.image_id0, pair.image_id1] = _pair_row(context, pair, entry)
-        if row.state == "verified":
-            points = coverage.add(pair, entry)
-            if visit is not None and points is not None:
-                visit(row, points, entry.verdict.errors_px)
-            tied.update((pair.image_id0, pair.image_id1))
-            matches.update({pair.image_id0: row.verified, pair.image_id1: row.verified})
-    pairs = [judged.get((p.image_id0, p.image_id1)) or _pair_row(context, p, None) for p in context.pairs]
-    steps = _steps(context)
-    for place, row in enumerate(pairs):
-        taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
-        pairs[place] = replace(row, steps=taken, step_reasons=reasons)
-    report = context.workspace.stage_report("consistency")
-    spread = read_json(report)["facts"].get("spread", {}) if report.is_file() else {}
-    proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
-    images = []
-    for image in context.block.images:
-        keypoints = coverage.keypoints_px(image.image_id)
-        images.append(
-            ImageRow(
-                image_id=image.image_id,
-                name=image.name,
-                href=_href(context, image),
-                pose=_pose_words(context, image),
-                keypoints=None if keypoints is None else len(keypoints),
-                pairs=proposed[image.image_id],
-                verified_pairs=tied[image.image_id],
-                verified_matches=matches[image.image_id],
-                coverage=coverage.share(image.image_id),
-                views=_fact(context.workspace.views(image.image_id), "views", len),
-                shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
-                **dict(zip(_SPREAD, spread.get(image.image_id, ()), strict=False)),
-            )
-        )
-    return pairs, images
-
-
-# The columns of the report of consistency.
-_SPREAD = "ninths", "empty_ninths", "points_of_three"
-
-
-def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:
-    """Which steps every pair took, and why; nothing without a cascade."""
-    if not context.settings.cascade or not context.workspace.steps.is_file():
-        return {}
-    rows = read_csv(context.workspace.steps)
-    return {
-        (row["image_id0"], row["image_id1"]): (row["steps"], "; ".join(filter(None, (row["reasons"], _lack(row)))))
-        for row in rows
-    }
-
-
-def _lack(row: Mapping[str, str]) -> str:
-    return f"in the end: {row['lacks']}" if row["lacks"] else ""
-
-
-def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:
-    """One fact of a JSON file of the workspace, None where the stage that writes it left none."""
-    facts = read_json(path) if path.is_file() else {}
-    return of(facts[key]) if key in facts else None
-
-
-def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:
-    names = (context.image_by_id[pair.image_id0].name, context.image_by_id[pair.image_id1].name)
-    known = (pair.image_id0, pair.image_id1, *names, pair.overlap, pair.view_angle_deg, pair.reason)
-    if entry is None:
-        words = "no matches of the present keypoints on file: run match and filter"
-        return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})
-    verdict = entry.verdict
-    errors = np.zeros(0) if verdict.errors_px is None else verdict.errors_px[np.isfinite(verdict.errors_px)]
-    return PairRow(
-        *known,
-        matches_in=entry.matches_in,
-        verified=len(entry.matches.indices) if verdict.state == "verified" else 0,
-        median_error_px=float(np.median(errors)) if len(errors) else float("nan"),
-        state=verdict.state,
-        reason=verdict.reason,
-        model_kind=verdict.model_kind,
-        rejects=verdict.rejected,
-    )
-
-
-def _pose_words(context: Context, image: Image) -> str:
-    pose = context.pose(image.image_id)
-    if pose is None:
-        return "none"
-    return "position" if pose.world_rotation is None else "full"
-
-
-def _href(context: Context, image: Image) -> str:
-    """Link from the report to the picture; "" where there is none (another drive on Windows, an object store)."""
-    if isinstance(context.picture(image), RemoteFile):
-        address = str(context.picture(image))
-        return address if address.startswith(("https://", "http://")) else ""
-    try:
-        relative = os.path.relpath(context.image_path(image), context.workspace.report.parent)
-    except ValueError:
-        return ""
-    return quote(Path(relative).as_posix())
 
 
 def stage_rows(workspace: Workspace) -> list[StageRow]:

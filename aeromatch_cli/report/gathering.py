@@ -1,0 +1,246 @@
+"""Pairs and images of the report: what became of each, read from the rows of files of the workspace.
+
+Reading the files is most of a large report's time: stretches of the pairs are read by several processes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import FloatArray, Image, Pair
+from aeromatch_cli.errors import WorkspaceError
+from aeromatch_cli.executor import Executor
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import VerifiedEntry
+from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.images.remote import RemoteFile
+from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
+from aeromatch_cli.stages.consistency import final_pairs
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.filter import match_points
+from aeromatch_cli.workspace import read_json
+
+T = TypeVar("T")
+# Coverage counts the cells of a grid of this many rows and columns that hold a verified match.
+COVERAGE_CELLS = 16
+# Fewer pairs are read faster than several processes take to begin.
+_FEW_PAIRS = 3000
+# Keypoints of so many images are at hand at a time.
+_IMAGES_AT_HAND = 512
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Pairs in the order of pairs.csv and images in the order of images.csv. drawn: of every verified pair, what `draw`
+    made of it."""
+
+    pairs: list[PairRow]
+    images: list[ImageRow]
+    drawn: dict[Key, str]
+
+
+# Makes what is drawn of a verified pair: both images, stored pixels (M, 2) of its matches in either, errors (M,) px.
+Draw = Callable[[tuple[Image, Image], tuple[FloatArray, FloatArray], FloatArray | None], str]
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Some of the pairs of a block: those of the context."""
+
+    context: Context
+    draw: Draw | None
+
+
+@dataclass(eq=False)
+class _Found:
+    """What files tell of a stretch. seen: image_id -> which cells hold a verified match. keypoints: image_id -> number,
+    None where an image has no readable features."""
+
+    rows: dict[Key, PairRow] = field(default_factory=dict)
+    drawn: dict[Key, str] = field(default_factory=dict)
+    seen: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    keypoints: dict[str, int | None] = field(default_factory=dict)
+
+    def add(self, other: _Found) -> None:
+        self.rows |= other.rows
+        self.drawn |= other.drawn
+        self.keypoints |= other.keypoints
+        for image_id, cells in other.seen.items():
+            self.seen[image_id] = self.seen[image_id] | cells if image_id in self.seen else cells
+
+    def mark(self, image: Image, points_px: FloatArray) -> None:
+        """The cells of an image that its matches (M, 2) touch."""
+        cells = np.floor((points_px + 0.5) * COVERAGE_CELLS / (image.width_px, image.height_px)).astype(np.int64)
+        cells = np.clip(cells, 0, COVERAGE_CELLS - 1)
+        seen = self.seen.setdefault(image.image_id, np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), dtype=bool))
+        seen[cells[:, 1], cells[:, 0]] = True
+
+
+def gather(context: Context, draw: Draw | None = None) -> Gathered:
+    """Everything about pairs and images. Raises WorkspaceError where a file is broken."""
+    found = _Found()
+    for stretch in _stretches(context, draw):
+        found.add(stretch)
+    pairs = [found.rows.get((p.image_id0, p.image_id1)) or _pair_row(context, p, None) for p in context.pairs]
+    steps = _steps(context)
+    for place, row in enumerate(pairs):
+        taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
+        pairs[place] = replace(row, steps=taken, step_reasons=reasons)
+    return Gathered(pairs, _image_rows(context, pairs, found), found.drawn)
+
+
+def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
+    jobs = context.executor.jobs
+    if jobs == 1 or len(context.pairs) < _FEW_PAIRS:
+        return [_read(Stretch(context, draw))]
+    alone = replace(context, executor=Executor("serial"))  # workers begin no workers
+    ends = np.linspace(0, len(context.pairs), 4 * jobs + 1).astype(int)
+    tasks = [Stretch(replace(alone, pairs=context.pairs[a:b]), draw) for a, b in itertools.pairwise(ends)]
+    outcomes = context.executor.run(_read, tasks, "report", [len(task.context.pairs) for task in tasks])
+    # What failed is tried here once more: only so does it say which file is broken.
+    return [outcome.value or _read(task) for outcome, task in zip(outcomes, tasks, strict=True)]
+
+
+def _read(stretch: Stretch) -> _Found:
+    context, found = stretch.context, _Found()
+
+    @lru_cache(maxsize=_IMAGES_AT_HAND)
+    def keypoints_px(image_id: str) -> FloatArray | None:
+        return _keypoints(context, image_id)
+
+    for pair, entry in final_pairs(context):
+        key = pair.image_id0, pair.image_id1
+        row = found.rows[key] = _pair_row(context, pair, entry)
+        if row.state != "verified":
+            continue
+        both = [keypoints_px(image_id) for image_id in key]
+        found.keypoints.update({i: None if one is None else len(one) for i, one in zip(key, both, strict=True)})
+        if both[0] is None or both[1] is None:
+            continue
+        points = match_points(entry.matches, both[0], both[1])
+        images = context.image_by_id[key[0]], context.image_by_id[key[1]]
+        for image, points_px in zip(images, points, strict=True):
+            found.mark(image, points_px)
+        if stretch.draw is not None:
+            found.drawn[key] = stretch.draw(images, points, entry.verdict.errors_px)
+    return found
+
+
+def _keypoints(context: Context, image_id: str) -> FloatArray | None:
+    """(K, 2), or None where the image has no readable features."""
+    try:
+        return read_keypoints(context.workspace.features(image_id))[0]
+    except WorkspaceError:
+        return None
+
+
+def _image_rows(context: Context, pairs: Sequence[PairRow], found: _Found) -> list[ImageRow]:
+    report = context.workspace.stage_report("consistency")
+    spread = read_json(report)["facts"].get("spread", {}) if report.is_file() else {}
+    proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
+    tied: Counter[str] = Counter()
+    matches: Counter[str] = Counter()
+    for row in pairs:
+        if row.state == "verified":
+            tied.update((row.image_id0, row.image_id1))
+            matches.update({row.image_id0: row.verified, row.image_id1: row.verified})
+    images = []
+    for image in context.block.images:
+        if image.image_id not in found.keypoints:
+            points = _keypoints(context, image.image_id)
+            found.keypoints[image.image_id] = None if points is None else len(points)
+        keypoints, seen = found.keypoints[image.image_id], found.seen.get(image.image_id)
+        images.append(
+            ImageRow(
+                image_id=image.image_id,
+                name=image.name,
+                href=_href(context, image),
+                pose=_pose_words(context, image),
+                keypoints=keypoints,
+                pairs=proposed[image.image_id],
+                verified_pairs=tied[image.image_id],
+                verified_matches=matches[image.image_id],
+                coverage=None if keypoints is None else 0.0 if seen is None else float(seen.mean()),
+                views=_fact(context.workspace.views(image.image_id), "views", len),
+                shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
+                **dict(zip(_SPREAD, spread.get(image.image_id, ()), strict=False)),
+            )
+        )
+    return images
+
+
+# The columns of the report of consistency.
+_SPREAD = "ninths", "empty_ninths", "points_of_three"
+
+
+def _steps(context: Context) -> dict[tuple[str, str], tuple[str, str]]:
+    """Which steps every pair took, and why; nothing without a cascade."""
+    if not context.settings.cascade or not context.workspace.steps.is_file():
+        return {}
+    rows = read_csv(context.workspace.steps)
+    return {
+        (row["image_id0"], row["image_id1"]): (row["steps"], "; ".join(filter(None, (row["reasons"], _lack(row)))))
+        for row in rows
+    }
+
+
+def _lack(row: Mapping[str, str]) -> str:
+    return f"in the end: {row['lacks']}" if row["lacks"] else ""
+
+
+def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:
+    """One fact of a JSON file of the workspace, None where the stage that writes it left none."""
+    facts = read_json(path) if path.is_file() else {}
+    return of(facts[key]) if key in facts else None
+
+
+def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:
+    names = (context.image_by_id[pair.image_id0].name, context.image_by_id[pair.image_id1].name)
+    known = (pair.image_id0, pair.image_id1, *names, pair.overlap, pair.view_angle_deg, pair.reason)
+    if entry is None:
+        words = "no matches of the present keypoints on file: run match and filter"
+        return PairRow(*known, 0, 0, float("nan"), NOT_JUDGED, words, "", {})
+    verdict = entry.verdict
+    errors = np.zeros(0) if verdict.errors_px is None else verdict.errors_px[np.isfinite(verdict.errors_px)]
+    return PairRow(
+        *known,
+        matches_in=entry.matches_in,
+        verified=len(entry.matches.indices) if verdict.state == "verified" else 0,
+        median_error_px=float(np.median(errors)) if len(errors) else float("nan"),
+        state=verdict.state,
+        reason=verdict.reason,
+        model_kind=verdict.model_kind,
+        rejects=verdict.rejected,
+    )
+
+
+def _pose_words(context: Context, image: Image) -> str:
+    pose = context.pose(image.image_id)
+    if pose is None:
+        return "none"
+    return "position" if pose.world_rotation is None else "full"
+
+
+def _href(context: Context, image: Image) -> str:
+    """Link from the report to the picture; "" where there is none (another drive on Windows, an object store)."""
+    if isinstance(context.picture(image), RemoteFile):
+        address = str(context.picture(image))
+        return address if address.startswith(("https://", "http://")) else ""
+    try:
+        relative = os.path.relpath(context.image_path(image), context.workspace.report.parent)
+    except ValueError:
+        return ""
+    return quote(Path(relative).as_posix())
