@@ -33,13 +33,7 @@ def truth() -> Truth:
 
 def matched(truth: Truth) -> list[MatchedKeypoints]:
     return [
-        MatchedKeypoints(
-            p.pair.image_id0,
-            p.pair.image_id1,
-            p.verified,
-            np.full(len(p.verified), 0.5),
-            np.zeros(len(p.verified), bool),
-        )
+        MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified, np.full(len(p.verified), 0.5))
         for p in truth.pairs
     ]
 

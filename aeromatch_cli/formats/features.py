@@ -72,12 +72,6 @@ def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8
     return arrays["keypoints_px"], arrays["sizes_px"], arrays.get("colours")
 
 
-def read_kinds(path: Path) -> NDArray[np.str_] | None:
-    """(K,) name of the first step that has found each keypoint; None of a file that is not of a cascade's steps."""
-    arrays = load_arrays(path, (), ("kinds", "kind_idx"))
-    return arrays["kinds"][arrays["kind_idx"]] if "kinds" in arrays else None
-
-
 def features_fingerprint(path: Path) -> str | None:
     """Fingerprint recorded in a feature file, None when the file is absent or any of its arrays is broken."""
     try:

@@ -65,21 +65,14 @@ class Contradictions:
 
 @dataclass(frozen=True, eq=False)
 class MatchedKeypoints:
-    """Verified matches of two images: keypoint indices (M, 2) and the matcher's scores (M,). learned: which (M,) are of
-    features that a network made. alone: both images placed by these matches, for where the block does not hold them;
-    None where that is not known."""
+    """Verified matches of two images: keypoint indices (M, 2) and the matcher's scores (M,). alone: both images placed
+    by these matches, for where the block does not hold them; None where that is not known."""
 
     image_id0: str
     image_id1: str
     indices: IntArray
     scores: FloatArray
-    learned: BoolArray
     alone: AdjustedBlock | None = None
-
-    def of(self, keep: BoolArray) -> MatchedKeypoints:
-        """Those of the matches (M,)."""
-        kept = {name: getattr(self, name)[keep] for name in ("indices", "scores", "learned")}
-        return replace(self, **kept)
 
 
 def contradicting(
@@ -160,13 +153,15 @@ class Settled:
         """Of every pair, what tells how probable the matches that do not contradict the block are, by each other alone;
         None where there are none."""
         kept = [
-            None if mask is None or mask.all() else pair.of(~mask)
+            None
+            if mask is None or mask.all()
+            else replace(pair, indices=pair.indices[~mask], scores=pair.scores[~mask])
             for pair, mask in zip(self.pairs, self.masks, strict=True)
         ]
         ends = [None if pair is None else self.view.keypoints_of(pair) for pair in kept]
         ties = _Ties.of(len(self.view.rays), [both for both in ends if both is not None])
         return [
-            None if pair is None or both is None else _of_pair(self.view, ties, *both, pair)
+            None if pair is None or both is None else _of_pair(self.view, ties, *both, pair.scores)
             for pair, both in zip(kept, ends, strict=True)
         ]
 
@@ -333,7 +328,7 @@ def _judged(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, limits: 
     return np.asarray((meeting.error_px > most_px) | meeting.behind | (2 * near < known))
 
 
-def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, pair: MatchedKeypoints) -> MatchEvidence:
+def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores: FloatArray) -> MatchEvidence:
     """Evidence of the matches (M,) of one pair, one at least."""
     meeting = _Meeting.of(view, ends0, ends1)
     _, confirming = meeting.in_third_images(view, ties, ends0, ends1, _CONFIRMING_PX)
@@ -341,8 +336,7 @@ def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, pair: M
     side0, side1 = (view.centers_m[image0], view.rays[ends0]), (view.centers_m[image1], view.rays[ends1])
     heights_m = meeting.points_m[:, 2]
     return MatchEvidence(
-        scores=np.asarray(pair.scores, dtype=np.float64),
-        learned=pair.learned,
+        scores=np.asarray(scores, dtype=np.float64),
         error_px=meeting.error_px,
         confirming=confirming,
         off0_px=off_neighbours_px(*side0, *side1, heights_m, float(view.focal_px[image1])),

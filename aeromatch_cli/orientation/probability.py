@@ -26,25 +26,21 @@ _LOOSE, _LEAST_LOOSE_PX = 1.5, 0.5
 _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
-# The column that tells matches of learned features from others.
-LEARNED = 6
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (4.5, 2.29, 0.95, -0.31, -1.3, -2.33, 0.0, 0.0)
+WEIGHTS = (4.53, 2.31, 0.99, -0.27, -1.32, -2.36)
 
 
 @dataclass(frozen=True, eq=False)
 class MatchEvidence:
     """What is known of the matches of a pair, (M,) each, one at least.
 
-    scores: the matcher's, 0-1. learned: which are of features that a network made: the ratio of their descriptors'
-    distances tells less than that of SIFT's. error_px: distance from the epipolar line of the adjusted block.
-    confirming: in how many third images their keypoints are matched within a pixel of the point's place. off0_px,
-    off1_px: how far the match lies from where it would be at the height of its neighbours (the second nearest of these
-    heights), with the neighbours in either image. angle_deg: between both rays.
+    scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. confirming: in how many
+    third images their keypoints are matched within a pixel of the point's place. off0_px, off1_px: how far the match
+    lies from where it would be at the height of its neighbours (the second nearest of these heights), with the
+    neighbours in either image. angle_deg: between both rays.
     """
 
     scores: FloatArray
-    learned: BoolArray
     error_px: FloatArray
     confirming: IntArray
     off0_px: FloatArray
@@ -92,9 +88,8 @@ def off_neighbours_px(
 
 
 def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
-    """(M, 8) what the model is linear in: one, score, confirmations by third images, angle between the rays, distance
-    from the neighbours' heights, how loose the whole pair is, and for learned features one and the score once more.
-    usual_px: `usual_off_px` of the block."""
+    """(M, 6) what the model is linear in: one, score, confirmations by third images, angle between the rays, distance
+    from the neighbours' heights, and how loose the whole pair is. usual_px: `usual_off_px` of the block."""
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
     off = evidence.off_px / unit_px
     tight_px = max(_LOOSE * usual_px, _LEAST_LOOSE_PX)
@@ -107,14 +102,12 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
             np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
             np.log2(1.0 + np.minimum(off, _MOST_OFF)),
             np.full(len(off), loose),
-            evidence.learned,
-            np.where(evidence.learned, evidence.scores, 0.0),
         ]
     ).astype(np.float64)
 
 
 def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities of matches with such `columns` (M, 8)."""
+    """(M,) probabilities of matches with such `columns` (M, 6)."""
     return _logistic(values @ np.array(WEIGHTS))
 
 
@@ -124,7 +117,7 @@ def probabilities(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 8) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = _logistic(values @ weights)

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair
-from aeromatch_cli.formats.features import read_keypoints, read_kinds
+from aeromatch_cli.data import FloatArray, Pair
+from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.geometry.coverage import covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
@@ -34,7 +34,6 @@ from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows, Step
-from aeromatch_cli.workspace import Workspace
 
 # The first step of every cascade.
 FIRST = "first"
@@ -219,22 +218,6 @@ def further(context: Context) -> list[StepContext]:
 def strategies_of(step: Step, settings: Settings) -> dict[str, Strategy]:
     """Family -> strategy that a step takes instead of the settings' own."""
     return _RECIPES[type(step)](step, settings)
-
-
-def learned_matches(settings: Settings, workspace: Workspace) -> Callable[[str, str, IntArray], BoolArray]:
-    """Which matches (M,) of two images, by their keypoints (M, 2) of the workspace, have one that a network made."""
-    extractors = {step.name: strategies_of(step, settings).get("extract") for step in settings.cascade}
-    learned = [name for name, extractor in extractors.items() if extractor is not None and extractor.network]
-
-    @cache
-    def of_image(image_id: str) -> BoolArray:
-        path = workspace.features(image_id)
-        kinds = read_kinds(path)
-        if kinds is None:
-            return np.full(len(read_keypoints(path)[0]), settings.extract.network)
-        return np.isin(kinds, learned) | ((kinds == FIRST) & settings.extract.network)
-
-    return lambda id0, id1, indices: of_image(id0)[indices[:, 0]] | of_image(id1)[indices[:, 1]]
 
 
 def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) -> StepContext:

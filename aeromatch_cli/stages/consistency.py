@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray, Pair, Verdict
+from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
@@ -23,7 +23,6 @@ from aeromatch_cli.orientation.alone import block_of_pair
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.remaining import without_dropped
 from aeromatch_cli.stages import adjust, orient
-from aeromatch_cli.stages.cascade import learned_matches
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, select, summarise, verified_pairs
@@ -72,8 +71,7 @@ def run(context: Context) -> StageReport:
         cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
         keypoints_px = contents_of(context).keypoints_px
-        learned = learned_matches(context.settings, context.workspace)
-        pairs = [_matched(context, adjusted, keypoints_px, learned, pair, entry) for pair, entry in entries]
+        pairs = [_matched(context, adjusted, keypoints_px, pair, entry) for pair, entry in entries]
         limits = Limits(
             recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
         )
@@ -106,7 +104,6 @@ def _matched(
     context: Context,
     adjusted: AdjustedBlock,
     keypoints_px: Callable[[str], FloatArray],
-    learned: Callable[[str, str, IntArray], BoolArray],
     pair: Pair,
     entry: VerifiedEntry,
 ) -> MatchedKeypoints:
@@ -122,7 +119,7 @@ def _matched(
             ids, (cameras[0], cameras[1]), (points[0], points[1]), verdict.model,
             cast("FloatArray", verdict.relative_rotation), None if pose is None else pose.world_rotation,
         )  # fmt: skip
-    return MatchedKeypoints(*ids, indices, entry.matches.scores, learned(*ids, indices), alone)
+    return MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:

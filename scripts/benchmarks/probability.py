@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.evaluate.scores import CORRECT_PX
@@ -30,8 +29,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
-from aeromatch_cli.orientation.probability import LEARNED, columns, fitted_weights, stated, usual_off_px
-from aeromatch_cli.stages.cascade import learned_matches
+from aeromatch_cli.orientation.probability import columns, fitted_weights, stated, usual_off_px
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import Workspace
@@ -69,14 +67,12 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
     block = read_adjusted(workspace.adjusted)
     cameras = {image_id: block.cameras[image.camera_id] for image_id, image in images.items()}
     keypoints = {image_id: np.asarray(read_keypoints(workspace.features(image_id))[0], float) for image_id in images}
-    learned = learned_matches(load(str(workspace.config)), workspace)
     pairs = [
-        MatchedKeypoints(image_id, other, found.indices, found.scores, learned(image_id, other, found.indices))
+        MatchedKeypoints(image_id, entry.image_id1, entry.matches.indices, entry.matches.scores)
         for image_id in sorted(images)
         if workspace.verified(image_id).is_file()
-        for other, entry in read_verified_row(workspace.verified(image_id)).items()
+        for entry in read_verified_row(workspace.verified(image_id)).values()
         if entry.verdict.state == "verified"
-        for found in [entry.matches]
     ]
     recipe = BlockConsistency()
     limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
@@ -114,40 +110,33 @@ def _classes(p: FloatArray) -> IntArray:
 
 
 def table_of(blocks: Sequence[Block], least: float) -> str:
-    """Blocks, features, and classes of probability."""
-    values, right = together(blocks)
-    p = stated(values)
-    every = [*((name, stated(own), own_right) for name, own, own_right in blocks), ("all", p, right)]
-    learned = values[:, LEARNED] > 0.0
-    kinds = [(name, p[own], right[own]) for name, own in (("SIFT", ~learned), ("learned", learned)) if own.any()]
-    number_of, classes = _classes(p), []
+    """Blocks, and classes of probability."""
+    lines = []
+    for name, values, right in [*blocks, ("all", *together(blocks))]:
+        p = stated(values)
+        left = p >= least
+        lines.append(
+            [name, number(len(right)), percent(p.mean(), 1), percent(right.mean(), 1),
+             percent(right[left].sum() / right.sum(), 1), percent(p[left].mean(), 1), percent(right[left].mean(), 1)]
+        )  # fmt: skip
+    all_values, all_right = together(blocks)
+    all_p = stated(all_values)
+    number_of, classes = _classes(all_p), []
     for k, (low, high) in enumerate(pairwise(_EDGES)):
         own = number_of == k
         if own.any():
             classes.append(
-                [f"{low:g} to {high:g}", number(int(own.sum())), percent(p[own].mean(), 1),
-                 percent(right[own].mean(), 1)]
+                [f"{low:g} to {high:g}", number(int(own.sum())), percent(all_p[own].mean(), 1),
+                 percent(all_right[own].mean(), 1)]
             )  # fmt: skip
+    titles = ["block", "matches", "stated", "right", f"right ones left at {least:g}"]
+    titles += ["stated of these", "right of these"]
     return "\n\n".join(
         [
-            "#### By block\n\n" + _left_table("block", every, least),
-            "#### By features\n\n" + _left_table("features", kinds, least),
+            "#### By block\n\n" + markdown(titles, lines),
             "#### By stated probability\n\n" + markdown(["probability", "matches", "stated", "right"], classes),
         ]
     )
-
-
-def _left_table(title: str, rows: Sequence[tuple[str, FloatArray, BoolArray]], least: float) -> str:
-    """rows: name, stated probability (M,) and which are right (M,)."""
-    lines = []
-    for name, p, right in rows:
-        left = p >= least
-        shares = (p, right), (p[left], right[left])
-        means = [[percent(float(mean), 1) for mean in (one.mean(), two.mean())] for one, two in shares]
-        kept = percent(float(right[left].sum() / right.sum()), 1)
-        lines.append([name, number(len(right)), *means[0], kept, *means[1]])
-    titles = [title, "matches", "stated", "right", f"right ones left at {least:g}", "stated of these", "right of these"]
-    return markdown(titles, lines)
 
 
 def draw_reliability(path: Path, blocks: Sequence[Block]) -> None:
