@@ -18,6 +18,7 @@ from test_report import HEIGHT, WIDTH, features, full, page_of  # noqa: F401 - a
 from aeromatch_cli.report import pair_viewer, thumbnails
 from aeromatch_cli.report.gathering import gather
 from aeromatch_cli.report.pair_viewer import PairData
+from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.stages.context import Context
 
@@ -35,8 +36,12 @@ def pair_data(context: Context) -> tuple[PairData, dict[tuple[str, str], str]]:
 
 
 def test_tables_made_while_pairs_are_gathered_are_those_of_their_files(full: Context) -> None:  # noqa: F811
-    again = pair_viewer.pair_data(full, gather(full).pairs, thumbnails.thumbnails(full), {})
-    assert again == pair_data(full)
+    found, files = gather(full, pair_viewer.pair_table), DrawnMatches(full.workspace)
+    drawn = {(row.image_id0, row.image_id1): row for row in pair_viewer.drawable(found.pairs)}
+    assert found.drawn.keys() == drawn.keys() == {("a", "b"), ("a", "c"), ("b", "c")}
+    for key, row in drawn.items():
+        images = full.image_by_id[key[0]], full.image_by_id[key[1]]
+        assert found.drawn[key] == pair_viewer.pair_table(images, *files.of(row))
 
 
 def test_pairs_of_readable_images_are_stored_with_places_and_errors(full: Context) -> None:  # noqa: F811

@@ -5,6 +5,7 @@ Reading the files is most of a large report's time: stretches of the pairs are r
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections import Counter
@@ -25,6 +26,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.images.remote import RemoteFile
+from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
@@ -44,15 +46,16 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Pairs in the order of pairs.csv and images in the order of images.csv. drawn: of every verified pair, what `draw`
-    made of it."""
+    """Pairs in the order of pairs.csv and images in the order of images.csv. drawn: of every verified or rejected pair
+    whose files can be read, what `draw` made of its matches."""
 
     pairs: list[PairRow]
     images: list[ImageRow]
     drawn: dict[Key, str]
 
 
-# Makes what is drawn of a verified pair: both images, stored pixels (M, 2) of its matches in either, errors (M,) px.
+# Makes what is drawn of a pair: both images, stored pixels (M, 2) of its matches in either, errors (M,) px; of a
+# rejected pair of those before verification, without errors.
 Draw = Callable[[tuple[Image, Image], tuple[FloatArray, FloatArray], FloatArray | None], str]
 
 
@@ -116,6 +119,7 @@ def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
 
 def _read(stretch: Stretch) -> _Found:
     context, found = stretch.context, _Found()
+    candidates = DrawnMatches(context.workspace)
 
     @lru_cache(maxsize=_IMAGES_AT_HAND)
     def keypoints_px(image_id: str) -> FloatArray | None:
@@ -124,6 +128,10 @@ def _read(stretch: Stretch) -> _Found:
     for pair, entry in final_pairs(context):
         key = pair.image_id0, pair.image_id1
         row = found.rows[key] = _pair_row(context, pair, entry)
+        images = context.image_by_id[key[0]], context.image_by_id[key[1]]
+        if row.state == "rejected" and row.matches_in and stretch.draw is not None:
+            with contextlib.suppress(WorkspaceError):  # its files have gone: the row stays, without a picture
+                found.drawn[key] = stretch.draw(images, *candidates.of(row))
         if row.state != "verified":
             continue
         both = [keypoints_px(image_id) for image_id in key]
@@ -131,7 +139,6 @@ def _read(stretch: Stretch) -> _Found:
         if both[0] is None or both[1] is None:
             continue
         points = match_points(entry.matches, both[0], both[1])
-        images = context.image_by_id[key[0]], context.image_by_id[key[1]]
         for image, points_px in zip(images, points, strict=True):
             found.mark(image, points_px)
         if stretch.draw is not None:

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, Image
-from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.report.figures import evenly_chosen
-from aeromatch_cli.report.previews import DrawnMatches, error_classes, turned_points
+from aeromatch_cli.report.previews import error_classes, turned_points
 from aeromatch_cli.report.rows import PairRow
 from aeromatch_cli.report.thumbnails import Thumbnails
 from aeromatch_cli.stages.context import Context
@@ -63,25 +62,17 @@ def _json(value: object) -> str:
 def pair_data(
     context: Context, rows: Sequence[PairRow], pictures: Thumbnails, tables: Mapping[tuple[str, str], str]
 ) -> tuple[PairData, dict[tuple[str, str], str]]:
-    """What can be drawn of the pairs, and under which key of PairData.pairs each is. tables: `pair_table` of verified
-    pairs; those of rejected ones are made here."""
+    """What can be drawn of the pairs, and under which key of PairData.pairs each is. tables: `pair_table` of pairs."""
     data = PairData()
     number_of = {image_id: number for number, image_id in enumerate(pictures)}
     for image_id in pictures:
         data.names.append(context.image_by_id[image_id].name)
         data.pictures.append(pictures.link(image_id))
-    drawn, images = DrawnMatches(context.workspace), context.image_by_id
     keys: dict[tuple[str, str], str] = {}
-    # One row of files after the other: each is read once.
     for row in sorted(drawable(rows), key=lambda row: (row.image_id0, row.image_id1)):
         ids = row.image_id0, row.image_id1
-        if ids[0] in number_of and ids[1] in number_of:
-            table = tables.get(ids)
-            if table is None:
-                try:
-                    table = pair_table((images[ids[0]], images[ids[1]]), *drawn.of(row))
-                except WorkspaceError:
-                    continue  # its files have gone: the row stays, without a picture
+        table = tables.get(ids)
+        if table is not None and ids[0] in number_of and ids[1] in number_of:
             keys[ids] = f"{number_of[ids[0]]},{number_of[ids[1]]}"
             data.pairs[keys[ids]] = (table, int(row.verified), int(row.matches_in or 0), row.state)
     if pictures.beside:
