@@ -15,7 +15,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -329,11 +329,26 @@ class Executor:
     def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T], *, network: bool) -> list[Outcome[R]]:
         try:
             from distributed import Client, as_completed
+            from distributed.comm.core import CommClosedError
         except ImportError:
             raise ConfigError(
                 "run.executor=dask needs the extra: pip install 'aeromatch[cluster]', or use --executor processes"
             ) from None
-        client = self._dask_client(Client)
+        try:
+            return self._gathered(self._dask_client(Client), as_completed, function, tasks, network=network)
+        except (CommClosedError, CancelledError) as error:  # a connection that closes while results travel
+            assert self._client is not None
+            raise _lost_scheduler(self._client) from error
+
+    def _gathered(
+        self,
+        client: Any,
+        as_completed: Callable[..., Any],
+        function: Callable[[T], R],
+        tasks: Sequence[T],
+        *,
+        network: bool,
+    ) -> list[Outcome[R]]:
         # A worker that is lost takes its task with it: that is given to another one, so many times.
         needs = {"GPU": 1.0} if network and offers_gpu(client) else None
         many = [function] * len(tasks)
@@ -349,10 +364,7 @@ class Executor:
             elif future.status == "error":
                 raise error
             else:
-                raise WorkspaceError(
-                    f"the dask scheduler {client.scheduler.address} is lost: start it again, and run the same command, "
-                    "which goes on"
-                )
+                raise _lost_scheduler(client)
             self._advance(index)
         return [outcomes[index] for index in range(len(tasks))]
 
@@ -363,6 +375,11 @@ class Executor:
             if self._scheduler and self._client.dashboard_link:
                 log.info("dask dashboard at %s", self._client.dashboard_link)
         return self._client
+
+
+def _lost_scheduler(client: Any) -> WorkspaceError:
+    lost = f"the dask scheduler {client.scheduler.address} is lost"
+    return WorkspaceError(f"{lost}: start it again, and run the same command, which goes on")
 
 
 def available_cores() -> int:

@@ -289,6 +289,24 @@ def test_a_lack_of_memory_is_the_machines(what: str) -> None:
 
 
 @pytest.mark.slow
+def test_a_scheduler_that_is_lost_while_results_travel_is_named(
+    cluster: tuple[str, Processes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import Future
+    from distributed.comm.core import CommClosedError
+
+    def closed(_: object) -> None:
+        raise CommClosedError("Stream is closed")
+
+    monkeypatch.setattr(Future, "result", closed)
+    with (
+        Executor("dask", scheduler=cluster[0]) as executor,
+        pytest.raises(WorkspaceError, match=r"the dask scheduler tcp://.* is lost: start it again"),
+    ):
+        executor.run(slow_square, [1], "x")
+
+
+@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_named() -> None:
     pytest.importorskip("distributed")
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):
