@@ -28,6 +28,7 @@ _STYLE: dict[Any, Any] = {
     # Text stays text; the salt keeps the names of clip paths and markers from run to run.
     **{"svg.fonttype": "none", "svg.hashsalt": "aeromatch"},
 }
+_HISTOGRAM_IN = (7.0, 2.7)
 _VARIABLES = {colour: f"var(--{name})" for name, colour in COLOURS.items()}
 
 
@@ -53,6 +54,13 @@ def new_axes(
 def label_width(values: Iterable[float]) -> float:
     """Points that the axis label and the tick labels of metres need beside a vertical axis that shows these values."""
     return 32.0 + 6.4 * max(len(f"{value:.0f}") for value in values)
+
+
+def histogram_axes(counts: Iterable[int]) -> Any:
+    """Axes of a chart of these counts, with room for their tick labels."""
+    left = (24.0 + 6.4 * len(f"{max(counts):,}")) / (72.0 * _HISTOGRAM_IN[0])
+    margins = {"left": max(0.105, left), "right": 0.965, "bottom": 0.2, "top": 0.96}
+    return new_axes(*_HISTOGRAM_IN, margins=margins)
 
 
 def png(figure: Any) -> bytes:
@@ -121,10 +129,10 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     """Bars over about 24 equal classes with rounded limits. values: at least one. unit: what they count, a plural."""
     from matplotlib.ticker import MaxNLocator
 
-    axes = new_axes(7.0, 2.7, margins={"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96})
     locator = MaxNLocator(24, steps=[1, 2, 5, 10], integer=True)
     edges = np.asarray(locator.tick_values(0, max(values) + 1))
     counts, _ = np.histogram(values, edges)
+    axes = histogram_axes(counts)
     filled = np.flatnonzero(counts)
     step = edges[1] - edges[0]
     bars = axes.bar(edges[filled], counts[filled], 0.94 * step, align="edge", color=COLOURS["accent"], linewidth=0)

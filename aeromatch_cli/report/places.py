@@ -5,12 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
-from aeromatch_cli.report.figures import COLOURS, label_width, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, new_axes, svg
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -22,7 +21,6 @@ _WIDTH_IN, _HEIGHTS_IN = 7.0, (3.2, 7.0)
 _BAR_IN, _LABELS_IN, _TITLE_IN = 1.0, 0.6, 0.35
 _LARGEST_ERROR = 0.99  # quantile
 _MANY_IMAGES = 20
-_MARGINS = {"left": 0.105, "right": 0.965, "bottom": 0.2, "top": 0.96}
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def point_figures(adjusted: AdjustedBlock | None) -> list[str]:
 def _images_figure(seen: IntArray) -> str:
     """Points by the number of images that see them."""
     numbers, counts = np.unique(np.minimum(seen, _MANY_IMAGES), return_counts=True)
-    axes: Any = new_axes(7.0, 2.7, margins=_MARGINS)
+    axes = histogram_axes(counts)
     for bar in axes.bar(numbers, counts, 0.9, color=COLOURS["accent"], linewidth=0):
         bar.set_gid("bar")
     label = f"images that see a point ({_MANY_IMAGES}: or more)"
@@ -160,10 +158,10 @@ def _images_figure(seen: IntArray) -> str:
 
 
 def _errors_figure(errors_px: FloatArray) -> str:
-    axes: Any = new_axes(7.0, 2.7, margins=_MARGINS)
     errors = errors_px[np.isfinite(errors_px)]
     largest = max(float(np.quantile(errors, _LARGEST_ERROR)) if len(errors) else 1.0, 0.1)
     counts, edges = np.histogram(np.minimum(errors, largest), 24, (0.0, largest))
+    axes = histogram_axes(counts)
     bars = axes.bar(
         edges[:-1], counts, 0.94 * (edges[1] - edges[0]), align="edge", color=COLOURS["accent"], linewidth=0
     )
