@@ -19,6 +19,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessP
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, Protocol, TypeVar
 
 from aeromatch_cli.dask_client import connected, offers_gpu
@@ -100,6 +101,20 @@ def _one_thread() -> Iterator[None]:
             yield
     finally:
         cv2.setNumThreads(before)
+
+
+class _WorkerProcess(SpawnProcess):
+    """Ends without a traceback where it has no memory to read its next task: the parent sees that it is gone."""
+
+    def run(self) -> None:
+        try:
+            super().run()
+        except MemoryError:
+            os._exit(1)
+
+
+class _WorkerContext(SpawnContext):
+    Process = _WorkerProcess
 
 
 def _worker_start() -> None:
@@ -308,9 +323,7 @@ class Executor:
     def _processes(self) -> ProcessPoolExecutor:
         if self._pool is None:
             with _worker_environment():
-                self._pool = ProcessPoolExecutor(
-                    self.jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_worker_start
-                )
+                self._pool = ProcessPoolExecutor(self.jobs, mp_context=_WorkerContext(), initializer=_worker_start)
                 # Spawning is lazy: make every worker now, while the environment says one thread. They are born deaf
                 # to Ctrl-C: before their initializer has run they would print tracebacks.
                 with _interrupts_held():

@@ -280,6 +280,31 @@ def run_out(what: str) -> None:
     raise MemoryError if what == "memory" else RuntimeError(what)
 
 
+@dataclass
+class Unreadable:
+    """A task that needs memory while it is read by a worker, the first time."""
+
+    mark: Path
+
+    def __setstate__(self, state: dict[str, Path]) -> None:
+        self.__dict__ |= state
+        if not self.mark.exists():
+            self.mark.touch()
+            raise MemoryError
+
+
+def marked(task: Unreadable) -> bool:
+    return task.mark.exists()
+
+
+def test_a_worker_without_memory_for_its_task_ends_silently(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "b").touch()  # a worker reads this one
+    with Executor("processes", 2) as executor:
+        outcomes = executor.run(marked, [Unreadable(tmp_path / "a"), Unreadable(tmp_path / "b")], "x")
+    assert [outcome.value for outcome in outcomes] == [True, True]
+    assert "Traceback" not in capfd.readouterr().err
+
+
 @pytest.mark.parametrize("what", ["memory", "DefaultCPUAllocator: can't allocate memory", "std::bad_alloc"])
 def test_a_lack_of_memory_is_the_machines(what: str) -> None:
     outcome = guarded(run_out, what)
