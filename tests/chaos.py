@@ -79,6 +79,7 @@ def _same(one: object, other: object) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/chaos", description=__doc__)
     parser.add_argument("--faults", type=int, default=200, help="default 200")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one, to go on from; default 0")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", default="", help=f"comma-separated of {', '.join(KINDS)}; all by default")
     args = parser.parse_args()
@@ -88,13 +89,15 @@ def main() -> None:
     count, bad = Counter[str](), Counter[str]()
     with tempfile.TemporaryDirectory() as scratch:
         calm = Calm(Path(scratch))
-        for number in range(args.faults):
+        for number in range(args.first, args.faults):
             kind = kinds[number % len(kinds)]
             what = injected(kind, args.seed * 100_000 + number, calm)
             count[kind] += 1
             if what:
                 bad[kind] += 1
                 print(f"{kind}, number {number}: {what}", file=sys.stderr, flush=True)
+            if number % 20 == 19:
+                print(f"{number + 1} of {args.faults}: {bad.total()} not withstood", file=sys.stderr, flush=True)
     for kind in kinds:
         print(f"{kind}: {count[kind]} injected, {bad[kind]} not withstood")
     sys.exit(1 if bad else 0)

@@ -35,8 +35,6 @@ PAGES: Mapping[str, str] = {
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
     "bench_growth_blocks": "large.md",
-    "bench_memory": "large.md",
-    "bench_speed": "large.md",
     "bench_blocks": "methods.md",
     "bench_thinned": "methods.md",
     "bench_fusion": "fusion.md",
