@@ -22,7 +22,7 @@ from aeromatch_cli.synthetic.flights import FLIGHTS
 from aeromatch_cli.synthetic.scenes.table import SCENES
 
 # What may stand for a preset or a file of the reader's own.
-PLACEHOLDERS = ("CONFIG", "PRESET", "CONFIG|PRESET")
+PLACEHOLDERS = ("WORK", "CONFIG", "PRESET", "CONFIG|PRESET")
 ADDED = ("match=distance", "match.max_distance=", "export=colmap+tiepoints")
 COMMAND_LINE = typer.main.get_command(app)
 # What typer raises on words that it does not know; its own copy of click's class.

@@ -103,7 +103,7 @@ def execute(
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 result = _repairing(command, settings, executor, part, overwrite, _Said(say))
-            if not result.failures:
+            if whole and not result.failures:
                 unchanged.remember(Workspace(root), inputs, result.facts["stages"])
             return result
         except BaseException as error:

@@ -39,7 +39,7 @@ def state_of_inputs(settings: Settings) -> dict[str, str]:
     own = (path for path in _files_below(Path(__file__).parent.parent, ()) if path.suffix != ".pyc")
     try:
         inputs = sorted(set(_inputs(settings, root)))
-    except ConfigError:  # a file that a setting names is missing: the run itself says so
+    except (ConfigError, OSError):  # a file is missing or may not be read: the run itself says so
         return {}
     return {
         "settings": _digest([dump(settings)]),
