@@ -40,7 +40,7 @@ def test_the_usual_match_is_right() -> None:
         {"confirming": 0.0},
         {"off0_px": 8.0},
         {"off1_px": 8.0},
-        {"angle_deg": 60.0},
+        {"angle_deg": 55.0},
     ],
 )
 def test_what_speaks_against_a_match_makes_it_less_probable(changed: dict[str, float]) -> None:

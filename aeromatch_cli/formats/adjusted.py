@@ -67,9 +67,8 @@ def read_adjusted(path: Path) -> AdjustedBlock:
         for name, (rotation, center_m, sigmas_m, sigmas_deg) in zip(ids, parts, strict=True)
     }
     both = np.column_stack([arrays["track_keypoints"], arrays["track_points"]]).astype(np.int32)
-    order = np.argsort(arrays["track_images"], kind="stable")
-    ends = np.searchsorted(arrays["track_images"][order], np.arange(len(ids) + 1))
-    tracks = {name: both[order[start:end]] for name, (start, end) in zip(ids, pairwise(ends), strict=True)}
+    ends = np.searchsorted(arrays["track_images"], np.arange(len(ids) + 1))  # written image by image
+    tracks = {name: both[start:end] for name, (start, end) in zip(ids, pairwise(ends), strict=True)}
     frames = {name: int(number) for name, number in zip(ids, arrays["frames"], strict=True) if number}
     return AdjustedBlock(cameras, poses, arrays["points_m"], arrays["errors_px"], tracks, frames)
 

@@ -167,11 +167,11 @@ def _check_settings(settings: Settings) -> None:
             "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "
             "orient, or pairs=exhaustive"
         )
-    for strategy in _chosen(settings):
+    for strategy in chosen_strategies(settings):
         strategy.check_files(settings.extract.descriptor_length)
 
 
-def _chosen(settings: Settings) -> Iterator[Strategy]:
+def chosen_strategies(settings: Settings) -> Iterator[Strategy]:
     yield from (settings.orient, settings.pairs, settings.enhance, settings.simulate, settings.extract, settings.match)
     yield from settings.filter
     yield from settings.export
@@ -179,7 +179,7 @@ def _chosen(settings: Settings) -> Iterator[Strategy]:
 
 def _remarks(settings: Settings) -> list[str]:
     """What the recipe brings that its user may not expect."""
-    return [f"own weights      {path}" for strategy in _chosen(settings) for path in strategy.own_weights()]
+    return [f"own weights      {path}" for strategy in chosen_strategies(settings) for path in strategy.own_weights()]
 
 
 def _fingerprint(context: Context) -> str:

@@ -98,8 +98,9 @@ def execute(
         try:
             whole = command == "run" and part is None
             inputs = unchanged.state_of_inputs(settings) if whole else {}
-            if not overwrite and unchanged.is_unchanged(Workspace(root), inputs):
-                return _unchanged(settings, _Said(say))
+            before = None if overwrite else unchanged.unchanged_reports(Workspace(root), inputs)
+            if before is not None:
+                return _unchanged(settings, before, _Said(say))
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 result = _repairing(command, settings, executor, part, overwrite, _Said(say))
@@ -116,10 +117,9 @@ def execute(
             raise
 
 
-def _unchanged(settings: Settings, said: _Said) -> Result:
+def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> Result:
     """Of a whole run that has nothing to do."""
     workspace = Workspace(Path(settings.workspace).absolute())
-    reports = unchanged.up_to_date_reports(workspace)
     names = {image.image_id: image.name for image in read_images(workspace.images)}
     block = next(report for report in reports if report.stage == "pairs")
     for line in block.facts["summary"]:

@@ -16,9 +16,9 @@ from typing import Any
 from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
 from aeromatch_cli.images.remote import is_remote
+from aeromatch_cli.stages.pairs import chosen_strategies
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.workspace import Workspace, read_json, write_json
 
 # Their arithmetic decides results.
@@ -48,18 +48,25 @@ def state_of_inputs(settings: Settings) -> dict[str, str]:
     }
 
 
-def is_unchanged(workspace: Workspace, inputs: dict[str, str]) -> bool:
-    """Whether the workspace is as the run from these inputs has left it, without a failure."""
+def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[StageReport] | None:
+    """What the run from these inputs has left, as reports of stages that have made nothing; None where anything has
+    changed since, or it left no record."""
     if not inputs or not workspace.finished.is_file():
-        return False
+        return None
     try:
         record = read_json(workspace.finished)
-    except BrokenFileError:
-        return False
-    return all(record.get(key) == value for key, value in {**inputs, "files": _state_of_files(workspace)}.items())
+        now = {**inputs, "files": _state_of_files(workspace)}
+        if any(record.get(key) != value for key, value in now.items()):
+            return None
+        return [
+            StageReport(stage, items=own["items"], skipped=own["items"], facts=own["facts"] or _told(workspace, stage))
+            for stage, own in record["stages"].items()
+        ]
+    except BrokenFileError:  # the long way makes it again
+        return None
 
 
-def remember(workspace: Workspace, inputs: dict[str, str], stages: Mapping[str, Mapping[str, Any]]) -> None:
+def remember(workspace: Workspace, inputs: Mapping[str, str], stages: Mapping[str, Mapping[str, Any]]) -> None:
     """Write the record of a run that has ended without a failure. inputs: from before it began. stages: facts of its
     stages, in order; those that their reports on file tell are not written once more."""
     if not inputs:
@@ -69,15 +76,6 @@ def remember(workspace: Workspace, inputs: dict[str, str], stages: Mapping[str, 
         for stage, own in stages.items()
     }
     write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
-
-
-def up_to_date_reports(workspace: Workspace) -> list[StageReport]:
-    """Reports of the stages of a run that is unchanged, which have made nothing."""
-    stages = read_json(workspace.finished)["stages"]
-    return [
-        StageReport(stage, items=own["items"], skipped=own["items"], facts=own["facts"] or _told(workspace, stage))
-        for stage, own in stages.items()
-    ]
 
 
 def _told(workspace: Workspace, stage: str) -> dict[str, Any]:
@@ -99,18 +97,8 @@ def _inputs(settings: Settings, root: Path) -> Iterator[Path]:
             yield from _beside(path.parent)
         if key != "images":
             yield from _beside(path.parent.parent if path.is_file() else path.parent)
-    for strategy in _strategies(settings):
+    for strategy in chosen_strategies(settings):
         yield from (Path(name) for name in strategy.fingerprint_files())
-        for name, field in type(strategy).model_fields.items():
-            extra, value = field.json_schema_extra, getattr(strategy, name)
-            if isinstance(extra, dict) and extra.get("path") and value and Path(value).is_file():
-                yield Path(value)
-
-
-def _strategies(settings: Settings) -> Iterator[Strategy]:
-    for name in type(settings).model_fields:
-        value = getattr(settings, name)
-        yield from (one for one in (value if isinstance(value, tuple) else (value,)) if isinstance(one, Strategy))
 
 
 def _beside(folder: Path) -> Iterator[Path]:

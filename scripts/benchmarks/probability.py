@@ -180,7 +180,7 @@ def main(arguments: Sequence[str]) -> None:
     limit_threads(2)
     if args.fit:
         weights = fitted_weights(*together(list(blocks_of(args, args.fit))))
-        print("WEIGHTS =", tuple(round(float(weight), 2) for weight in weights))
+        print("WEIGHTS =", tuple(round(float(weight), 3) for weight in weights))
     blocks = list(blocks_of(args, [args.seed]))
     draw_reliability(args.out / "reliability.svg", blocks)
     if args.docs is not None:
