@@ -35,6 +35,7 @@ PAGES: Mapping[str, str] = {
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
     "bench_growth_blocks": "large.md",
+    "bench_device": "large.md",
     "bench_blocks": "methods.md",
     "bench_thinned": "methods.md",
     "bench_fusion": "fusion.md",
