@@ -156,6 +156,24 @@ def _rows_of(whole: Seen, part: Seen) -> np.ndarray:
     return np.array([rows[d.tobytes()] for d in part.descriptors])
 
 
+def test_batches_go_on_where_a_run_was_left() -> None:
+    rng = np.random.default_rng(4)
+    first = side(rng.uniform(0, [640, 480], (60, 2)))
+    truth = Partners(np.arange(60, dtype=np.int32), np.arange(60, dtype=np.int32))
+    pairs = [Pair(first, first, truth, False)]
+    plan = (train_lightglue.Phase("homographies", 10, 16, 0.0), train_lightglue.Phase("blocks", 5, 32, 0.6))
+    every = train_lightglue.Batches(pairs, pairs, plan, 1, 0, seed=2)
+    # 1 x 256 keypoints a batch: 16 pairs of 16 pass the first phase's end, and 8 of 32 would pass the second's.
+    assert every.begins == [0]
+    assert every.plan_at(10) == (plan[1], 8)
+    later = train_lightglue.Batches(pairs, pairs, plan, 1, 10, seed=2)
+    assert later.begins == [10]
+    assert [len(batch.partners0) for batch in later] == [8]
+    again = train_lightglue.drawn(pairs, pairs, plan[1], 8, 10, 2)
+    assert torch.equal(later[0].side0.places, again.side0.places)
+    assert torch.equal(later[0].partners1, again.partners1)
+
+
 def test_a_small_network_learns_a_batch_by_heart() -> None:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)

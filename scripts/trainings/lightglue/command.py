@@ -23,12 +23,13 @@ import copy
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.lightglue import Dimensions, LightGlue
@@ -95,6 +96,34 @@ def drawn(stage1: list[Pair], stage2: list[Pair], phase: Phase, size: int, seen:
     return batch_of(pieces, phase.count)
 
 
+class Batches(Dataset[Batch]):
+    """Every batch from the pair `begin` on, in order."""
+
+    def __init__(
+        self, stage1: list[Pair], stage2: list[Pair], plan: Sequence[Phase], batch: int, begin: int, seed: int
+    ) -> None:
+        self.stages, self.seed = (stage1, stage2), seed
+        self._plan, self._batch = plan, batch
+        self.begins: list[int] = []
+        while begin < sum(phase.pairs for phase in plan):
+            self.begins.append(begin)
+            begin += self.plan_at(begin)[1]
+
+    def plan_at(self, seen: int) -> tuple[Phase, int]:
+        """The phase after so many pairs, and how many pairs its batches have."""
+        phase = _phase(self._plan, seen)
+        return phase, max(1, self._batch * 256 // phase.count)
+
+    def __len__(self) -> int:
+        return len(self.begins)
+
+    def __getitem__(self, number: int) -> Batch:
+        if number >= len(self.begins):
+            raise IndexError(number)
+        seen = self.begins[number]
+        return drawn(*self.stages, *self.plan_at(seen), seen, self.seed)
+
+
 def on(batch: Batch, device: str) -> Batch:
     return Batch(*(part.to(device) for part in (batch.side0, batch.side1, batch.partners0, batch.partners1)))
 
@@ -127,20 +156,20 @@ def train(args: argparse.Namespace, device: str, spent_s: float = 0.0) -> Run | 
     """The finished run, or None where --minutes, of which so much is spent, ended it before."""
     plan = phases(args.scale, anew=args.start is None)
     total = sum(phase.pairs for phase in plan)
-    stage1 = [p for path in sorted((args.out / "data" / "stage1").glob("*.npz")) for p in read_groups(path)]
-    stage2 = [p for path in sorted((args.out / "data" / "stage2").glob("*.npz")) for p in read_block(path)]
-    stage1, stage2 = ([pair for pair in pairs if usable(pair)] for pairs in (stage1, stage2))
+    stage1 = read_all(args.out / "data" / "stage1", read_groups)
+    stage2 = read_all(args.out / "data" / "stage2", read_block)
     sets = validation_sets(args.out / "data")
     state, started = args.out / "state.pt", time.monotonic()
     run = Run.begin(state, device, args.rate, args.seed, args.start)
     print(f"{len(stage1)} homography pairs, {len(stage2)} rendered pairs, {run.seen} of {total} pairs seen", flush=True)
     losses: list[tuple[float, float, float]] = []
-    while run.seen < total:
-        phase = _phase(plan, run.seen)
-        size = max(1, args.batch * 256 // phase.count)
+    batches = Batches(stage1, stage2, plan, args.batch, run.seen, args.seed)
+    # Where a device computes, drawing is done beside it.
+    for batch in DataLoader(batches, batch_size=None, num_workers=args.jobs if device == "cuda" else 0):
+        phase, size = batches.plan_at(run.seen)
         for group in run.optimiser.param_groups:
             group["lr"] = args.rate * _rate(run.seen, total)
-        losses.append(step(run, on(drawn(stage1, stage2, phase, size, run.seen, args.seed), device), phase, device))
+        losses.append(step(run, on(batch, device), phase, device))
         before, run.seen = run.seen, run.seen + size
         if run.seen // REPORT_EVERY > before // REPORT_EVERY or run.seen >= total:
             row = {"seen": run.seen, "phase": phase.name, "minutes": round((time.monotonic() - started) / 60, 1)}
@@ -157,6 +186,11 @@ def train(args: argparse.Namespace, device: str, spent_s: float = 0.0) -> Run | 
             print(f"{run.seen} of {total} pairs seen; the same command goes on from here", flush=True)
             return None
     return run
+
+
+def read_all(folder: Path, read: Callable[[Path], list[Pair]]) -> list[Pair]:
+    """Pairs of all files of a folder that there is something to learn from."""
+    return [pair for path in sorted(folder.glob("*.npz")) for pair in read(path) if usable(pair)]
 
 
 def usable(pair: Pair) -> bool:
@@ -188,9 +222,8 @@ def step(run: Run, batch: Batch, phase: Phase, device: str) -> tuple[float, floa
 
 def validation_sets(data: Path, keypoints: tuple[int, int] = (512, 1024)) -> dict[str, list[Pair]]:
     """Unseen pairs by name, keypoints of homographies and of rendered pairs cut so that validation takes seconds."""
-    first = [p for path in sorted((data / "unseen1").glob("*.npz")) for p in read_groups(path)]
-    second = [p for path in sorted((data / "unseen2").glob("*.npz")) for p in read_block(path)]
-    first, second = ([pair for pair in pairs if usable(pair)] for pairs in (first, second))
+    first = read_all(data / "unseen1", read_groups)
+    second = read_all(data / "unseen2", read_block)
     turned = [pair for pair in first if pair.side0.angles_rad.any()]
     upright = [pair for pair in first if not pair.side0.angles_rad.any()]
     return {
@@ -305,7 +338,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--scale", type=float, default=1.0, help="of the number of pairs of every phase")
     add("--batch", type=at_least_one, help="pairs of 256 keypoints at once (default 16, 96 on CUDA)")
     add("--rate", type=float, default=6e-4, help="largest learning rate")
-    add("--jobs", type=at_least_one, default=2, help="processes that make the data, threads that train")
+    add(
+        "--jobs",
+        type=at_least_one,
+        default=2,
+        help="processes that make the data, and beside a CUDA device draw batches; threads that train",
+    )
     add("--minutes", type=float, default=0.0, help="stop after so long (0: never) and go on when called again")
     add("--only-data", action="store_true", help="make the data and stop")
     add("--out", type=Path, required=True)
