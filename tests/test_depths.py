@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from make_images import write_bands
 from numpy.typing import NDArray
+from rasterio.errors import NotGeoreferencedWarning
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images.depth import in_16_bits, to_gray8
+from aeromatch_cli.images import gdal
+from aeromatch_cli.images.depth import _stretched, in_16_bits, to_gray8
 from aeromatch_cli.images.files import read_pixels, write_png
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 
@@ -116,3 +120,43 @@ def test_enhancers_take_every_depth_and_keep_the_picture(tmp_path: Path, name: s
     assert found.dtype == np.uint16
     assert len(np.unique(found)) > 1000
     assert np.mean((found[..., 0] >= found[..., 1]) & (found[..., 1] >= found[..., 2])) == 1.0
+
+
+@pytest.mark.parametrize("top", [5, 300, 4096, 65536])
+def test_the_stretch_is_that_of_numpys_percentiles(top: int) -> None:
+    """In tables and strips: the whole picture in floating numbers would take ten times its memory."""
+    rng = np.random.default_rng(top)
+    for shape in ((1, 1), (7, 3), (90, 61), (40, 30, 3)):
+        pixels = rng.integers(0, top, shape).astype(np.uint16)
+        seen = pixels[pixels != 0].astype(np.float32) if pixels.any() else np.array([0.0, 1.0], np.float32)
+        low, high = np.percentile(seen, (0.5, 99.5)) if pixels.any() else (0.0, 1.0)
+        exact = np.clip(np.rint((pixels.astype(np.float64) - low) * (255.0 / max(high - low, 1e-6))), 0, 255)
+        np.testing.assert_array_equal(_stretched(pixels, pixels), exact)
+
+
+@pytest.mark.parametrize("mask_rows", [(), (2,), (2, 70)])
+def test_a_tiff_is_the_same_in_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mask_rows: tuple[int]) -> None:
+    """Whether an unnamed last band is one of transparency is told by all of it: here by its last rows."""
+    bands = np.random.default_rng(3).integers(1, 60000, (4, 100, 64)).astype(np.uint16)
+    bands[3] = np.where(np.arange(64) < 9, 0, 65535)
+    bands[3, list(mask_rows), 20] = 777
+    path = tmp_path / "a.tif"
+    shape = {"count": 4, "height": 100, "width": 64, "dtype": "uint16"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="GTiff", tiled=True, blockxsize=16, blockysize=16, **shape) as out:
+            out.write(bands)
+    whole, valid = gdal.read_bands(path)
+    monkeypatch.setattr(gdal, "_STRIP_PIXELS", 64 * 32)
+    strips, known = gdal.read_bands(path)
+    np.testing.assert_array_equal(strips, whole)
+    np.testing.assert_array_equal(strips, np.moveaxis(bands[:3], 0, 2))
+    if mask_rows:
+        assert valid is None
+        assert known is None
+    else:
+        assert valid is not None
+        assert known is not None
+        np.testing.assert_array_equal(known, valid)
+        assert known[:, :9].sum() == 0
+        assert known[:, 9:].all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ _STRETCH_PERCENTILES = (0.5, 99.5)
 _RANGE_PERCENTILES = (0.1, 99.9)
 
 _TOP_16_BIT = 65535
+
+_STRIP_PIXELS = 4_000_000
 
 _COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 
@@ -82,8 +85,41 @@ def _stretched(values: NDArray[Any], pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """Values of a picture in 8 bits: as they are where it has 8, else between percentiles of the picture."""
     if pixels.dtype == np.uint8:
         return np.clip(np.rint(values), 0, 255).astype(np.uint8)
-    known = pixels.astype(np.float32)
-    seen = known[known != 0]
-    low, high = np.percentile(seen, _STRETCH_PERCENTILES) if seen.size else (0.0, 1.0)
-    stretched = (values.astype(np.float32) - low) * (255.0 / max(float(high - low), 1e-6))
-    return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
+    low, high = _percentiles(pixels)
+
+    def in_8_bits(numbers: NDArray[Any]) -> NDArray[np.uint8]:
+        stretched = (numbers.astype(np.float32) - low) * (255.0 / max(float(high - low), 1e-6))
+        return np.clip(np.rint(stretched), 0, 255).astype(np.uint8)
+
+    if values.dtype != np.uint16:
+        return in_8_bits(values)
+    # By a table, in strips: in floating numbers a large picture would take ten times its own memory.
+    table = in_8_bits(np.arange(_TOP_16_BIT + 1))
+    found = np.empty(values.shape, np.uint8)
+    for rows in _strips(values):
+        found[rows] = table[values[rows]]
+    return found
+
+
+def _percentiles(pixels: NDArray[np.uint16]) -> tuple[np.float64, np.float64]:
+    """_STRETCH_PERCENTILES of the values other than 0, (0, 1) where there are none: as np.percentile has them."""
+    counts = np.zeros(_TOP_16_BIT + 1, np.int64)
+    for rows in _strips(pixels):
+        counts += np.bincount(pixels[rows].ravel(), minlength=len(counts))
+    counts[0] = 0
+    until = np.cumsum(counts)
+    if not until[-1]:
+        return np.float64(0.0), np.float64(1.0)
+    places = np.array(_STRETCH_PERCENTILES) / 100.0 * (until[-1] - 1)
+    below = np.floor(places).astype(np.int64)
+    first, second = (np.searchsorted(until, at, side="right") for at in (below, np.minimum(below + 1, until[-1] - 1)))
+    share = places - below
+    # From the nearer one, as numpy does.
+    between = np.where(share < 0.5, first + (second - first) * share, second - (second - first) * (1.0 - share))
+    return between[0], between[1]
+
+
+def _strips(pixels: NDArray[Any]) -> Iterator[slice]:
+    """Rows of a picture, some megapixels at a time."""
+    rows = max(1, _STRIP_PIXELS // pixels.shape[1])
+    return (slice(top, top + rows) for top in range(0, pixels.shape[0], rows))

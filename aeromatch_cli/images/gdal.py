@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
+
+# Pixels that are decoded at once, and GDAL's own cache, which would else take a twentieth of the machine.
+_STRIP_PIXELS, _CACHE_MB = 4_000_000, 128
 
 TIFF = frozenset({".tif", ".tiff"})
 SUFFIXES = TIFF | {".jp2", ".j2k"}
@@ -47,25 +51,71 @@ def read_bands(path: Path, part: tuple[int, int, int, int] | None = None) -> tup
     with _opened(path) as source:
         if part is None:
             check_pixels(path, source.width, source.height)
-        window = None if part is None else ((part[1], part[1] + part[3]), (part[0], part[0] + part[2]))
-        extra = _transparency(source)
-        shown = [index for index in source.indexes if index != extra]
-        shown = shown[:3] if len(shown) >= 3 else shown[:1]
-        # One call: in most files the bands of a pixel lie together, and a second call would decode them again.
-        bands = source.read([*shown, extra] if extra else shown, window=window)
-        planes, alpha = bands[: len(shown)], bands[len(shown) :]
-        if bands.dtype.kind not in "iuf":
-            raise ItemError(f"image {path} holds {bands.dtype} numbers: write their magnitudes, as uint16 or float32")
-        masks = [_has_values(planes, [source.nodatavals[index - 1] for index in shown])]
-        if extra:
-            named = source.colorinterp[extra - 1].name == "alpha"
-            masks.append(alpha[0] > 0 if named or _is_mask(alpha[0]) else None)
-        flags = {flag.name for flag in source.mask_flag_enums[0]}
-        if "per_dataset" in flags and "alpha" not in flags:
-            masks.append(source.read_masks(1, window=window) > 0)
-    known = [mask for mask in masks if mask is not None]
-    valid = np.logical_and.reduce(known) if known else None
-    return np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.asarray(planes[0]), valid
+        left, top, width, height = part or (0, 0, source.width, source.height)
+        rows = height if part else _strip_rows(path, source)
+        strips = [(left, y, width, min(rows, top + height - y)) for y in range(top, top + height, rows)]
+        first = _read_strip(path, source, strips[0])
+        if len(strips) == 1:
+            return first.pixels, first.valid(first.alpha_is_mask)
+        pixels = np.empty((height, *first.pixels.shape[1:]), first.pixels.dtype)
+        parts, at = [], 0
+        for strip in strips:
+            found = first if at == 0 else _read_strip(path, source, strip)
+            pixels[at : at + strip[3]] = found.pixels
+            parts.append(replace(found, pixels=found.pixels[:0].copy()))
+            at += strip[3]
+    # Whether the last band is one of transparency, only all of its values tell.
+    alpha_is_mask = all(found.alpha_is_mask for found in parts)
+    valid = [mask for found in parts if (mask := found.valid(alpha_is_mask)) is not None]
+    return pixels, np.concatenate(valid) if valid else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Strip:
+    """Rows of a picture. known: (h, W) by nodata and the file's own mask, None where neither says anything. alpha: (h,
+    W) where a last band that may be one of transparency is not 0."""
+
+    pixels: NDArray[Any]
+    known: BoolArray | None
+    alpha: BoolArray | None
+    alpha_is_mask: bool
+
+    def valid(self, alpha_is_mask: bool) -> BoolArray | None:
+        alpha = self.alpha if alpha_is_mask else None
+        if self.known is None or alpha is None:
+            return alpha if self.known is None else self.known
+        return np.asarray(self.known & alpha)
+
+
+def _strip_rows(path: Path, source: Any) -> int:
+    """Rows that are decoded at once: whole tiles of a TIFF. What is compressed as a whole is decoded once."""
+    if path.suffix.lower() not in TIFF:
+        return int(source.height)
+    tile_rows = int(source.block_shapes[0][0])
+    return max(1, _STRIP_PIXELS // (source.width * tile_rows)) * tile_rows
+
+
+def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> _Strip:
+    left, top, width, height = part
+    window = ((top, top + height), (left, left + width))
+    extra = _transparency(source)
+    shown = [index for index in source.indexes if index != extra]
+    shown = shown[:3] if len(shown) >= 3 else shown[:1]
+    # One call: in most files the bands of a pixel lie together, and a second call would decode them again.
+    bands = source.read([*shown, extra] if extra else shown, window=window)
+    planes, last = bands[: len(shown)], bands[len(shown) :]
+    if bands.dtype.kind not in "iuf":
+        raise ItemError(f"image {path} holds {bands.dtype} numbers: write their magnitudes, as uint16 or float32")
+    known = _has_values(planes, [source.nodatavals[index - 1] for index in shown])
+    flags = {flag.name for flag in source.mask_flag_enums[0]}
+    if "per_dataset" in flags and "alpha" not in flags:
+        mask = source.read_masks(1, window=window) > 0
+        known = mask if known is None else known & mask
+    pixels = np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.array(planes[0])
+    if not extra:
+        return _Strip(pixels, known, None, alpha_is_mask=False)
+    named = source.colorinterp[extra - 1].name == "alpha"
+    return _Strip(pixels, known, last[0] > 0, alpha_is_mask=named or _is_mask(last[0]))
 
 
 def may_have_a_mask(path: Path) -> bool:
@@ -116,7 +166,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
+            with rasterio.Env(GDAL_CACHEMAX=_CACHE_MB), rasterio.open(path) as source:
                 yield source
     except (RasterioError, OSError) as error:
         words = str(error.__cause__ or error)  # rasterio's own refer to "previous exception"
