@@ -164,3 +164,9 @@ def test_a_fisheye_lens_is_named(tmp_path: Path, focal_35mm: int, fisheye: bool)
         write_image(tmp_path / f"{number}.jpg", (400, 300), exif={37386: 2.7, 41989: focal_35mm})
     warnings = read_inputs(tmp_path).warnings
     assert any("probably a fisheye lens" in warning for warning in warnings) == fisheye
+
+
+def test_a_camera_file_of_a_hundred_thousand_brackets_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "deep.json").write_text('{"cameras":' + "[" * 100_000)
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        read_camera_file(tmp_path / "deep.json")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import time
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import pytest
 from make_images import write_image, write_jpeg_2000
 from numpy.typing import NDArray
 from PIL import Image as Picture
+from PIL.PngImagePlugin import PngImageFile, PngInfo
 
 from aeromatch_cli.blocks.exif import exif_or_reason
+from aeromatch_cli.blocks.png import late_chunks
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import normalise
@@ -279,7 +282,6 @@ def test_nothing_is_shrunk_at_full_scale_or_below_one_pixel() -> None:
 
 def _claiming(path: Path, width: int, height: int) -> Path:
     """A PNG of some bytes whose header states a size."""
-    import struct
     import zlib
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -325,3 +327,29 @@ def test_jpeg_2000_that_is_cut_off_is_refused(tmp_path: Path, share: float) -> N
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(ItemError, match=r"a\.jp2"):
         read_pixels(path, colour=True)
+
+
+def test_tags_behind_the_pixels_of_a_png_are_read_without_decoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tags, packet = Picture.Exif(), PngInfo()
+    tags[272] = "Model X"
+    packet.add_itxt("XML:com.adobe.xmp", '<x:xmpmeta xmlns:x="adobe:ns:meta/"/>')
+    path = tmp_path / "a.png"
+    Picture.fromarray(pattern()).save(path, exif=tags, pnginfo=packet)
+    data, chunks, at = path.read_bytes(), [], 8
+    while at < len(data):
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        chunks.append((kind, data[at : at + 12 + length]))
+        at += 12 + length
+    late = (b"eXIf", b"iTXt", b"IEND")
+    parts = [chunk for kind, chunk in chunks if kind not in late] + [chunk for kind, chunk in chunks if kind in late]
+    path.write_bytes(data[:8] + b"".join(parts))
+    monkeypatch.setattr(PngImageFile, "load", None)
+    facts = exif_or_reason(path)
+    assert not isinstance(facts, str)
+    assert facts.model == "Model X"
+    assert late_chunks(path)["xmp"].startswith(b"<x:xmpmeta")
+    plain = exif_or_reason(_claiming(tmp_path / "plain.png", 20_000, 20_000))
+    assert not isinstance(plain, str)
+    assert (plain.width_px, plain.model) == (20_000, "")

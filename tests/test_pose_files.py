@@ -340,3 +340,9 @@ def test_xml_that_cannot_be_read_is_refused_in_words(tmp_path: Path, pose_format
     path.write_text(sound[: len(sound) // 2] if damage == "cut" else bomb)
     with pytest.raises(ConfigError, match=r"cameras\.xml is no XML that can be read: it is cut off, or declares"):
         read_pose_file(path, pose_format)
+
+
+def test_a_list_of_a_hundred_thousand_brackets_is_refused_at_once(tmp_path: Path) -> None:
+    path = write(tmp_path, "deep.json", '{"type":"FeatureCollection","features":' + "[" * 100_000)
+    with pytest.raises(ConfigError, match="no header with a column 'image'"):
+        read_pose_file(path, "auto")

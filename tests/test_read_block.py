@@ -15,7 +15,7 @@ from read_inputs import read_inputs
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import exif_or_reason
 from aeromatch_cli.blocks.read import BlockInputs
-from aeromatch_cli.blocks.scan import image_id, image_ids, scan_images
+from aeromatch_cli.blocks.scan import image_id, image_ids, scan_files, scan_images
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError, InputError
 
@@ -332,3 +332,14 @@ def test_a_camera_file_goes_before_the_cameras_of_a_pose_file(tmp_path: Path) ->
     found = read_inputs(tmp_path / "images", poses, str(own))
     assert [camera.params[0] for camera in found.cameras.values()] == [77.0]
     assert not found.failures
+
+
+def test_names_with_control_characters_are_passed_over(tmp_path: Path) -> None:
+    for name in ("a\nb.jpg", "c\x1b[31m.jpg", "plain.jpg"):
+        write_image(tmp_path / name)
+    names, failures = scan_images(tmp_path)
+    assert names == ["plain.jpg"]
+    assert [(failure.name, failure.image_lost) for failure in failures] == [("a?b.jpg", True), ("c?[31m.jpg", True)]
+    assert all("control characters" in failure.reason for failure in failures)
+    listed, passed_over = scan_files({"a\nb.jpg": 5, "plain.jpg": 5})
+    assert (listed, [failure.name for failure in passed_over]) == (["plain.jpg"], ["a?b.jpg"])

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from conftest import PAGE, UNORIENTED, Site, invoke
 
-from aeromatch_cli.stages import pairs, unchanged
+from aeromatch_cli.errors import ItemError
+from aeromatch_cli.stages import export, pairs, unchanged
 from aeromatch_cli.workspace import read_json
 
 SETTINGS = UNORIENTED
@@ -127,3 +128,17 @@ def test_files_of_the_workspace_and_the_record_itself_do_not_count_as_inputs(don
     (tmp_path / "site" / "run.log").write_text("of the shell")
     done_site("run")
     assert read_json(done_site.work / "finished.json") == before
+
+
+def test_an_export_that_failed_is_tried_again(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(task: export.ExportTask) -> dict[str, object]:
+        raise ItemError(f"{task.folder.name} cannot be written")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(export, "_run_task", fail)
+        first = done_site("run", "--set", "export=[opensfm]")
+        assert (first.code, done_site.failures()) == (1, [("export", "opensfm")])
+        assert done_site("run", "--set", "export=[opensfm]").code == 1
+        assert done_site.failures() == [("export", "opensfm")]
+    assert done_site("run", "--set", "export=[opensfm]").code == 0
+    assert (done_site.work / "export" / "opensfm").is_dir()

@@ -74,6 +74,8 @@ def _tree(path: Path, text: str) -> CameraFile:
         raise ConfigError(
             f"camera file {path}{line} is neither YAML nor JSON: {getattr(error, 'problem', '')}"
         ) from error
+    except RecursionError:
+        raise ConfigError(f"camera file {path} is nested too deeply to be a list of cameras") from None
     if not isinstance(tree, dict):
         raise ConfigError(f"camera file {path} must hold NAME: {{model, width, height, params}}")
     entries = tree.get("cameras", tree)

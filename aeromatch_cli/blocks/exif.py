@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.png import late_chunks
 from aeromatch_cli.blocks.xmp import (
     ALTITUDES,
     LATITUDES,
@@ -139,10 +140,17 @@ def _header(path: Path, notes: list[str]) -> _Header:
     Image.MAX_IMAGE_PIXELS = None
     try:
         with Image.open(path) as image:
+            if image.format == "PNG":
+                image.info |= {name: value for name, value in late_chunks(path).items() if name not in image.info}
+
+            def table() -> Image.Exif:
+                # A PNG's own method decodes all pixels in search of what may stand behind them.
+                return Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
+
             readers: tuple[Callable[[], Mapping[int, Any]], ...] = (
-                lambda: dict(image.getexif()),
-                lambda: dict(image.getexif().get_ifd(_EXIF_IFD)),
-                lambda: dict(image.getexif().get_ifd(_GPS_IFD)),
+                lambda: dict(table()),
+                lambda: dict(table().get_ifd(_EXIF_IFD)),
+                lambda: dict(table().get_ifd(_GPS_IFD)),
             )
             main, exif, gps = _tables(readers, notes)
             # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.

@@ -53,6 +53,7 @@ _OWN_FRAME = "own"
 _ANGLE_SIGMAS = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
 _ALL_SIGMAS = (*_SIGMAS, *_AXIS_SIGMAS, *_ANGLE_SIGMAS)
 _KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", "frame", *_ALL_SIGMAS)
+_LONGEST_NAME = 100  # characters of a column
 _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
@@ -240,6 +241,8 @@ def _columns(line: str) -> tuple[str | None, tuple[str, ...]]:
 
 
 def _canonical(cell: str) -> str:
+    if len(cell) > _LONGEST_NAME:
+        return cell[:_LONGEST_NAME]  # no name, and the pattern would take hours for a hundred thousand brackets
     name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", cell.strip().strip("\"'").strip().lower())
     name = re.sub(r"[\s-]+", "_", name)
     return _ALIASES.get(name, name)

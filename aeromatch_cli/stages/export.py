@@ -57,6 +57,7 @@ def run(context: Context) -> StageReport:
         not context.overwrite
         and last.is_file()
         and (found := read_json(last)).get("fingerprint") == wanted
+        and set(found["facts"]) == {exporter.name for exporter in context.settings.export}  # none failed
         and _complete(context.workspace)
     ):
         report.skipped = report.items
