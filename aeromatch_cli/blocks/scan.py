@@ -21,7 +21,6 @@ _APPLE_DOUBLE = "is macOS metadata (AppleDouble), not an image"
 _EMPTY = "file is empty: copy it again"
 # Line breaks and what else no XML holds: other programs' files are lists of lines, reports are SVG.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ufffe\uffff]")
-_CONTROLLED = "file name holds control characters: rename the file"
 
 
 @dataclass(frozen=True)
@@ -100,13 +99,20 @@ def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[S
             continue
         elif file.startswith("._"):
             failures.append(ScanFailure(name, _APPLE_DOUBLE, False))
-        elif _CONTROL.search(name):
-            failures.append(ScanFailure(_CONTROL.sub("?", name), _CONTROLLED, True))
+        elif (failure := _controlled(name)) is not None:
+            failures.append(failure)
         elif size_bytes == 0:
             failures.append(ScanFailure(name, _EMPTY, True))
         elif not file.startswith("."):
             names.append(name)
     return names, failures
+
+
+def _controlled(name: str) -> ScanFailure | None:
+    readable = _CONTROL.sub("?", name)
+    return (
+        None if readable == name else ScanFailure(readable, "file name holds control characters: rename the file", True)
+    )
 
 
 def _failure_of(path: Path, name: str) -> ScanFailure | None:
@@ -119,8 +125,8 @@ def _failure_of(path: Path, name: str) -> ScanFailure | None:
     except UnicodeEncodeError:
         readable = os.fsencode(name).decode("utf-8", "replace")
         return ScanFailure(readable, "file name is not valid UTF-8: rename the file", True)
-    if _CONTROL.search(name):
-        return ScanFailure(_CONTROL.sub("?", name), _CONTROLLED, True)
+    if (failure := _controlled(name)) is not None:
+        return failure
     try:
         size_bytes = path.stat().st_size
     except OSError as error:

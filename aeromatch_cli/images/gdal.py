@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,28 +54,29 @@ def read_bands(path: Path, part: tuple[int, int, int, int] | None = None) -> tup
         left, top, width, height = part or (0, 0, source.width, source.height)
         rows = height if part else _strip_rows(path, source)
         strips = [(left, y, width, min(rows, top + height - y)) for y in range(top, top + height, rows)]
-        first = _read_strip(path, source, strips[0])
+        pixels, known = _read_strip(path, source, strips[0])
         if len(strips) == 1:
-            return first.pixels, first.valid(first.alpha_is_mask)
-        pixels = np.empty((height, *first.pixels.shape[1:]), first.pixels.dtype)
-        parts, at = [], 0
-        for strip in strips:
-            found = first if at == 0 else _read_strip(path, source, strip)
-            pixels[at : at + strip[3]] = found.pixels
-            parts.append(replace(found, pixels=found.pixels[:0].copy()))
-            at += strip[3]
+            return pixels, known.valid(known.alpha_is_mask)
+        first, parts = pixels, [known]
+        pixels = np.empty((height, *first.shape[1:]), first.dtype)
+        pixels[:rows] = first
+        for strip in strips[1:]:
+            pixels[strip[1] - top : strip[1] - top + strip[3]], known = _read_strip(path, source, strip)
+            parts.append(known)
     # Whether the last band is one of transparency, only all of its values tell.
-    alpha_is_mask = all(found.alpha_is_mask for found in parts)
-    valid = [mask for found in parts if (mask := found.valid(alpha_is_mask)) is not None]
+    alpha_is_mask = all(each.alpha_is_mask for each in parts)
+    valid = [mask for each in parts if (mask := each.valid(alpha_is_mask)) is not None]
     return pixels, np.concatenate(valid) if valid else None
 
 
 @dataclass(frozen=True, eq=False)
-class _Strip:
-    """Rows of a picture. known: (h, W) by nodata and the file's own mask, None where neither says anything. alpha: (h,
-    W) where a last band that may be one of transparency is not 0."""
+class _Known:
+    """Where rows of a picture have values.
 
-    pixels: NDArray[Any]
+    known: (h, W) by nodata and the file's own mask, None where neither says anything. alpha: (h, W) where a last band
+    that may be one of transparency is not 0.
+    """
+
     known: BoolArray | None
     alpha: BoolArray | None
     alpha_is_mask: bool
@@ -95,7 +96,7 @@ def _strip_rows(path: Path, source: Any) -> int:
     return max(1, _STRIP_PIXELS // (source.width * tile_rows)) * tile_rows
 
 
-def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> _Strip:
+def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> tuple[NDArray[Any], _Known]:
     left, top, width, height = part
     window = ((top, top + height), (left, left + width))
     extra = _transparency(source)
@@ -113,9 +114,9 @@ def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> _St
         known = mask if known is None else known & mask
     pixels = np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.array(planes[0])
     if not extra:
-        return _Strip(pixels, known, None, alpha_is_mask=False)
+        return pixels, _Known(known, None, alpha_is_mask=False)
     named = source.colorinterp[extra - 1].name == "alpha"
-    return _Strip(pixels, known, last[0] > 0, alpha_is_mask=named or _is_mask(last[0]))
+    return pixels, _Known(known, last[0] > 0, alpha_is_mask=named or _is_mask(last[0]))
 
 
 def may_have_a_mask(path: Path) -> bool:
