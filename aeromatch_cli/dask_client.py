@@ -23,7 +23,8 @@ def connected(client: Callable[..., Any], scheduler: str, jobs: int) -> Any:
     for name in ("distributed", "distributed.client", "distributed.nanny", "distributed.worker"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if not scheduler:
-        return client(None, n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+        # Port 0: one that is free. Two runs on one machine have their own.
+        return client(None, n_workers=jobs, threads_per_worker=1, dashboard_address="127.0.0.1:0")
     try:
         return _within(_ANSWER_S, lambda: client(scheduler, timeout="10s"))
     except (OSError, ValueError) as error:
@@ -53,6 +54,11 @@ def _within(seconds: float, make: Callable[[], T]) -> T:
     if not found:
         raise TimeoutError(f"no answer within {seconds:.0f} s")
     return found[0]
+
+
+def has_workers(client: Any) -> bool:
+    """Whether any worker is connected now."""
+    return bool(client.scheduler_info()["workers"])
 
 
 def offers_gpu(client: Any) -> bool:

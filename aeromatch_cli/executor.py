@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, Protocol, TypeVar
 
-from aeromatch_cli.dask_client import connected, offers_gpu
+from aeromatch_cli.dask_client import connected, has_workers, offers_gpu
 from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError, lacks_memory
 
 T = TypeVar("T")
@@ -384,9 +384,16 @@ class Executor:
     def _dask_client(self, connect: Callable[..., Any]) -> Any:
         if self._client is None:
             self._client = connected(connect, self._scheduler, self.jobs)
-            self._client.run(single_threaded)
-            if self._scheduler and self._client.dashboard_link:
+            # Of workers that come later, too.
+            self._client.register_worker_callbacks(setup=single_threaded)
+            if self._client.dashboard_link:
                 log.info("dask dashboard at %s", self._client.dashboard_link)
+            if not has_workers(self._client):
+                log.warning(
+                    "warning: the dask scheduler %s has no workers: waiting for one (`dask worker %s --nthreads 1`)",
+                    self._scheduler,
+                    self._scheduler,
+                )
         return self._client
 
 

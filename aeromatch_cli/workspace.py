@@ -171,15 +171,28 @@ class Workspace:
         return self.reports / (f"{stage}.{shard}.json" if shard else f"{stage}.json")
 
     def create(self) -> None:
-        """Make the folder and prove that it can be written; refuse one of another format version."""
+        """Make the folder and prove that it can be written; refuse one of another format version, or with links that
+        lead out of it."""
         with translated_os_errors(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
+        self.check_links()
         self.check_version()
         probe = _temporary_name(self.root / "writable")
         with translated_os_errors(self.root):
             probe.touch()
             probe.unlink()
         remove_stale_temporaries(self.root)
+
+    def check_links(self) -> None:
+        """Raises WorkspaceError where a link leads out of the folder: what is written through it would land there."""
+        root = self.root.resolve()
+        for parent, folders, files in os.walk(root):
+            for path in (Path(parent) / name for name in (*folders, *files)):
+                if path.is_symlink() and not path.resolve().is_relative_to(root):
+                    raise WorkspaceError(
+                        f"{path} is a link that leads out of the workspace, to {path.resolve()}: remove it; to keep "
+                        "results on another disk, place the whole workspace there"
+                    )
 
     def check_version(self) -> None:
         """Raises WorkspaceError where another format version wrote this workspace."""
@@ -226,6 +239,8 @@ def locked(workspace: Workspace, command: str, *, shared: bool) -> Iterator[None
     path = workspace.lock
     with translated_os_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink():  # the lock's words would be written to what it links to
+            path.unlink()
         stream = path.open("a+", encoding="utf-8")
     with stream:
         try:

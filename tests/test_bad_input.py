@@ -296,6 +296,32 @@ def test_unreadable_mask_fails_one_image(site):
     assert site.failures() == [("extract", site.names()[0].replace(".", "_"))]
 
 
+def test_a_mask_that_leads_out_of_its_folder_is_refused(site):
+    masks = site.root / "masks"
+    masks.mkdir()
+    cv2.imwrite(str(site.root / "one.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    mask = masks / f"{site.names()[0]}.png"
+    mask.symlink_to(site.root / "one.png")
+    outcome = site("pairs", "--masks", masks)
+    assert outcome.code == 2
+    assert f"mask {mask} is a link that leads out of {masks}" in outcome.stderr
+    mask.unlink()
+    (masks / "kept.png").write_bytes((site.root / "one.png").read_bytes())
+    mask.symlink_to(masks / "kept.png")
+    assert site("pairs", "--masks", masks).code == 0
+
+
+def test_a_mask_that_is_no_file_is_refused(site):
+    masks = site.root / "masks"
+    masks.mkdir()
+    mask = masks / f"{site.names()[0]}.png"
+    os.mkfifo(mask)
+    outcome = site("pairs", "--masks", masks)
+    assert (outcome.code, f"mask {mask} is no file" in outcome.stderr) == (2, True)
+    outcome = site("pairs", "--masks", "/dev/zero")
+    assert (outcome.code, "masks /dev/zero are neither a folder nor a file" in outcome.stderr) == (2, True)
+
+
 # --- what goes wrong on the way -----------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from conftest import heed_interrupts
-from dask_cluster import Processes, dask_cluster
+from dask_cluster import Processes, dask_cluster, dask_worker
 from make_slow import slow_square
 
 from aeromatch_cli.blocks.exif import read_exif
@@ -329,6 +329,22 @@ def test_a_scheduler_that_is_lost_while_results_travel_is_named(
         pytest.raises(WorkspaceError, match=r"the dask scheduler tcp://.* is lost: start it again"),
     ):
         executor.run(slow_square, [1], "x")
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers_is_said_and_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("distributed")
+    with dask_cluster() as (address, (_, *workers)), caplog.at_level("INFO", logger="aeromatch"):
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+        late = threading.Timer(3.0, lambda: workers.append(dask_worker(address, "--name", "late")))
+        late.start()
+        with Executor("dask", scheduler=address) as executor:
+            assert executor.run(slow_square, [3], "x")[0].value == 9
+        assert f"the dask scheduler {address} has no workers: waiting for one" in caplog.text
+        workers[-1].kill()
+        workers[-1].wait()
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def test_budgets_are_read(text: str, expected: float | None) -> None:
 
 @pytest.mark.parametrize("text", ["8", "GB", "-1GB", "0GB", "8TBB"])
 def test_budgets_that_are_none(text: str) -> None:
-    with pytest.raises(ConfigError, match="write a number with its unit, such as 8GB"):
+    with pytest.raises(ConfigError, match="write a number with its unit, MB or GB, such as 8GB"):
         budget_mb(text)
 
 
@@ -39,6 +39,9 @@ def test_workers_fit_the_budget() -> None:
     assert jobs_within(4000.0, 8, [image(4000, 3000)], network=True)[0] == 1
     with pytest.raises(ConfigError, match=r"a\.jpg has 108\.0 megapixels and takes 1182 MB .* give more --memory"):
         jobs_within(1000.0, 8, [image(12000, 9000)], network=False)
+    assert jobs_within(500.0, 8, [image(400, 300)], network=False)[0] == 1
+    with pytest.raises(ConfigError, match=r"400 MB do not hold it: give more --memory$"):
+        jobs_within(400.0, 8, [image(400, 300)], network=False)
     jobs, remark = jobs_within(1200.0, 8, [image(12000, 9000)], network=False)
     assert jobs == 1
     assert "give more, or smaller images" in remark

@@ -171,6 +171,12 @@ def test_pictures_of_a_web_server(site: Site, web: str) -> None:
         list_remote("http://127.0.0.1:9/images")
 
 
+def test_a_password_in_an_address_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"holds a user or password.*~/\.netrc") as raised:
+        list_remote("https://me:secret@127.0.0.1/images")
+    assert "secret" not in str(raised.value)
+
+
 def test_names_on_a_web_server_are_those_of_the_folder(site: Site, web: str) -> None:
     pytest.importorskip("aiohttp")
     odd = site.image(0).rename(site.images / "Flug ü b&c#1 100%.jpg")

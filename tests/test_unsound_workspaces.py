@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -105,10 +107,44 @@ def test_a_folder_where_a_file_belongs_is_named(done_site: Site) -> None:
     assert "a folder stands where the file belongs; move it away" in outcome.stderr
 
 
-def test_names_that_spreadsheets_run_are_said(site: Site) -> None:
+def test_names_that_spreadsheets_run_are_refused(site: Site) -> None:
     site.image(0).rename(site.images / "=cmd calc.jpg")
     outcome = site("pairs", "--poses", "none", "--set", "orient=none", "--set", "pairs=exhaustive")
-    assert "1 image names begin as formulas do: =cmd calc.jpg" in outcome.stderr
+    assert outcome.code == 1
+    assert "./=cmd calc.jpg: name begins with =, which a spreadsheet runs as a formula: rename" in outcome.stderr
+    tables = "".join(path.read_text() for path in site.work.glob("*.csv"))
+    assert re.search(r"(^|,)\"?=", tables, re.MULTILINE) is None
+
+
+@pytest.mark.parametrize("name", ["export", "verified/{0}.npz"])
+def test_a_link_out_of_the_workspace_is_refused(done_site: Site, tmp_path: Path, name: str) -> None:
+    path = done_site.work / name.format(done_site.names()[0].replace(".", "_"))
+    path.rename(tmp_path / "elsewhere")
+    path.symlink_to(tmp_path / "elsewhere")
+    outcome = done_site("run", "--overwrite")
+    assert outcome.code == 3
+    assert f"{path} is a link that leads out of the workspace, to {tmp_path / 'elsewhere'}: remove it" in outcome.stderr
+    path.unlink()
+    assert done_site("run").code == 0
+
+
+def test_a_link_in_place_of_an_export_goes(done_site: Site) -> None:
+    expected = contents(done_site.work)
+    export = next(path for path in (done_site.work / "export").iterdir() if path.is_dir())
+    export.rename(done_site.work / "moved")
+    export.symlink_to(done_site.work / "moved")
+    assert done_site("export", "--overwrite").code == 0
+    assert not export.is_symlink()
+    shutil.rmtree(done_site.work / "moved")
+    assert contents(done_site.work) == expected
+
+
+def test_the_lock_writes_through_no_link(done_site: Site, tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("kept")
+    (done_site.work / ".lock").unlink()
+    (done_site.work / ".lock").symlink_to(tmp_path / "precious")
+    assert done_site("run").code == 0
+    assert (tmp_path / "precious").read_text() == "kept"
 
 
 def test_a_scheduler_is_for_dask_alone(site: Site) -> None:

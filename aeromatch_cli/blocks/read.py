@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, get_args
@@ -44,8 +44,6 @@ from aeromatch_cli.geometry.angles import Angles
 
 EXIF = "exif"
 FOLDER = "folder"
-# What cells begin with that spreadsheets take for formulas.
-_FORMULA = ("=", "+", "-", "@")
 
 
 class ReadFailure(NamedTuple):
@@ -138,7 +136,6 @@ def block_inputs(
     warnings, failures = _report_scan(passed_over)
     failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
-    warnings += _like_formulas(facts)
     rows: dict[str, PoseRow] = {}
     if lists.pose_list is not None:
         rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}")
@@ -209,17 +206,6 @@ def _images(ids: Mapping[str, str], facts: Mapping[str, ExifFacts], camera_ids: 
         for name, fact in facts.items()
     ]
     return tuple(sorted(images, key=lambda image: image.image_id))
-
-
-def _like_formulas(names: Iterable[str]) -> list[str]:
-    """A word on names that a spreadsheet runs as formulas: results hold names as they are, for programs to read."""
-    found = sorted(name for name in names if name.startswith(_FORMULA))
-    if not found:
-        return []
-    return [
-        f"{len(found)} image names begin as formulas do: {listed(found)}: rename them before a table of the results is "
-        "opened in a spreadsheet, which would run them"
-    ]
 
 
 def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[ReadFailure]]:

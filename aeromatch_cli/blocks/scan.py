@@ -23,6 +23,12 @@ _EMPTY = "file is empty: copy it again"
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ufffe\uffff]")
 
 
+# What cells begin with that spreadsheets run as formulas; tables of the results hold names as they are.
+_FORMULA = ("=", "+", "-", "@")
+# Thumbnails that network storage makes, one folder of them in every folder.
+_THUMBNAILS = "@eaDir"
+
+
 @dataclass(frozen=True)
 class ScanFailure:
     """Something that has the name of an image and is none.
@@ -67,7 +73,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
         if parent != str(folder) and {"block.json", "images.csv", "pairs.csv"} <= set(files):  # a workspace
             subfolders.clear()
             continue
-        subfolders[:] = sorted(name for name in subfolders if not name.startswith("."))
+        subfolders[:] = sorted(name for name in subfolders if not name.startswith(".") and name != _THUMBNAILS)
         for name in subfolders:
             if Path(name).suffix.lower() in SUFFIXES:
                 relative = (Path(parent) / name).relative_to(folder).as_posix()
@@ -95,11 +101,11 @@ def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[S
             continue
         if name.startswith("/") or ".." in name.replace("\\", "/").split("/"):
             failures.append(ScanFailure(name, "leads out of the folder: it is not read", True))
-        elif any(part.startswith(".") for part in parents):
+        elif any(part.startswith(".") or part == _THUMBNAILS for part in parents):
             continue
         elif file.startswith("._"):
             failures.append(ScanFailure(name, _APPLE_DOUBLE, False))
-        elif (failure := _controlled(name)) is not None:
+        elif (failure := _unfit(name)) is not None:
             failures.append(failure)
         elif size_bytes == 0:
             failures.append(ScanFailure(name, _EMPTY, True))
@@ -108,11 +114,15 @@ def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[S
     return names, failures
 
 
-def _controlled(name: str) -> ScanFailure | None:
+def _unfit(name: str) -> ScanFailure | None:
+    """Names that lists, tables or XML of the results could not hold, or that a spreadsheet would run."""
     readable = _CONTROL.sub("?", name)
-    return (
-        None if readable == name else ScanFailure(readable, "file name holds control characters: rename the file", True)
-    )
+    if readable != name:
+        return ScanFailure(readable, "file name holds control characters: rename the file", True)
+    if name.startswith(_FORMULA):
+        words = f"name begins with {name[0]}, which a spreadsheet runs as a formula: rename the file or folder"
+        return ScanFailure(f"./{name}", words, True)
+    return None
 
 
 def _failure_of(path: Path, name: str) -> ScanFailure | None:
@@ -125,7 +135,7 @@ def _failure_of(path: Path, name: str) -> ScanFailure | None:
     except UnicodeEncodeError:
         readable = os.fsencode(name).decode("utf-8", "replace")
         return ScanFailure(readable, "file name is not valid UTF-8: rename the file", True)
-    if (failure := _controlled(name)) is not None:
+    if (failure := _unfit(name)) is not None:
         return failure
     try:
         size_bytes = path.stat().st_size

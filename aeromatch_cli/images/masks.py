@@ -9,20 +9,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import world_rays
 from aeromatch_cli.geometry.footprints import sees_horizon
 
 
 def mask_path(masks: str, name: str) -> Path | None:
-    """Mask of an image: COLMAP's naming (a/1.jpg.png), the bare stem (a/1.png), or the one file for all."""
+    """Mask of an image: COLMAP's naming (a/1.jpg.png), the bare stem (a/1.png), or the one file for all.
+
+    Raises ConfigError where that is no file (a pipe, a device), or a link that leads out of the folder.
+    """
     if not masks:
         return None
     root = Path(masks)
     if root.is_file():
         return root
     for candidate in (root / f"{name}.png", (root / name).with_suffix(".png")):
-        if candidate.is_file():
-            return candidate
+        if not candidate.exists():
+            continue
+        if not candidate.is_file():
+            raise ConfigError(f"mask {candidate} is no file: put a picture there, or remove it")
+        if not candidate.resolve().is_relative_to(root.resolve()):
+            raise ConfigError(
+                f"mask {candidate} is a link that leads out of {root}, to {candidate.resolve()}: copy that file there; "
+                "one mask for all images is given by --masks FILE"
+            )
+        return candidate
     return None
 
 

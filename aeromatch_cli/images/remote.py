@@ -17,7 +17,7 @@ from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, unquote
+from urllib.parse import quote, unquote, urlsplit
 
 from aeromatch_cli.errors import ConfigError, ItemError
 
@@ -181,12 +181,19 @@ def _opened(folder: str) -> tuple[Any, str]:
     import fsspec
 
     url = folder
+    if "@" in urlsplit(folder).netloc and folder.startswith(("http://", "https://")):
+        raise ConfigError(
+            "the address of --images holds a user or password, which settings, logs and results would repeat: leave "
+            "them out and put them into ~/.netrc (machine HOST login USER password WORD)"
+        )
     if "://" not in folder:
         url = f"zip://::file://{Path(folder).resolve().as_posix()}"
     protocol = url.partition("://")[0].rpartition("::")[2]
     with _named_errors(folder, kind=ConfigError):
         try:
-            system, root = fsspec.core.url_to_fs(url)
+            # aiohttp reads ~/.netrc and the variables of proxies only when asked to.
+            options = {"client_kwargs": {"trust_env": True}} if protocol in ("http", "https") else {}
+            system, root = fsspec.core.url_to_fs(url, **options)
         except ImportError as error:
             extra = _EXTRAS.get(protocol)
             remedy = f"pip install 'aeromatch[{extra}]'" if extra else str(error)

@@ -122,8 +122,9 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
 
 def _check_folders(settings: Settings, workspace: Workspace) -> None:
     given = settings.block
-    if given.masks and not Path(given.masks).exists():
-        raise ConfigError(f"masks {given.masks} do not exist: give a folder of masks, or one mask, with --masks")
+    if given.masks and not (Path(given.masks).is_dir() or Path(given.masks).is_file()):
+        what = "are neither a folder nor a file" if Path(given.masks).exists() else "do not exist"
+        raise ConfigError(f"masks {given.masks} {what}: give a folder of masks, or one mask, with --masks")
     if Path(given.images).resolve() == workspace.root.resolve():
         raise ConfigError(
             f"the workspace is the images folder {given.images}: its pictures would be taken for images; "
@@ -132,8 +133,10 @@ def _check_folders(settings: Settings, workspace: Workspace) -> None:
 
 
 def _mask_warnings(settings: Settings, images: Sequence[Image]) -> list[str]:
+    """What is wrong with the masks. Raises as `mask_path`."""
     masks = settings.block.masks
-    if not masks or any(mask_path(masks, image.name) for image in images):
+    found = [mask_path(masks, image.name) for image in images]
+    if not masks or any(found):
         return []
     name = images[0].name
     return [f"no mask in {masks} belongs to an image: the mask of {name} would be {name}.png"]

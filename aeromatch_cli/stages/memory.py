@@ -36,7 +36,7 @@ def budget_mb(text: str) -> float | None:
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", text)
     unit = _UNITS.get(match[2].upper()) if match else None
     if match is None or unit is None or not float(match[1]) > 0.0:
-        raise ConfigError(f"memory {text!r}: write a number with its unit, such as 8GB or 6000MB")
+        raise ConfigError(f"memory {text!r}: write a number with its unit, MB or GB, such as 8GB or 6000MB")
     return float(match[1]) * unit
 
 
@@ -51,11 +51,14 @@ def jobs_within(budget: float, jobs: int, images: Iterable[Image], *, network: b
     megapixels = largest.width_px * largest.height_px / 1e6
     need = worker_mb(megapixels, network=network)
     most = int((budget - _PARENT_MB) / need)
-    decoded = _BASE_MB + _DECODED_BYTES * megapixels + _PARENT_MB
+    # A single worker of small images is this process itself.
+    alone = need - _BASE_MB + _PARENT_MB
+    decoded = min(alone, _BASE_MB + _DECODED_BYTES * megapixels + _PARENT_MB)
     if decoded > budget:
         raise ConfigError(
             f"memory: {largest.name} has {megapixels:.1f} megapixels and takes {decoded:.0f} MB with this program once "
-            f"it is decoded; {budget:.0f} MB do not hold it: give more --memory, or reduce the image"
+            f"it is decoded; {budget:.0f} MB do not hold it: give more --memory"
+            + (", or reduce the image" if budget > _PARENT_MB else "")
         )
     if most >= jobs:
         return jobs, ""

@@ -77,18 +77,26 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         if previous.exists() and not folder.exists():
             previous.rename(folder)
         for leftover in (partial, previous):
-            if leftover.exists():
-                shutil.rmtree(leftover)
+            _remove(leftover)
         partial.mkdir(parents=True)
         yield partial
+        if folder.is_symlink():
+            folder.unlink()
         if folder.exists():
             folder.rename(previous)
         partial.rename(folder)
-        if previous.exists():
-            shutil.rmtree(previous)
+        _remove(previous)
     except OSError as error:
         raise WorkspaceError(
             f"export folder {folder} cannot be written: {error}; check free space and permissions, then run again"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove(folder: Path) -> None:
+    """A folder, or what else has its name: a file, or a link, of which only the link goes."""
+    if folder.is_dir() and not folder.is_symlink():
+        shutil.rmtree(folder)
+    else:
+        folder.unlink(missing_ok=True)
