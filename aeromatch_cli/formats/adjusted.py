@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray
-from aeromatch_cli.formats.features import load_arrays
+from aeromatch_cli.formats.archives import load_arrays
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import IntArray
-from aeromatch_cli.formats.features import load_arrays
+from aeromatch_cli.formats.archives import load_arrays
 
 # image_id0, image_id1 -> fingerprint of the verified entry, and rows of its matches.
 Dropped = Mapping[tuple[str, str], tuple[str, IntArray]]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zipfile
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
@@ -19,21 +16,10 @@ from aeromatch_cli.data import (
     JoinedKeypoints,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.reading import readable, say_damaged
+from aeromatch_cli.formats.archives import load_arrays, load_checked
+from aeromatch_cli.formats.reading import say_damaged
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
-
-# What numpy and zipfile raise on contents that are no sound archive, or not the arrays that it should hold.
-ARCHIVE_FAULTS = (
-    KeyError,
-    IndexError,
-    ValueError,
-    TypeError,
-    EOFError,
-    RuntimeError,
-    struct.error,
-    zipfile.BadZipFile,
-)
 
 
 def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> None:
@@ -75,8 +61,7 @@ def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8
 def features_fingerprint(path: Path) -> str | None:
     """Fingerprint recorded in a feature file, None when the file is absent or any of its arrays is broken."""
     try:
-        check_sums(path)
-        return str(load_arrays(path, ("fingerprint",))["fingerprint"])
+        return str(load_checked(path, ("fingerprint",))["fingerprint"])
     except BrokenFileError as error:
         say_damaged(path, error)
         return None
@@ -91,17 +76,3 @@ def known_fingerprint(path: Path) -> str | None:
 def _cached_fingerprint(path: Path, stamp: int) -> str | None:
     del stamp  # only tells rewritten files apart
     return features_fingerprint(path)
-
-
-def check_sums(path: Path) -> None:
-    """Compare all contents with the archive's checksums (CRC-32), also those that no stage reads any more because what
-    follows is up to date. Raises BrokenFileError.
-    """
-    with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(path) as archive:
-        if name := archive.testzip():
-            raise BrokenFileError(str(path), f"{name} contradicts its checksum")
-
-
-def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    with readable(path, *ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in (*names, *(name for name in optional if name in archive))}

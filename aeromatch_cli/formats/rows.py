@@ -18,7 +18,7 @@ from aeromatch_cli.data import (
     Verdict,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.features import ARCHIVE_FAULTS, check_sums, load_arrays
+from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, load_checked
 from aeromatch_cli.formats.reading import readable, say_damaged
 
 # Features of rows that earlier versions wrote.
@@ -132,8 +132,7 @@ def row_fingerprints(path: Path) -> Mapping[str, str]:
 def _cached_fingerprints(path: Path, stamp: int) -> Mapping[str, str]:
     del stamp  # only tells rewritten files apart
     try:
-        check_sums(path)
-        arrays = load_arrays(path, ("image_id1", "fingerprint"))
+        arrays = load_checked(path, ("image_id1", "fingerprint"))
         with readable(path, *ARCHIVE_FAULTS):
             return {str(i): str(f) for i, f in zip(arrays["image_id1"], arrays["fingerprint"], strict=True)}
     except BrokenFileError as error:
@@ -145,8 +144,8 @@ class _Row:
     """A row archive, read once."""
 
     def __init__(self, path: Path) -> None:
-        with readable(path, *ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
-            self._arrays = {name: archive[name] for name in archive.files}
+        self._arrays = load_all(path)
+        with readable(path, *ARCHIVE_FAULTS):
             self._offsets = self._arrays["offsets"]
 
     def __getitem__(self, name: str) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.formats.features import load_arrays
+from aeromatch_cli.formats.archives import load_arrays
 from aeromatch_cli.orientation.process import quiet_pycolmap, run_process
 
 # Visual words per image, and the limits of their number.

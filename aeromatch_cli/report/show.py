@@ -15,8 +15,9 @@ import numpy as np
 
 from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
-from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
+from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.formats.archives import load_all
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
@@ -296,13 +297,8 @@ def _file_lines(path: Path) -> Iterator[str]:
     """Arrays of an .npz, keys of a .json, columns of a .csv."""
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                for name in archive.files:
-                    array = archive[name]
-                    yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
-        except (OSError, ValueError, EOFError) as error:
-            raise BrokenFileError(str(path), str(error)) from error
+        for name, array in load_all(path).items():
+            yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
     elif suffix == ".json":
         yield from json.dumps(read_json(path), indent=2, ensure_ascii=False).splitlines()
     elif suffix == ".csv":

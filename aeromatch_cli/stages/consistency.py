@@ -15,8 +15,9 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
+from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
-from aeromatch_cli.formats.features import check_sums, read_keypoints
+from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
 from aeromatch_cli.orientation.alone import block_of_pair
@@ -147,9 +148,9 @@ def final_block(context: Context) -> AdjustedBlock | None:
 
 def _whole(workspace: Workspace, facts: Mapping[str, Any]) -> bool:
     """Whether the files that a report vouches for are there. Raises BrokenFileError where one is damaged."""
-    check_sums(workspace.dropped)
+    load_checked(workspace.dropped, ())
     if workspace.final.is_file():
-        check_sums(workspace.final)
+        load_checked(workspace.final, ())
     if "observations_left" not in facts:
         return False  # of an earlier version
     return workspace.final.is_file() == (facts["observations_left"] < facts["observations"])
