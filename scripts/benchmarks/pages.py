@@ -36,6 +36,8 @@ PAGES: Mapping[str, str] = {
     "bench_auto_real": "auto.md",
     "bench_growth_blocks": "large.md",
     "bench_device": "large.md",
+    "bench_memory": "large.md",
+    "bench_speed": "large.md",
     "bench_blocks": "methods.md",
     "bench_thinned": "methods.md",
     "bench_fusion": "fusion.md",
