@@ -31,6 +31,7 @@ TABLE: Table = {
     "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
     "memory": ("benchmarks.memory", "peak memory of whole runs against --memory, on large images"),
     "device": ("benchmarks.device", "images and pairs a second of the networks on a CUDA device, beside its limit"),
+    "runtimes": ("benchmarks.runtimes", "the networks on a CPU by several runtimes, and how equal their answers are"),
     "pages": ("benchmarks.pages", "brings the first lines of docs/results up to date with the tables' stamps"),
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
 }

@@ -71,6 +71,7 @@ PAGES: Mapping[str, str] = {
     "bench_descriptors": "extraction.md",
     "bench_extraction": "extraction.md",
     "bench_extraction_float32": "extraction.md",
+    "bench_runtimes": "extraction.md",
 }
 _TABLE = re.compile(r"<!-- table (\S+): start -->\n(.*?)<!-- table \1: end -->", re.DOTALL)
 _STAMP = re.compile(r"<!-- stamp (\{.*\}) -->\n")
