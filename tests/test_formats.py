@@ -349,6 +349,14 @@ def test_a_flipped_byte_in_any_array_leaves_no_fingerprint(tmp_path: Path, kind:
     assert not last(path)  # type: ignore[operator]
 
 
+def test_compressed_archives_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    np.savez_compressed(path, image_id1=np.zeros(10_000_000), fingerprint=np.array(["f"]))
+    with pytest.raises(WorkspaceError, match=r"image_id1\.npy is compressed"):
+        read_match_row(path)
+    assert features_fingerprint(path) is None
+
+
 def test_archives_with_objects_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     np.savez(path, image_id1=np.array([{"a": 1}], dtype=object), fingerprint=np.array(["f"]), offsets=np.array([0, 0]))

@@ -17,8 +17,9 @@ from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.formats.adjusted import read_adjusted
-from aeromatch_cli.formats.archives import load_all
+from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
 from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
@@ -297,8 +298,10 @@ def _file_lines(path: Path) -> Iterator[str]:
     """Arrays of an .npz, keys of a .json, columns of a .csv."""
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        for name, array in load_all(path).items():
-            yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
+        with readable(path, *ARCHIVE_FAULTS), np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                array = archive[name]
+                yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
     elif suffix == ".json":
         yield from json.dumps(read_json(path), indent=2, ensure_ascii=False).splitlines()
     elif suffix == ".csv":
