@@ -147,7 +147,7 @@ def test_a_tiff_is_the_same_in_strips(tmp_path: Path, monkeypatch: pytest.Monkey
         with rasterio.open(path, "w", driver="GTiff", tiled=True, blockxsize=16, blockysize=16, **shape) as out:
             out.write(bands)
     whole, valid = gdal.read_bands(path)
-    monkeypatch.setattr(gdal, "_STRIP_PIXELS", 64 * 32)
+    monkeypatch.setattr(gdal, "STRIP_PIXELS", 64 * 32)
     strips, known = gdal.read_bands(path)
     np.testing.assert_array_equal(strips, whole)
     np.testing.assert_array_equal(strips, np.moveaxis(bands[:3], 0, 2))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
-_SIGNATURE_BYTES, _CRC_BYTES = 8, 4
+from aeromatch_cli.images.png import chunks
+
 _LONGEST_CHUNK = 16 * 2**20  # of what is read of it; EXIF has 64 KB at most
 _XMP = b"XML:com.adobe.xmp"
 
@@ -13,24 +13,21 @@ _XMP = b"XML:com.adobe.xmp"
 def late_chunks(path: Path) -> dict[str, bytes]:
     """Pillow's `info` of EXIF ("exif") and uncompressed XMP ("xmp") in any chunk; what is cut off is left out.
 
-    Source: PNG specification, third edition, 5.3 (chunks), 11.3.3.4 (iTXt), 11.3.3.6 (eXIf).
+    Source: PNG specification, third edition, 11.3.3.4 (iTXt), 11.3.3.6 (eXIf).
     """
     found: dict[str, bytes] = {}
     size = path.stat().st_size
     with path.open("rb") as stream:
-        stream.seek(_SIGNATURE_BYTES)
-        while len(head := stream.read(8)) == 8:
-            length, kind = struct.unpack(">I4s", head)
-            after = stream.tell() + length + _CRC_BYTES
-            if after > size or kind == b"IEND":
+        for kind, start, length, after in chunks(stream):
+            if after > size:
                 break
             if kind in (b"eXIf", b"iTXt") and length <= _LONGEST_CHUNK:
+                stream.seek(start)
                 data = stream.read(length)
                 if kind == b"eXIf":
                     found["exif"] = b"Exif\0\0" + data
                 elif (packet := _packet(data)) is not None:
                     found["xmp"] = packet
-            stream.seek(after)
     return found
 
 

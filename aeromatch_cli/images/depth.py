@@ -18,7 +18,8 @@ _RANGE_PERCENTILES = (0.1, 99.9)
 
 _TOP_16_BIT = 65535
 
-_STRIP_PIXELS = 4_000_000
+# Pixels that are decoded or stretched at once.
+STRIP_PIXELS = 4_000_000
 
 _COLOUR_LEVELS = 7  # squares of 1, 2, 4 ... 64 px
 
@@ -121,5 +122,5 @@ def _percentiles(pixels: NDArray[np.uint16]) -> tuple[np.float64, np.float64]:
 
 def _strips(pixels: NDArray[Any]) -> Iterator[slice]:
     """Rows of a picture, some megapixels at a time."""
-    rows = max(1, _STRIP_PIXELS // pixels.shape[1])
+    rows = max(1, STRIP_PIXELS // pixels.shape[1])
     return (slice(top, top + rows) for top in range(0, pixels.shape[0], rows))

@@ -5,6 +5,7 @@ The only file that knows OpenCV's BGR.
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import gdal
 from aeromatch_cli.images.depth import in_16_bits, to_gray8
+from aeromatch_cli.images.png import SIGNATURE, chunks
 
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
 # announce (ITU T.81, table B.1): frames, tables, scans, application data, comments.
@@ -24,8 +26,6 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
-
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
@@ -104,17 +104,8 @@ def _png_fault(data: bytes) -> str:
     A chunk may claim any length: OpenCV makes room for up to 2 GB of it, and fills that, before it finds that the file
     ends; so no chunk may claim more than is left.
     """
-    if not data.startswith(_PNG):
-        return ""
-    place = len(_PNG)
-    while place + 8 <= len(data):
-        kind = data[place + 4 : place + 8]
-        # Length and kind stand before the contents, a checksum behind them.
-        place += 12 + int.from_bytes(data[place : place + 4], "big")
-        if place > len(data):
-            return "cut off: its PNG data ends early; copy it again or remove it"
-        if kind == b"IEND":
-            break
+    if data.startswith(SIGNATURE) and any(after > len(data) for *_, after in chunks(io.BytesIO(data))):
+        return "cut off: its PNG data ends early; copy it again or remove it"
     return ""
 
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.images.depth import STRIP_PIXELS
 
-# Pixels that are decoded at once, and GDAL's own cache, which would else take a twentieth of the machine.
-_STRIP_PIXELS, _CACHE_MB = 4_000_000, 128
+# GDAL's own cache, which would else take a twentieth of the machine.
+_CACHE_MB = 128
 
 TIFF = frozenset({".tif", ".tiff"})
 SUFFIXES = TIFF | {".jp2", ".j2k"}
@@ -93,7 +94,7 @@ def _strip_rows(path: Path, source: Any) -> int:
     if path.suffix.lower() not in TIFF:
         return int(source.height)
     tile_rows = int(source.block_shapes[0][0])
-    return max(1, _STRIP_PIXELS // (source.width * tile_rows)) * tile_rows
+    return max(1, STRIP_PIXELS // (source.width * tile_rows)) * tile_rows
 
 
 def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> tuple[NDArray[Any], _Known]:
