@@ -163,3 +163,18 @@ def test_budget_border_and_mask() -> None:
     assert len(heat_keypoints(np.full((64, 64), 90, np.uint8), 50)[0]) == 0
     away = np.linalg.norm(points[:, None] - points[None], axis=2) + 99.0 * np.eye(len(points))
     assert away.min() > 3.0
+
+
+@pytest.mark.slow
+def test_corners_that_show_nothing_are_not_looked_at_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    picture, valid = texture(700, 900), np.zeros((700, 900), np.uint8)
+    cv2.fillPoly(valid, [np.array([[450, 20], [880, 350], [450, 680], [20, 350]], np.int32)], 1)
+    shown = valid.astype(bool)
+    there, whole = heat(picture, shown=shown), heat(picture)
+    inside = cv2.erode(valid, np.ones((9, 9), np.uint8)).astype(bool)
+    assert np.array_equal(there[inside], whole[inside])
+    assert (there < -49.0).mean() > 0.15
+    found = heat_keypoints(picture, 500, shown)
+    monkeypatch.setattr("aeromatch_cli.strategies.extractors.heat._shown", lambda level, valid: None)
+    for with_corners, without in zip(heat_keypoints(picture, 500, shown), found, strict=True):
+        assert np.array_equal(with_corners, without)

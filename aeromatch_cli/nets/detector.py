@@ -12,6 +12,7 @@ CVPR workshops 2018; their maxima over scale after the paper of method 3 (J. Geo
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,6 +33,8 @@ FIELD_PX = REACH_PX + 8 * CELL_PX
 # On a CPU the layers work on such squares, with what these depend on. Answers of 32 MB and more would take twice the
 # seconds, because the system hands out their memory anew for every layer.
 PIECE_PX = 384
+# Log odds where none are wanted: below all others.
+UNSHOWN = -50.0
 # Contrast below which a picture is taken for flat, of the gray range 0-1: one gray level of 8 bit.
 _FLAT = 1.0 / 255.0
 
@@ -82,21 +85,24 @@ class Detector(nn.Module):
         self.layers = nn.ModuleList(TurnedConvolution(CHANNELS, CHANNELS, 3, gap) for gap in _GAPS)
         self.last = TurnedConvolution(CHANNELS, 1, 3)
 
-    def forward(self, gray: Tensor) -> Tensor:
+    def forward(self, gray: Tensor, shown: Tensor | None = None) -> Tensor:
         """Logits (N, 1, H, W) float32 of the heat (confidence 0-1 by a sigmoid) for gray (N, 1, H, W), 0-1.
 
         Pixels beyond the picture are as bright as its local mean. Pieces of a picture give the numbers of the whole
         where they start at multiples of CELL_PX, FIELD_PX away from their edges.
+
+        shown: (H, W) bool, where the heat is wanted. On a CPU it is UNSHOWN farther away: a turned ground view shows
+        nothing in its corners, up to half of it.
         """
         if gray.ndim != 4 or gray.shape[1] != 1:
             raise ValueError(f"gray has shape {tuple(gray.shape)} instead of (N, 1, H, W)")
         x = evened(gray.float())
         if x.device.type != "cpu" or self.training:
             return self._layered(x)
-        out = torch.empty_like(x)
-        for own_y, needed_y, kept_y in _pieces(x.shape[2]):
-            for own_x, needed_x, kept_x in _pieces(x.shape[3]):
-                out[..., own_y, own_x] = self._layered(x[..., needed_y, needed_x])[..., kept_y, kept_x]
+        out = torch.full_like(x, UNSHOWN)
+        for own_y, own_x in _pieces(x.shape[2], x.shape[3], shown):
+            (needed_y, kept_y), (needed_x, kept_x) = _reached(own_y, x.shape[2]), _reached(own_x, x.shape[3])
+            out[..., own_y, own_x] = self._layered(x[..., needed_y, needed_x])[..., kept_y, kept_x]
         return out
 
     def _layered(self, x: Tensor) -> Tensor:
@@ -111,15 +117,31 @@ class Detector(nn.Module):
             return F.conv2d(x.float(), weights.float(), biases.float(), padding=self.last.padding)
 
 
-def _pieces(length_px: int) -> list[tuple[slice, slice, slice]]:
-    """Pieces of PIECE_PX of an axis, or less: each, the pixels that its heat depends on, and where it lies in these."""
+def _pieces(height_px: int, width_px: int, shown: Tensor | None) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of pieces of PIECE_PX squared of a picture, or less: of each the part around what is shown."""
+    for rows in _parts(height_px):
+        for columns in _parts(width_px):
+            if shown is None:
+                yield rows, columns
+            elif (inside := shown[rows, columns]).any():
+                yield _around(inside.any(1), rows.start), _around(inside.any(0), columns.start)
+
+
+def _parts(length_px: int) -> list[slice]:
     count = -(-length_px // PIECE_PX)
-    cuts = [length_px * k // count for k in range(count + 1)]
-    found = []
-    for start, end in pairwise(cuts):
-        first, last = max(0, start - REACH_PX), min(length_px, end + REACH_PX)
-        found.append((slice(start, end), slice(first, last), slice(start - first, end - first)))
-    return found
+    return [slice(*ends) for ends in pairwise(length_px * k // count for k in range(count + 1))]
+
+
+def _around(flags: Tensor, start_px: int) -> slice:
+    """From the first to the last that is set, counted from `start_px`."""
+    places = flags.nonzero()
+    return slice(start_px + int(places[0]), start_px + int(places[-1]) + 1)
+
+
+def _reached(own: slice, length_px: int) -> tuple[slice, slice]:
+    """The pixels of an axis that the heat of some depends on, and where these lie among them."""
+    first, last = max(0, own.start - REACH_PX), min(length_px, own.stop + REACH_PX)
+    return slice(first, last), slice(own.start - first, own.stop - first)
 
 
 def evened(gray: Tensor) -> Tensor:

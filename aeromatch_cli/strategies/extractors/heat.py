@@ -52,7 +52,7 @@ def heat_keypoints(
 
     network = network or load_detector()
     levels = levels_of(gray)
-    maps = [heat(level.gray, network) for level in levels]
+    maps = [heat(level.gray, network, shown=_shown(level, valid)) for level in levels]
     points, sizes, logits = maxima(levels, maps)
     inside = _within(valid, points, sizes)
     points, sizes, logits = points[inside], sizes[inside], logits[inside]
@@ -63,8 +63,13 @@ def heat_keypoints(
     return points[order], sizes[order], 1.0 / (1.0 + np.exp(-ranks[order]))
 
 
-def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_AREA_PX) -> Logits:
-    """Log odds (H, W) of the heat of a gray picture (H, W), computed in tiles, then smoothed."""
+def heat(
+    gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_AREA_PX, shown: BoolArray | None = None
+) -> Logits:
+    """Log odds (H, W) of the heat of a gray picture (H, W), computed in tiles, then smoothed.
+
+    shown: (H, W) where they are wanted; a few pixels off its edge they may be lower than they are.
+    """
     import cv2
     import torch
 
@@ -78,8 +83,10 @@ def heat(gray: NDArray[np.uint8], network: Any = None, tile_area_px: int = TILE_
         for tile in tiles(width, height, tile_area_px, _TILE_MARGIN_PX):
             assert tile.x0 % CELL_PX == 0
             assert tile.y0 % CELL_PX == 0
-            piece = torch.from_numpy(np.ascontiguousarray(gray[tile.y0 : tile.y1, tile.x0 : tile.x1]))
-            found = network(piece.to(device).float()[None, None] / 255.0)[0, 0].cpu().numpy()
+            window = slice(tile.y0, tile.y1), slice(tile.x0, tile.x1)
+            piece = torch.from_numpy(np.ascontiguousarray(gray[window])).to(device).float()[None, None] / 255.0
+            known = () if shown is None else (torch.from_numpy(np.ascontiguousarray(shown[window])),)
+            found = network(piece, *known)[0, 0].cpu().numpy()
             left, top, right, bottom = tile.core
             x0, x1 = int(np.ceil(max(left, tile.x0))), int(np.ceil(min(right, tile.x1)))
             y0, y1 = int(np.ceil(max(top, tile.y0))), int(np.ceil(min(bottom, tile.y1)))
@@ -136,6 +143,21 @@ def refined(logits: Logits, x: IntArray, y: IntArray) -> tuple[FloatArray, Float
     steps[~has_top] = 0.0
     steps = np.clip(steps, -1.0, 1.0)
     return steps, v[1][1] + 0.5 * (steps[:, 0] * slope_x + steps[:, 1] * slope_y)
+
+
+def _shown(level: Level, valid: BoolArray | None) -> BoolArray | None:
+    """Which pixels (h, w) of a level touch what the picture shows; None where that is all of it.
+
+    No keypoint that stays depends on others: it lies farther inside than its size of SIZE_PX of its level, and a
+    maximum, its smoothing and its neighbours in the next coarser level reach less far.
+    """
+    if valid is None or bool(valid.all()):
+        return None
+    import cv2
+
+    height, width = level.gray.shape
+    shares = cv2.resize(valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(shares > 0.0)
 
 
 def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
