@@ -21,8 +21,6 @@ _APPLE_DOUBLE = "is macOS metadata (AppleDouble), not an image"
 _EMPTY = "file is empty: copy it again"
 # Line breaks and what else no XML holds: other programs' files are lists of lines, reports are SVG.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ufffe\uffff]")
-
-
 # What cells begin with that spreadsheets run as formulas; tables of the results hold names as they are.
 _FORMULA = ("=", "+", "-", "@")
 # Thumbnails that network storage makes, one folder of them in every folder.

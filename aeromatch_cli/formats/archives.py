@@ -39,7 +39,7 @@ _PREFIX_BYTES = 10
 def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Arrays of an archive by name, those of `optional` where it has them. Raises BrokenFileError."""
     with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(path) as archive:
-        held = archive.NameToInfo
+        held = set(archive.namelist())
         return {
             name: _array(_contents(archive, f"{name}.npy"))
             for name in (*names, *(name for name in optional if f"{name}.npy" in held))

@@ -13,7 +13,6 @@ descriptors with a cosine of 0.99 and more; of the mutual best pairs the same.
 
 from __future__ import annotations
 
-import json
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,8 +46,7 @@ _SIZE_PX = (1000, 750)
 _STRONGEST = 500
 
 Arrays = tuple[NDArray[np.float32], ...]
-Answer = tuple[NDArray[np.float32], ...]
-Call = Callable[[Arrays], Answer]
+Call = Callable[[Arrays], Arrays]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +57,7 @@ class Case:
     network: nn.Module
     given: Arrays
     calibration: Arrays
-    equal: Callable[[Answer, Answer], float]
+    equal: Callable[[Arrays, Arrays], float]
 
 
 class Layers(nn.Module):
@@ -127,7 +125,7 @@ def _side(loaded: Any, features: Features, keypoints: int) -> Arrays:
     return side.places.numpy(), side.descriptors.numpy()
 
 
-def _equal_maxima(answer: Answer, right: Answer) -> float:
+def _equal_maxima(answer: Arrays, right: Arrays) -> float:
     found, wanted = (_maxima(heat[0][0, 0]) for heat in (answer, right))
     distances = np.abs(found[:, None] - wanted[None]).max(axis=2)
     return float((distances.min(axis=1) <= 1.0).mean())
@@ -142,12 +140,12 @@ def _maxima(heat: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.column_stack(np.unravel_index(order, heat.shape))
 
 
-def _share(answer: Answer, right: Answer, least: float) -> float:
+def _share(answer: Arrays, right: Arrays, least: float) -> float:
     """Of unit vectors (N, D) those whose cosine with the right ones is at least so large."""
     return float(((answer[0] * right[0]).sum(axis=1) >= least).mean())
 
 
-def _equal_pairs(answer: Answer, right: Answer) -> float:
+def _equal_pairs(answer: Arrays, right: Arrays) -> float:
     found, wanted = (_mutual(one[0]) for one in (answer, right))
     return len(found & wanted) / max(1, len(wanted))
 
@@ -250,7 +248,7 @@ def measured(folder: Path, threads: int, keypoints: int, repeats: int, seed: int
     rows: list[Row] = []
     with torch.inference_mode():
         for case in cases(folder / "block", keypoints, seed):
-            right: Answer = ()
+            right: Arrays = ()
             for name, (made, needs) in RUNTIMES.items():
                 if any(find_spec(package) is None for package in needs):
                     continue
@@ -293,7 +291,7 @@ def main(arguments: Sequence[str]) -> None:
             rows += pool.submit(measured, args.out, threads, args.keypoints, args.repeats, args.seed).result()
         write_rows(args.out / "runtimes.json", rows)
     options.publish(
-        args, table_of(json.loads((args.out / "runtimes.json").read_text(encoding="utf-8"))) + "\n",
+        args, table_of(rows) + "\n",
         args.out / "runtimes.md", table="bench_runtimes", command=options.command_line(parser, args),
         versions=stamps.of_networks("detector", "orientation", "geodesc", "lightglue"),
     )  # fmt: skip

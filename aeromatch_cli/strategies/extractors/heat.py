@@ -52,7 +52,8 @@ def heat_keypoints(
 
     network = network or load_detector()
     levels = levels_of(gray)
-    maps = [heat(level.gray, network, shown=_shown(level, valid)) for level in levels]
+    seen = None if valid is None or bool(valid.all()) else valid.astype(np.float32)
+    maps = [heat(level.gray, network, shown=_shown(level, seen)) for level in levels]
     points, sizes, logits = maxima(levels, maps)
     inside = _within(valid, points, sizes)
     points, sizes, logits = points[inside], sizes[inside], logits[inside]
@@ -145,19 +146,18 @@ def refined(logits: Logits, x: IntArray, y: IntArray) -> tuple[FloatArray, Float
     return steps, v[1][1] + 0.5 * (steps[:, 0] * slope_x + steps[:, 1] * slope_y)
 
 
-def _shown(level: Level, valid: BoolArray | None) -> BoolArray | None:
-    """Which pixels (h, w) of a level touch what the picture shows; None where that is all of it.
+def _shown(level: Level, seen: NDArray[np.float32] | None) -> BoolArray | None:
+    """Which pixels (h, w) of a level touch what the picture shows: where `seen` (H, W) is 1, not 0. None for all.
 
     No keypoint that stays depends on others: it lies farther inside than its size of SIZE_PX of its level, and a
     maximum, its smoothing and its neighbours in the next coarser level reach less far.
     """
-    if valid is None or bool(valid.all()):
+    if seen is None:
         return None
     import cv2
 
     height, width = level.gray.shape
-    shares = cv2.resize(valid.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(shares > 0.0)
+    return np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA) > 0.0)
 
 
 def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
