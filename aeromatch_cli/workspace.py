@@ -133,16 +133,21 @@ class Workspace:
         return self.root / "report" / "files.json"
 
     def enhanced(self, image_id: str, suffix: str) -> Path:
-        return self.root / "enhanced" / f"{image_id}{suffix}"
+        return self._pictures / "enhanced" / f"{image_id}{suffix}"
 
     def views(self, image_id: str) -> Path:
-        return self.root / "simulated" / image_id / "views.json"
+        return self._pictures / "simulated" / image_id / "views.json"
 
     def view(self, image_id: str, view_name: str) -> Path:
-        return self.root / "simulated" / image_id / f"{view_name}.png"
+        return self._pictures / "simulated" / image_id / f"{view_name}.png"
 
     def features(self, image_id: str) -> Path:
-        return (self.features_of or self).root / "features" / f"{image_id}.npz"
+        return self._pictures / "features" / f"{image_id}.npz"
+
+    @property
+    def _pictures(self) -> Path:
+        """Where features lie, and the records of the views that they were found in."""
+        return (self.features_of or self).root
 
     def matches(self, image_id0: str) -> Path:
         return self.root / "matches" / f"{image_id0}.npz"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import sqlite3
 
 import numpy as np
@@ -204,6 +205,8 @@ def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(
     with (site.work / "steps.csv").open(newline="") as stream:
         assert {row["steps"] for row in csv.DictReader(stream)} == {"first+guided"}
     assert not (site.work / "steps" / "guided" / "features").exists()
+    extracted = json.loads((site.work / "steps" / "guided" / "reports" / "extract.json").read_text())
+    assert extracted["skipped"] == extracted["items"] == IMAGES
     first, guided = (_rows(site.work / "steps" / step / "verified") for step in ("first", "guided"))
     whole = _rows(site.work / "verified")
     assert len(whole) == len(guided) == len(first)
