@@ -251,6 +251,22 @@ def test_pairs_with_ample_matches_are_not_searched_again():
     np.testing.assert_array_equal(settled.indices, plain.indices)
 
 
+def test_a_search_goes_on_from_the_matches_of_a_plain_one(monkeypatch):
+    """The same as from nothing, without another scan."""
+    rng = np.random.default_rng(3)
+    kinds = np.concatenate([np.arange(400), np.arange(100)])  # some twice: told apart by their places alone
+    first, second = (described(s, d) for s, d in zip(scene(rng, 500), noisy_twins(kinds, rng), strict=True))
+    geometry = pair_of(POSE0, POSE1)
+    plain = Nearest()(first, second, geometry)
+    guided = Nearest(guided=True, guide_below_matches=9999)
+    whole = guided(first, second, geometry)
+    assert len(whole.indices) > len(plain.indices) >= 100
+    monkeypatch.setattr(Nearest, "scan", lambda *_: pytest.fail("scanned"))
+    again = guided.again(first, second, geometry, plain)
+    np.testing.assert_array_equal(again.indices, whole.indices)
+    np.testing.assert_allclose(again.scores, whole.scores, atol=1e-6)
+
+
 @pytest.mark.parametrize(("probability", "stays"), [(0.9, True), (0.005, False)])
 def test_matches_that_only_a_network_sees_stay_where_place_and_size_agree(probability, stays):
     rng = np.random.default_rng(9)

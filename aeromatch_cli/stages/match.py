@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
@@ -98,21 +99,36 @@ def run_task(task: MatchTask) -> RowResult:
     old = rows.readable(read_match_row, path, task.overwrite)
     features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
     ahead = matched_in_batches(task.matchers, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
-    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead))
+    first = task.workspace.features_of
+    scanned = None if first is None else read_match_row(first.matches(task.image_id0))
+    row = rows.redo(task.image_id0, task.pairs, old, lambda pair: _match_pair(task, pair, features0, ahead, scanned))
     write_atomically(path, lambda stream: write_match_row(stream, row.entries))
     return RowResult(len(row.made), sum(len(entry.matches.indices) for entry in row.made), row.failures)
 
 
-def _match_pair(task: MatchTask, pair: PairTask, features0: Features, ahead: dict[str, Matches]) -> MatchEntry:
-    """ahead: matches of pairs that are there already, which are taken out."""
+def _match_pair(
+    task: MatchTask,
+    pair: PairTask,
+    features0: Features,
+    ahead: dict[str, Matches],
+    scanned: Mapping[str, MatchEntry] | None,
+) -> MatchEntry:
+    """ahead: matches of pairs that are there already, which are taken out. scanned: what the step before has found in
+    the same features."""
     ids, matcher = (task.image_id0, pair.image_id1), task.matchers[pair.image_id1]
+    features = rows.features_of(task.workspace, *ids)
     matches = ahead.pop(pair.image_id1, None)
+    if matches is None and scanned is not None and isinstance(matcher, Search) and not matcher.network:
+        before = scanned.get(pair.image_id1)
+        if before is None or before.features != features:
+            raise ItemError("the step before has no matches of these features: run the same command again")
+        matches = matcher.again(*_sides(task, pair, features0), pair.geometry, before.matches)
     if matches is None:
         sources = (task.sources[ids[0]], task.sources[ids[1]]) if matcher.reads_pixels else None
         matches = compared(matcher, _sides(task, pair, features0), pair.geometry, sources)
         for source in sources or ():
             check_unchanged(source)
-    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, rows.features_of(task.workspace, *ids))
+    return MatchEntry(pair.image_id1, pair.fingerprint, matcher.name, matches, features)
 
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:

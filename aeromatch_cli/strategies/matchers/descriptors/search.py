@@ -11,7 +11,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import BoolArray, Features, FloatArray, Matches, PairGeometry
+from aeromatch_cli.data import BoolArray, Features, FloatArray, IntArray, Matches, PairGeometry
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.prediction import Windows, search_windows
 from aeromatch_cli.strategies import Strategy
@@ -103,6 +103,10 @@ class Search(Strategy):
         """
         return finished(self.steps(features0, features1, geometry), self.run_network)
 
+    def again(self, features0: Features, features1: Features, geometry: PairGeometry, scanned: Matches) -> Matches:
+        """The call, where a cheaper search has already found the matches `scanned` of the same features."""
+        return finished(self.steps(features0, features1, geometry, scanned), self.run_network)
+
     @property
     def batches_pairs(self) -> bool:
         """Whether the network is faster for many pairs at once."""
@@ -112,14 +116,19 @@ class Search(Strategy):
         """One output for each input that `steps` yields. Raises TypeError in a matcher without a network."""
         raise TypeError(f"{type(self).__name__} has no network")
 
-    def steps(self, features0: Features, features1: Features, geometry: PairGeometry) -> Steps[Matches]:
-        """The call as a generator: it yields inputs for the network."""
+    def steps(
+        self, features0: Features, features1: Features, geometry: PairGeometry, scanned: Matches | None = None
+    ) -> Steps[Matches]:
+        """The call as a generator: it yields inputs for the network. scanned: as in `again`."""
         comparable = comparable_views(features0, features1, self.max_direction_deg)
         source, *enhanced = (comparable & which for which in appearances(features0, features1))
         windows = self.windows(features0, geometry) if self.guided else None
         where = Where(windows, undistort(geometry.camera1, features1.keypoints_px)) if windows is not None else None
         comparison = Comparison(features0, features1, geometry, source)
-        found = self._first_scan(comparison)
+        if scanned is None or enhanced:  # nobody knows in which of both pictures they were found
+            found = self._first_scan(comparison)
+        else:
+            found = _as_found(scanned, features0, features1)
         comparison = replace(comparison, where=where)
         found = comparison.within(found)
         if len(found.rows) < self.guide_below_matches:
@@ -182,6 +191,23 @@ class Search(Strategy):
             sigmas=self.sigmas,
             sigma_px=self.sigma_px,
         )
+
+
+def _as_found(matches: Matches, features0: Features, features1: Features) -> Found:
+    """Of each match the first descriptors of its keypoints in its views."""
+    sides = [
+        _first_descriptors(features, matches.indices[:, side], matches.view_pairs[:, side])
+        for side, features in enumerate((features0, features1))
+    ]
+    return Found(sides[0], sides[1], 1.0 - matches.scores.astype(np.float64))
+
+
+def _first_descriptors(features: Features, keypoint_idx: IntArray, view_idx: IntArray) -> IntArray:
+    """The first descriptor (N,) of keypoints (N,) in views (N,)."""
+    views = len(features.view_angles_deg)
+    codes = features.descriptor_keypoint_idx.astype(np.int64) * views + features.view_idx
+    order = np.argsort(codes, kind="stable")
+    return order[np.searchsorted(codes[order], keypoint_idx.astype(np.int64) * views + view_idx)]
 
 
 def _matches(comparison: Comparison, found: Found) -> Matches:
