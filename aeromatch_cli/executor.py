@@ -191,6 +191,7 @@ class Executor:
         self._tried = 0
         self._sizes: Sequence[int] | None = None
         self._pool: ProcessPoolExecutor | None = None
+        self._workers = 0  # of the pool
         self._client: Any = None
 
     def __enter__(self) -> Executor:
@@ -281,11 +282,13 @@ class Executor:
         waiting = list(range(len(tasks)))
         in_flight: list[int] = []
         while waiting:
+            self._start(min(self.jobs, len(tasks)))
             in_flight = self._drain(function, tasks, waiting, outcomes)
             waiting = [index for index in waiting if index not in outcomes and index not in in_flight]
             # A dead worker (killed for memory, a crash in a native library) takes the pool with it and does not say
             # which task it had: each task that was in flight is tried again alone, and blamed only if it dies alone.
             for index in in_flight:
+                self._start(min(self.jobs, len(tasks)))
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
                     words = "its worker process died (out of memory, or a crash in a library)"
@@ -297,8 +300,8 @@ class Executor:
         self, function: Callable[[T], R], tasks: Sequence[T], indices: Sequence[int], outcomes: dict[int, Outcome[R]]
     ) -> list[int]:
         """Run the tasks at `indices`; returns those in flight when a worker died, none if all went well."""
-        pool = self._processes()
-        queue = iter(indices)
+        assert self._pool is not None
+        pool, queue = self._pool, iter(indices)
         flying: dict[Future[Outcome[R]], int] = {}
         try:
             while True:
@@ -320,24 +323,27 @@ class Executor:
             self._pool = None
             return sorted(flying.values())
 
-    def _processes(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            with _worker_environment():
-                self._pool = ProcessPoolExecutor(self.jobs, mp_context=_WorkerContext(), initializer=_worker_start)
-                # Spawning is lazy: make every worker now, while the environment says one thread. They are born deaf
-                # to Ctrl-C: before their initializer has run they would print tracebacks.
-                with _interrupts_held():
-                    first = [self._pool.submit(os.getpid) for _ in range(self.jobs)]
-                try:
-                    for future in first:
-                        future.result()
-                except BrokenProcessPool:
-                    self._pool = None
-                    raise ConfigError(
-                        f"worker processes die at their start (too little memory for {self.jobs} jobs, or a script "
-                        "without `if __name__ == '__main__':`); use --executor serial"
-                    ) from None
-        return self._pool
+    def _start(self, workers: int) -> None:
+        """A pool of at least so many workers."""
+        if self._pool is not None and self._workers >= workers:
+            return
+        self.close()
+        with _worker_environment():
+            self._pool = ProcessPoolExecutor(workers, mp_context=_WorkerContext(), initializer=_worker_start)
+            self._workers = workers
+            # Spawning is lazy: make every worker now, while the environment says one thread. They are born deaf
+            # to Ctrl-C: before their initializer has run they would print tracebacks.
+            with _interrupts_held():
+                first = [self._pool.submit(os.getpid) for _ in range(workers)]
+            try:
+                for future in first:
+                    future.result()
+            except BrokenProcessPool:
+                self._pool = None
+                raise ConfigError(
+                    f"worker processes die at their start (too little memory for {workers} jobs, or a script "
+                    "without `if __name__ == '__main__':`); use --executor serial"
+                ) from None
 
     def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T], *, network: bool) -> list[Outcome[R]]:
         try:

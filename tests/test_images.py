@@ -220,6 +220,11 @@ def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:
     expected = np.ones((60, 80), bool)
     expected[:, :10] = False
     np.testing.assert_array_equal(valid, expected)
+    noise = np.where(np.random.default_rng(1).random((60, 80)) < 0.6, 0, 100).astype(np.uint8)
+    _, numbers = cv2.connectedComponents((noise == 0).astype(np.uint8), connectivity=4)
+    edge = np.concatenate([numbers[0], numbers[-1], numbers[:, 0], numbers[:, -1]])
+    np.testing.assert_array_equal(without_frames(noise), ~np.isin(numbers, edge[edge > 0]))
+    assert not without_frames(noise).all()
 
 
 # --- sky ------------------------------------------------------------------------------------------------------------

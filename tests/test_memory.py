@@ -37,14 +37,18 @@ def test_workers_fit_the_budget() -> None:
     assert jobs_within(64000.0, 8, [image(4000, 3000)], network=False) == (8, "")
     assert jobs_within(64000.0, 8, [], network=False) == (8, "")
     assert jobs_within(4000.0, 8, [image(4000, 3000)], network=True)[0] == 1
-    with pytest.raises(ConfigError, match=r"a\.jpg has 108\.0 megapixels and takes 1182 MB .* give more --memory"):
-        jobs_within(1000.0, 8, [image(12000, 9000)], network=False)
+    with pytest.raises(
+        ConfigError, match=r"a\.jpg has 108\.0 megapixels, .* about 2396 MB .* more --memory, or .*size"
+    ):
+        jobs_within(2300.0, 8, [image(12000, 9000)], network=False)
+    reduced = jobs_within(2300.0, 8, [image(12000, 9000)], network=False, max_size_px=6000)
+    assert reduced == (1, "memory: 1 of 8 workers, as each needs about 1374 MB for images of 27 megapixels")
     assert jobs_within(500.0, 8, [image(400, 300)], network=False)[0] == 1
     with pytest.raises(ConfigError, match=r"400 MB do not hold it: give more --memory$"):
         jobs_within(400.0, 8, [image(400, 300)], network=False)
-    jobs, remark = jobs_within(1200.0, 8, [image(12000, 9000)], network=False)
+    jobs, remark = jobs_within(2400.0, 8, [image(12000, 9000)], network=True)
     assert jobs == 1
-    assert "give more, or smaller images" in remark
+    assert "with a network more than 2400 MB may be needed" in remark
 
 
 def test_an_executor_keeps_to_its_limit() -> None:
@@ -54,6 +58,18 @@ def test_an_executor_keeps_to_its_limit() -> None:
         executor.limit(2)  # no more than before
         assert executor.jobs == 1
         assert [outcome.value for outcome in executor.run(abs, [-1, -2], "count")] == [1, 2]
+
+
+def test_no_more_workers_than_tasks() -> None:
+    """A thousand jobs for a few images would start as many processes."""
+    with Executor("processes", 1000) as executor:
+        workers = []
+        for tasks in ([1, 2], [1, 2, 3], [1, 2]):
+            executor.run(abs, tasks, "count")
+            assert executor._pool is not None
+            workers.append(set(executor._pool._processes))
+        assert [len(found) for found in workers] == [2, 3, 3]
+        assert workers[1] == workers[2]
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from typing import Any
 from aeromatch_cli.blocks.lenses import Nearest, of_colmap
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.cameras import MODELS, colmap_params, focal_px
 
 _ENTRY_KEYS = ("model", "width", "height", "params")
@@ -36,7 +37,7 @@ class CameraFile:
 def read_camera_file(path: Path) -> CameraFile:
     """Reads a camera file of any accepted form. Raises ConfigError with file and line or key."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = given_bytes(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ConfigError(
@@ -76,6 +77,8 @@ def _tree(path: Path, text: str) -> CameraFile:
         ) from error
     except RecursionError:
         raise ConfigError(f"camera file {path} is nested too deeply to be a list of cameras") from None
+    except ValueError:
+        raise ConfigError(f"camera file {path} holds a number of too many digits") from None
     if not isinstance(tree, dict):
         raise ConfigError(f"camera file {path} must hold NAME: {{model, width, height, params}}")
     entries = tree.get("cameras", tree)

@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 
 # Control points so many extents of the block, and so many metres more, from its middle are elsewhere.
@@ -92,9 +93,9 @@ class _Row:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return given_bytes(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        said = getattr(error, "strerror", None) or error
+        said = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ConfigError(f"control points {path} cannot be read ({said}): give ODM's gcp_list.txt") from error
 
 

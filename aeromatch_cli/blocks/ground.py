@@ -13,6 +13,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import check_given
 from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ def open_dem(
             raise ConfigError(f"--ground {path}: no such file, and no number: give metres, a DEM or auto")
         raise ConfigError(f"the DEM {path} needs image positions to find the block on it; give poses or a constant")
     try:
+        check_given(path)
         with rasterio.open(path) as dataset:
             source_crs, notes = _source_crs(dataset, path, crs)
             absolute = np.asarray(positions_m, dtype=np.float64) + np.asarray(origin_m)
@@ -116,8 +118,9 @@ def open_dem(
             reach = MAX_DISTANCE_FACTOR * float(absolute[:, 2].max() - np.nanmin(coarse))
             margin = float(np.clip(reach, *_MARGIN_M))
             heights, transform = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS)
-    except RasterioError as error:
-        raise ConfigError(f"cannot read the DEM {path}: {error}; give a GeoTIFF of heights or a constant") from error
+    except (RasterioError, OSError) as error:
+        said = getattr(error, "strerror", None) or error
+        raise ConfigError(f"cannot read the DEM {path}: {said}; give a GeoTIFF of heights or a constant") from error
     known = np.isfinite(heights)
     median = float(np.median(heights[known]))
     if not known.all():

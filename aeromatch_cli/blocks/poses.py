@@ -36,6 +36,7 @@ from typing import Any, Literal, cast
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 
 PositionKind = Literal["grid", "geographic"]
 AttitudeKind = Literal["omega_phi_kappa", "yaw_pitch_roll", "quaternion", "none"]
@@ -192,16 +193,16 @@ def _fault(path: Path, fault: str, images: Mapping[int, str]) -> str:
 
 def _text(path: Path) -> str:
     try:
-        raw = path.read_bytes()
+        raw = given_bytes(path)
     except OSError as error:
         raise ConfigError(
             f"pose list {path} cannot be read ({error.strerror}): give a CSV file, or exif, with --poses"
         ) from error
-    encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    kind, encoding = ("UTF-16", "utf-16") if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else ("UTF-8", "utf-8-sig")
     try:
         text = raw.decode(encoding)
     except UnicodeDecodeError as error:
-        raise ConfigError(f"pose list {path} is not {encoding[:6].upper()} text: save it as UTF-8 CSV") from error
+        raise ConfigError(f"pose list {path} is not {kind} text: save it as UTF-8 CSV") from error
     if "\0" in text:
         raise ConfigError(f"pose list {path} is a binary file: give a CSV or TXT file")
     return text

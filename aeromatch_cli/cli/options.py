@@ -162,6 +162,7 @@ Jobs = Annotated[
     typer.Option(
         "--jobs",
         min=0,
+        max=1024,
         envvar="AEROMATCH_JOBS",
         show_envvar=False,
         rich_help_panel=_WORK,

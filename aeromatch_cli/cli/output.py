@@ -28,6 +28,7 @@ EXIT_SOME_FAILED = 1
 EXIT_INTERRUPTED = 130
 # Where the application keeps the arguments as they were written, in the object of the root context.
 ARGUMENTS = "aeromatch.arguments"
+_FAILURES_SHOWN = 5
 
 
 def guarded(
@@ -88,6 +89,11 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
     say = said(quiet)
     for line in result.lines:
         say(line)
+    if quiet:  # what failed is an error
+        for failure in result.failures[:_FAILURES_SHOWN]:
+            printed(": ".join(failure), err=True)
+        if len(result.failures) > _FAILURES_SHOWN:
+            printed(f"and {len(result.failures) - _FAILURES_SHOWN} more", err=True)
     return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
 
 

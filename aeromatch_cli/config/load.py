@@ -110,6 +110,11 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     if not is_yaml and source in preset_names():
         text, origin, folder = read_text(_preset_folder() / f"{source}.yaml"), f"preset {source}", None
+    elif (path / ".lock").is_file():
+        raise ConfigError(
+            f"{source!r} is a workspace whose run has not got as far as to write its settings: let it end, or run the "
+            "same command again"
+        )
     elif path.is_dir():
         raise ConfigError(f"{source!r} is a folder: give a folder of images with --images, as in: --images {source}")
     elif is_yaml or path.is_file():
@@ -121,8 +126,12 @@ def _read_tree(source: str) -> tuple[dict[str, Any], str]:
         )
     try:
         differences = yaml.load(text, UniqueKeyLoader) or {}
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except RecursionError:
+        raise ConfigError(f"{origin} is nested too deeply for settings") from None
+    except yaml.YAMLError as error:
         raise ConfigError(f"{origin} is not YAML: {error}") from None
+    except ValueError:
+        raise ConfigError(f"{origin} holds a number of too many digits, or a date that no calendar has") from None
     if not isinstance(differences, dict):
         raise ConfigError(f"{origin} must hold keys and values at the top, not a {type(differences).__name__}")
     if folder is not None:

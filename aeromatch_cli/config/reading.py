@@ -8,16 +8,17 @@ from typing import Any
 import yaml
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 
 
 def read_text(path: Path) -> str:
     """The text of a file. Raises ConfigError where it cannot be read or is not UTF-8."""
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return given_bytes(path).decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"cannot read configuration {path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"cannot read configuration {path}: {error}; save it as UTF-8") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"configuration {path} is not UTF-8 text: save it as UTF-8") from None
 
 
 class UniqueKeyLoader(yaml.SafeLoader):

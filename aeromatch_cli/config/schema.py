@@ -130,7 +130,9 @@ class RunSettings(_Section):
         description="Address of a dask scheduler, such as tcp://10.0.0.1:8786, with executor=dask. Empty: what "
         "DASK_SCHEDULER_ADDRESS names, else a local cluster.",
     )
-    jobs: int = Field(0, ge=0, description="Number of worker processes; 0 = one per core. Larger: faster, more memory.")
+    jobs: int = Field(
+        0, ge=0, le=1024, description="Number of worker processes; 0 = one per core. Larger: faster, more memory."
+    )
     memory: str = Field(
         "",
         description="Memory that all workers together may use, such as 8GB: fewer of them run side by side where they "

@@ -1,8 +1,10 @@
-"""What reading a file of the workspace may raise."""
+"""Reading files: those that a user names, and what reading one of the workspace may raise."""
 
 from __future__ import annotations
 
+import errno
 import logging
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +12,19 @@ from pathlib import Path
 from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 
 log = logging.getLogger("aeromatch")
+
+
+def given_bytes(path: Path) -> bytes:
+    """Contents of a file that a user names. Raises OSError, of pipes and devices too: their reading may never end."""
+    check_given(path)
+    return path.read_bytes()
+
+
+def check_given(path: Path) -> None:
+    """Raises OSError for what is missing, or neither a file nor a folder."""
+    kind = path.stat().st_mode
+    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+        raise OSError(errno.EINVAL, "it is a pipe or a device")
 
 
 def say_damaged(path: Path, error: BrokenFileError) -> None:

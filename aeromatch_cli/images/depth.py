@@ -97,7 +97,7 @@ def _stretched(values: NDArray[Any], pixels: NDArray[Any]) -> NDArray[np.uint8]:
     # By a table, in strips: in floating numbers a large picture would take ten times its own memory.
     table = in_8_bits(np.arange(_TOP_16_BIT + 1))
     found = np.empty(values.shape, np.uint8)
-    for rows in _strips(values):
+    for rows in strips(*values.shape[:2]):
         found[rows] = table[values[rows]]
     return found
 
@@ -105,7 +105,7 @@ def _stretched(values: NDArray[Any], pixels: NDArray[Any]) -> NDArray[np.uint8]:
 def _percentiles(pixels: NDArray[np.uint16]) -> tuple[np.float64, np.float64]:
     """_STRETCH_PERCENTILES of the values other than 0, (0, 1) where there are none: as np.percentile has them."""
     counts = np.zeros(_TOP_16_BIT + 1, np.int64)
-    for rows in _strips(pixels):
+    for rows in strips(*pixels.shape[:2]):
         counts += np.bincount(pixels[rows].ravel(), minlength=len(counts))
     counts[0] = 0
     until = np.cumsum(counts)
@@ -120,7 +120,7 @@ def _percentiles(pixels: NDArray[np.uint16]) -> tuple[np.float64, np.float64]:
     return between[0], between[1]
 
 
-def _strips(pixels: NDArray[Any]) -> Iterator[slice]:
+def strips(height_px: int, width_px: int) -> Iterator[slice]:
     """Rows of a picture, some megapixels at a time."""
-    rows = max(1, STRIP_PIXELS // pixels.shape[1])
-    return (slice(top, top + rows) for top in range(0, pixels.shape[0], rows))
+    rows = max(1, STRIP_PIXELS // width_px)
+    return (slice(top, top + rows) for top in range(0, height_px, rows))

@@ -12,6 +12,7 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import world_rays
 from aeromatch_cli.geometry.footprints import sees_horizon
+from aeromatch_cli.images.depth import strips
 
 
 def mask_path(masks: str, name: str) -> Path | None:
@@ -49,15 +50,14 @@ def below_horizon(camera: Camera, world_rotation: FloatArray) -> BoolArray:
     xs, ys = np.arange(0.0, width + 15, 16), np.arange(0.0, height + 15, 16)
     grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     up = np.nan_to_num(world_rays(camera, world_rotation, grid)[:, 2], nan=1.0).reshape(len(ys), len(xs))
-    return _interpolate(up, xs, ys, width, height) < 0.0
-
-
-def _interpolate(values: FloatArray, xs: FloatArray, ys: FloatArray, width: int, height: int) -> FloatArray:
-    rows = np.array([np.interp(np.arange(width), xs, row) for row in values])
+    found = np.empty((height, width), bool)
+    rows = np.array([np.interp(np.arange(width), xs, row) for row in up])
     t = np.interp(np.arange(height), ys, np.arange(len(ys), dtype=float))
     lower = np.minimum(t.astype(int), len(ys) - 2)
-    weight = (t - lower)[:, None]
-    return rows[lower] * (1 - weight) + rows[lower + 1] * weight
+    for strip in strips(height, width):
+        below, weight = lower[strip], (t[strip] - lower[strip])[:, None]
+        found[strip] = rows[below] * (1 - weight) + rows[below + 1] * weight < 0.0
+    return found
 
 
 def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
@@ -71,7 +71,8 @@ def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
     borders = (flat[0], flat[-1], flat[:, 0], flat[:, -1])
     if all(np.count_nonzero(line == 0) < 0.5 * line.size for line in borders):
         return None
-    zero = (flat == 0).astype(np.uint8)
-    _, labels = cv2.connectedComponents(zero, connectivity=4)
-    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    return ~np.isin(labels, edge[edge > 0])
+    # With one more black pixel all around, all frames are what hangs together with the first corner.
+    black = np.ones((flat.shape[0] + 2, flat.shape[1] + 2), np.uint8)
+    np.equal(flat, 0, out=black[1:-1, 1:-1], casting="unsafe")
+    cv2.floodFill(black, None, (0, 0), 2, flags=4)
+    return np.asarray(black[1:-1, 1:-1] != 2)

@@ -12,6 +12,7 @@ from aeromatch_cli.blocks.ground import ConstantGround, DemGround, SeveralGround
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, FloatArray, Ground
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.orientation.dem import Terrain
 from aeromatch_cli.orientation.judgement import heights_above_m
@@ -21,7 +22,9 @@ from aeromatch_cli.strategies.orienters import GivenPoses
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
 # that differs by more than so many standard deviations of a position, whichever is more.
 _SAID_SHARE, _SAID_SIGMAS = 0.1, 3.0
-# One that differs by this share is wrong: views and footprints of it would miss each other.
+# No ground lies farther above or below the zero of its heights.
+_FARTHEST_M = 100_000.0
+# A stated ground that differs by this share is wrong: views and footprints of it would miss each other.
 _WRONG_SHARE = 0.3
 # Heights above the take-off point differ from those above ground by more than this only where something is wrong.
 _ALTITUDE_SHARE = 0.25
@@ -36,10 +39,10 @@ def ground_fingerprint(settings: Settings) -> str:
 def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None, str, tuple[str, ...]]:
     """The ground that settings or the camera file state, where it comes from in words, and remarks; else None."""
     text = settings.block.ground
-    try:
-        return ConstantGround(float(text) - inputs.origin_m[2]), f"given: {float(text):g} m", ()
-    except ValueError:
-        pass
+    if (z_m := _number(text)) is not None:
+        if not abs(z_m) <= _FARTHEST_M:
+            raise ConfigError(f"--ground {text}: no height in metres; give one, a DEM or auto")
+        return ConstantGround(z_m - inputs.origin_m[2]), f"given: {z_m:g} m", ()
     if text != "auto":
         positions = np.array([pose.center_m for pose in inputs.poses.values()]).reshape(-1, 3)
         dem, remarks = open_dem(Path(text), inputs.crs, inputs.origin_m, positions)
@@ -47,6 +50,13 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
     if inputs.ground_hint_z_m is not None and inputs.ground_is_stated:
         return ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source, ()
     return None, "", ()
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def judged_ground(

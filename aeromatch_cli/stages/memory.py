@@ -12,8 +12,8 @@ from aeromatch_cli.errors import ConfigError
 # together, whichever are more: a view of a turned or tilted image is larger than the image.
 _BASE_MB = 350.0
 _BYTES_PER_PIXEL = 12.0
-# Colours as decoded, and gray beside them.
-_DECODED_BYTES = 4.0
+# Of a picture while it is decoded: its colours twice, their gray, and where it is valid.
+_DECODED_BYTES = 8.0
 _TILE_MB = 700.0
 _TILE_MEGAPIXELS = 4.0
 # PyTorch and the layers of a network.
@@ -23,10 +23,12 @@ _PARENT_MB = 400.0
 _UNITS = {"MB": 1.0, "GB": 1e3, "MIB": 1.048576, "GIB": 1073.741824, "M": 1.0, "G": 1e3}
 
 
-def worker_mb(megapixels: float, *, network: bool = False) -> float:
-    """Peak of one worker. megapixels: of the image, or of all its views, whichever are more."""
+def worker_mb(megapixels: float, *, network: bool = False, stored: float = 0.0) -> float:
+    """Peak of one worker. megapixels: of the raster worked on, or of all its views, whichever are more. stored: of the
+    picture in its file, where that is reduced."""
     tile = min(_TILE_MB, _TILE_MB * megapixels / _TILE_MEGAPIXELS)
-    return _BASE_MB + _BYTES_PER_PIXEL * megapixels + tile + (_NETWORK_MB if network else 0.0)
+    pixels = max(_BYTES_PER_PIXEL * megapixels + tile, _DECODED_BYTES * stored)
+    return _BASE_MB + pixels + (_NETWORK_MB if network else 0.0)
 
 
 def budget_mb(text: str) -> float | None:
@@ -40,32 +42,35 @@ def budget_mb(text: str) -> float | None:
     return float(match[1]) * unit
 
 
-def jobs_within(budget: float, jobs: int, images: Iterable[Image], *, network: bool) -> tuple[int, str]:
+def jobs_within(
+    budget: float, jobs: int, images: Iterable[Image], *, network: bool, max_size_px: int = 0
+) -> tuple[int, str]:
     """How many workers a budget in megabytes allows, one at least, and what is to be said where it allows fewer.
 
-    Raises ConfigError where it does not even hold the largest image decoded.
+    max_size_px: longer side to which larger images are reduced, 0 for none. Raises ConfigError where the budget does
+    not hold the largest image.
     """
     largest = max(images, key=lambda image: image.width_px * image.height_px, default=None)
     if largest is None:
         return jobs, ""
-    megapixels = largest.width_px * largest.height_px / 1e6
-    need = worker_mb(megapixels, network=network)
+    stored = largest.width_px * largest.height_px / 1e6
+    scale = min(1.0, max_size_px / max(largest.width_px, largest.height_px)) if max_size_px else 1.0
+    megapixels = stored * scale**2
+    need = worker_mb(megapixels, network=network, stored=stored)
     most = int((budget - _PARENT_MB) / need)
-    # A single worker of small images is this process itself.
-    alone = need - _BASE_MB + _PARENT_MB
-    decoded = min(alone, _BASE_MB + _DECODED_BYTES * megapixels + _PARENT_MB)
-    if decoded > budget:
-        raise ConfigError(
-            f"memory: {largest.name} has {megapixels:.1f} megapixels and takes {decoded:.0f} MB with this program once "
-            f"it is decoded; {budget:.0f} MB do not hold it: give more --memory"
-            + (", or reduce the image" if budget > _PARENT_MB else "")
-        )
     if most >= jobs:
         return jobs, ""
     each = f"each needs about {need:.0f} MB for images of {megapixels:.0f} megapixels"
     if most >= 1:
         return most, f"memory: {most} of {jobs} workers, as {each}"
-    return 1, (
-        f"memory: one worker needs about {need:.0f} MB for images of {megapixels:.1f} megapixels, and this program "
-        f"{_PARENT_MB:.0f} MB; {budget:.0f} MB are too few: give more, or smaller images"
-    )
+    # A single worker is this process itself.
+    alone = worker_mb(megapixels, stored=stored) - _BASE_MB + _PARENT_MB
+    if alone > budget:
+        raise ConfigError(
+            f"memory: {largest.name} has {stored:.1f} megapixels, and this program needs about {alone:.0f} MB for it; "
+            f"{budget:.0f} MB do not hold it: give more --memory"
+            + (", or reduce the images by --max-size" if budget > _PARENT_MB else "")
+        )
+    if network and alone + _NETWORK_MB > budget:
+        return 1, f"memory: 1 of {jobs} workers, as {each}: with a network more than {budget:.0f} MB may be needed"
+    return 1, f"memory: 1 of {jobs} workers, as {each}"

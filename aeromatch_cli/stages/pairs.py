@@ -125,7 +125,8 @@ def _within_memory(settings: Settings, executor: Executor, block: Block) -> list
     if budget is None or executor.kind == "serial":
         return []
     network = settings.extract.name == "learned" or bool(settings.cascade)
-    jobs, remark = jobs_within(budget, executor.jobs, block.images, network=network)
+    size_px = settings.block.max_size_px
+    jobs, remark = jobs_within(budget, executor.jobs, block.images, network=network, max_size_px=size_px)
     executor.limit(jobs)
     return [remark] if remark else []
 

@@ -16,6 +16,7 @@ from aeromatch_cli.blocks.lenses import Nearest
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
@@ -47,7 +48,7 @@ class Source:
         try:
             if self.path.stat().st_size > _LARGEST_BYTES:
                 raise ConfigError(f"pose file {self.path} is larger than {_LARGEST_BYTES // 10**9} GB")
-            return self.path.read_bytes()
+            return given_bytes(self.path)
         except OSError as error:
             raise ConfigError(
                 f"pose list {self.path} cannot be read ({error.strerror}): give a pose file, or exif, with --poses"

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.pairings.measure import measured_pairs, ordered
@@ -49,7 +50,7 @@ class PairFile(Strategy):
                 "pairs by file need the list's path: set pairs.path to a file with two names on each line"
             )
         try:
-            return Path(self.path).read_text(encoding="utf-8-sig").splitlines()
+            return given_bytes(Path(self.path)).decode("utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(
                 f"cannot read the pair list {self.path}: {error}; set pairs.path to a text file"
