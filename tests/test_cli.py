@@ -203,7 +203,7 @@ def test_quiet_leaves_errors_and_json(site):
     site.image(0).write_bytes(b"")
     outcome = invoke("run", "baseline", *site.options("--quiet"))
     assert (outcome.code, outcome.stdout) == (1, "")
-    assert outcome.stderr.splitlines() == [f"images: {site.names()[0]}: file is empty: copy it again"]
+    assert outcome.stderr.splitlines() == [f"{site.names()[0]}: file is empty: copy it again"]
     outcome = invoke("run", "baseline", *site.options("--quiet", "--json"))
     assert len(outcome.stdout.splitlines()) == 1
     outcome = invoke("run", "baseline", *site.options("--quiet", "--shard", "0/1"))

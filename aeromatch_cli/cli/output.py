@@ -91,7 +91,7 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
         say(line)
     if quiet:  # what failed is an error
         for failure in result.failures[:_FAILURES_SHOWN]:
-            printed(": ".join(failure), err=True)
+            printed(": ".join(failure[1:]), err=True)
         if len(result.failures) > _FAILURES_SHOWN:
             printed(f"and {len(result.failures) - _FAILURES_SHOWN} more", err=True)
     return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
