@@ -1,4 +1,4 @@
-"""A picture at scales half an octave apart, and square patches cut out of it at any place, size and turn."""
+"""A picture at scales an octave or half an octave apart, and square patches cut out of it at any place, size and turn."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from aeromatch_cli.data import FloatArray, IntArray
 PATCH_PX = 32
 # A patch shows this many keypoint sizes: a keypoint of 5 px has a patch of 32 stored pixels.
 SUPPORT = 6.4
-STEP = 2.0**-0.5
+PER_OCTAVE = 2
+STEP = 2.0 ** (-1.0 / PER_OCTAVE)
 _SMALLEST_PX = 32
 # cv2.remap addresses rows by 16 bits.
 _PER_CALL = 512
@@ -36,19 +37,19 @@ class Level:
         return np.asarray((points_px + 0.5) / self.scale - 0.5)
 
 
-def levels_of(gray: NDArray[Any], most: int = 16) -> list[Level]:
-    """The picture (H, W) itself, then area averages of it half an octave apart, as long as a patch fits in."""
+def levels_of(gray: NDArray[Any], most: int = 16, per_octave: int = PER_OCTAVE) -> list[Level]:
+    """The picture (H, W) itself, then area averages of it at equal ratios, as long as a patch fits in."""
     import cv2
 
     height, width = gray.shape
     found = [Level(gray, np.ones(2))]
     while len(found) < most:
-        scale = STEP ** len(found)
+        scale = 2.0 ** (-len(found) / per_octave)
         size = round(width * scale), round(height * scale)
         if min(size) < _SMALLEST_PX:
             break
         # From the level twice as large where there is one: exact halves, and far fewer pixels to read.
-        larger = found[-2] if len(found) > 1 else found[-1]
+        larger = found[-min(per_octave, len(found))]
         small = cv2.resize(larger.gray, size, interpolation=cv2.INTER_AREA)
         found.append(Level(small, np.array(size) / np.array([width, height])))
     return found
