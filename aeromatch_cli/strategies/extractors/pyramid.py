@@ -1,4 +1,4 @@
-"""A picture at scales an octave or half an octave apart, and square patches cut out of it at any place, size and turn."""
+"""A picture at scales an octave or half an octave apart, and patches cut out of it at any place, size and turn."""
 
 from __future__ import annotations
 
