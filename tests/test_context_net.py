@@ -16,6 +16,7 @@ from trainings.context import data
 from trainings.context.validation import compared
 
 from aeromatch_cli.nets.context import NEIGHBOURS, Context, evened, layout_of, load_context
+from aeromatch_cli.strategies.extractors import heat
 from aeromatch_cli.strategies.extractors.context import as_bytes, context_inputs, from_bytes
 from aeromatch_cli.strategies.extractors.detection import Raw
 
@@ -82,6 +83,7 @@ def test_the_shipped_weights_are_as_good_as_when_they_were_made(
 ) -> None:
     monkeypatch.setattr(data, "RECIPES", data.RECIPES[:1])
     monkeypatch.setattr(data, "KEYPOINTS", 300)
+    monkeypatch.setattr(heat, "_PER_OCTAVE", 2)  # keypoints as they were then
     pairs = data.block_pairs(rendered, tmp_path / "block.npz")
     network = load_context()
     with torch.inference_mode():

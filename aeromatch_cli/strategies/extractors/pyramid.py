@@ -44,7 +44,7 @@ def levels_of(gray: NDArray[Any], most: int = 16, per_octave: int = PER_OCTAVE) 
     height, width = gray.shape
     found = [Level(gray, np.ones(2))]
     while len(found) < most:
-        scale = 2.0 ** (-len(found) / per_octave)
+        scale = (2.0 ** (-1.0 / per_octave)) ** len(found)
         size = round(width * scale), round(height * scale)
         if min(size) < _SMALLEST_PX:
             break
