@@ -282,13 +282,11 @@ class Executor:
         waiting = list(range(len(tasks)))
         in_flight: list[int] = []
         while waiting:
-            self._start(min(self.jobs, len(tasks)))
             in_flight = self._drain(function, tasks, waiting, outcomes)
             waiting = [index for index in waiting if index not in outcomes and index not in in_flight]
             # A dead worker (killed for memory, a crash in a native library) takes the pool with it and does not say
             # which task it had: each task that was in flight is tried again alone, and blamed only if it dies alone.
             for index in in_flight:
-                self._start(min(self.jobs, len(tasks)))
                 alone = self._drain(function, tasks, [index], outcomes)
                 if alone:
                     words = "its worker process died (out of memory, or a crash in a library)"
@@ -300,8 +298,7 @@ class Executor:
         self, function: Callable[[T], R], tasks: Sequence[T], indices: Sequence[int], outcomes: dict[int, Outcome[R]]
     ) -> list[int]:
         """Run the tasks at `indices`; returns those in flight when a worker died, none if all went well."""
-        assert self._pool is not None
-        pool, queue = self._pool, iter(indices)
+        pool, queue = self._start(min(self.jobs, len(tasks))), iter(indices)
         flying: dict[Future[Outcome[R]], int] = {}
         try:
             while True:
@@ -323,10 +320,10 @@ class Executor:
             self._pool = None
             return sorted(flying.values())
 
-    def _start(self, workers: int) -> None:
+    def _start(self, workers: int) -> ProcessPoolExecutor:
         """A pool of at least so many workers."""
         if self._pool is not None and self._workers >= workers:
-            return
+            return self._pool
         self.close()
         with _worker_environment():
             self._pool = ProcessPoolExecutor(workers, mp_context=_WorkerContext(), initializer=_worker_start)
@@ -344,6 +341,7 @@ class Executor:
                     f"worker processes die at their start (too little memory for {workers} jobs, or a script "
                     "without `if __name__ == '__main__':`); use --executor serial"
                 ) from None
+        return self._pool
 
     def _run_dask(self, function: Callable[[T], R], tasks: Sequence[T], *, network: bool) -> list[Outcome[R]]:
         try:

@@ -151,17 +151,19 @@ def refined(logits: Logits, x: IntArray, y: IntArray) -> tuple[FloatArray, Float
 
 
 def _shown(level: Level, seen: NDArray[np.float32] | None) -> BoolArray | None:
-    """Which pixels (h, w) of a level touch what the picture shows: where `seen` (H, W) is 1, not 0. None for all.
+    """Which pixels (h, w) of a level lie within 2 of what the picture shows: where `seen` (H, W) is 1, not 0. None for
+    all.
 
-    No keypoint that stays depends on others: it lies farther inside than its size of SIZE_PX of its level, and a
-    maximum, its smoothing and its neighbours in the next coarser level reach less far.
+    No keypoint that stays depends on others: it lies farther inside than its size of SIZE_PX of its level, half as many
+    pixels of the next coarser one, where its neighbours and their smoothing reach 5.
     """
     if seen is None:
         return None
     import cv2
 
     height, width = level.gray.shape
-    return np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA) > 0.0)
+    touched = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA) > 0.0
+    return np.asarray(cv2.dilate(touched.astype(np.uint8), np.ones((5, 5), np.uint8)), bool)
 
 
 def _nearest(values: NDArray[Any], points_px: FloatArray) -> NDArray[Any]:
