@@ -224,17 +224,47 @@ def _little_memory(site: Site, rng: random.Random) -> None:
     ended(process, (0, 1, 3))
 
 
-def _slow_renames(site: Site, rng: random.Random) -> None:
-    """As on a folder far away; the run is killed in the middle of one."""
+def _patched(site: Site, text: str) -> subprocess.Popen[str]:
+    """A run that executes some Python first, in each of its processes."""
     patch = site.work.with_name("patch")
     patch.mkdir(parents=True, exist_ok=True)
-    text = "import pathlib, time\nold = pathlib.Path.replace\n"
-    text += "pathlib.Path.replace = lambda self, to: (time.sleep(0.3), old(self, to))[1]\n"
     (patch / "sitecustomize.py").write_text(text)
-    environment = {**os.environ, "PYTHONPATH": f"{patch}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    process = site.start(env=environment)
+    return site.start(env={**os.environ, "PYTHONPATH": f"{patch}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"})
+
+
+_SLOW_RENAMES = """
+import pathlib, time
+old = pathlib.Path.replace
+pathlib.Path.replace = lambda self, to: (time.sleep(0.3), old(self, to))[1]
+"""
+
+
+def _slow_renames(site: Site, rng: random.Random) -> None:
+    """As on a folder far away; the run is killed in the middle of one."""
+    process = _patched(site, _SLOW_RENAMES)
     time.sleep(rng.uniform(1.0, 3.0 * site.seconds))
     if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+    ended(process, (0, -9))
+
+
+# Files bear the clock's time when they come to their names, as they would on a machine whose clock is set.
+_CLOCK = """
+import os, pathlib, time
+true, old, set_at, jump = time.time, pathlib.Path.replace, {at}, {jump}
+time.time = lambda: true() + (jump if true() > set_at else 0.0)
+time.time_ns = lambda: int(time.time() * 1e9)
+pathlib.Path.replace = lambda self, to: (os.utime(self, (time.time(), time.time())), old(self, to))[1]
+"""
+
+
+def _clock_jumps(site: Site, rng: random.Random) -> None:
+    """Forward or back by a second to a year; half of the runs are killed afterwards, so that another one goes on with
+    the true time."""
+    jump = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(0.0, 7.5)
+    process = _patched(site, _CLOCK.format(at=time.time() + rng.uniform(0.5, site.seconds), jump=jump))
+    if rng.random() < 0.5:
+        site.wait(rng)
         os.killpg(process.pid, signal.SIGKILL)
     ended(process, (0, -9))
 
@@ -342,6 +372,7 @@ OF_RUNS: Mapping[str, Fault] = {
     "few file handles": _few_handles,
     "little memory": _little_memory,
     "slow renames": _slow_renames,
+    "clock jumps": _clock_jumps,
     "input gone": _input_gone,
     "input replaced": _input_replaced,
     "two runs at once": _two_at_once,

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -188,9 +187,6 @@ def contents(work: Path) -> dict[str, Any]:
 
 
 def _content(path: Path, work: Path) -> Any:
-    if path.suffix == ".npz":
-        with np.load(path) as archive:
-            return {name: (archive[name].dtype.str, archive[name].tobytes()) for name in archive.files}
     if path.suffix == ".db":
         return _tables(path)
     text = path.read_bytes().replace(str(work).encode(), b"WORK")

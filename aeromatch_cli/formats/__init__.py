@@ -254,7 +254,8 @@ line per pair), `conditions.csv`, plots as PNG.
 
 ### export/files.json, report/files.json
 
-`files`: of all that the exporters, or the report, have written. What differs is made again.
+`files`: of all that the exporters, or the report, have written. `told`, of the report: the files of the workspace that
+the page tells of. Both hold SHA-256 digests; what differs is made again.
 
 ### export/colmap/
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray
-from aeromatch_cli.formats.archives import load_arrays
+from aeromatch_cli.formats.archives import load_arrays, save_arrays
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 
@@ -35,7 +35,7 @@ def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
     seen = [adjusted.tracks[i] for i in ids]
     cameras = [f"{c.model} {c.width_px} {c.height_px}" for c in (adjusted.cameras[k] for k in lenses)]
     params = [" ".join(map(repr, map(float, adjusted.cameras[k].params))) for k in lenses]
-    np.savez(
+    save_arrays(
         stream,
         images=np.array(ids, dtype=np.str_),
         rotations=np.array([p.rotation for p in poses]).reshape(-1, 3, 3),

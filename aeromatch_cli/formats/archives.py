@@ -1,5 +1,6 @@
-"""NumPy archives (`.npz`) of the workspace: read with their checksums, without Python objects.
+"""NumPy archives (`.npz`) of the workspace: written with a checksum of the whole file, read without Python objects.
 
+The comment of the zip archive is the checksum. Those of its members say nothing of their list, names and dates.
 `numpy.load` parses the header of every array as Python source; large blocks have a hundred thousand small arrays, of
 which most headers are alike.
 """
@@ -9,10 +10,11 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -34,11 +36,27 @@ ARCHIVE_FAULTS = (
 # Magic string, version 1.0 and length of the header, as numpy writes all arrays of less than 64 kB of header.
 _VERSION_1 = b"\x93NUMPY\x01\x00"
 _PREFIX_BYTES = 10
+# Of a zip archive (APPNOTE.TXT 4.3.7, 4.3.16): the end record without a comment, and where the header of a member has
+# the lengths of what follows it.
+_END, _END_BYTES = b"PK\5\6", 22
+_LENGTHS, _MEMBER_BYTES = struct.Struct("<HH"), 30
+_MARK, _DIGITS = b"CRC-32 ", 8
+
+
+def save_arrays(stream: BinaryIO, **arrays: NDArray[Any]) -> None:
+    """Arrays by name, uncompressed. The same arrays make the same bytes."""
+    made = io.BytesIO()
+    np.savez(made, **arrays)  # type: ignore[arg-type]
+    # The last field of the end record is the length of the comment.
+    head = made.getvalue()[:-2] + (len(_MARK) + _DIGITS).to_bytes(2, "little")
+    stream.write(head + _MARK + b"%08x" % zlib.crc32(head))
 
 
 def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Arrays of an archive by name, those of `optional` where it has them. Raises BrokenFileError."""
-    with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(path) as archive:
+    with readable(path, *ARCHIVE_FAULTS), path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+        stream.seek(-_END_BYTES, io.SEEK_END)
+        _has_checksum(stream.read())
         held = set(archive.namelist())
         return {
             name: _array(_contents(archive, f"{name}.npy"))
@@ -48,23 +66,60 @@ def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) 
 
 def load_all(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an archive, of which every byte is compared with its checksum (CRC-32). Raises BrokenFileError."""
-    with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(io.BytesIO(path.read_bytes())) as archive:
-        return {name.removesuffix(".npy"): _array(_contents(archive, name)) for name in archive.namelist()}
+    with readable(path, *ARCHIVE_FAULTS):
+        return {name.removesuffix(".npy"): _array(contents) for name, contents in _members(path.read_bytes()).items()}
 
 
 def load_checked(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Arrays of an archive, after all its contents were compared with their checksums, also those that no stage reads
     any more because what follows is up to date. Raises BrokenFileError.
     """
-    with readable(path, *ARCHIVE_FAULTS), zipfile.ZipFile(path) as archive:
-        contents = {name: _contents(archive, name) for name in archive.namelist()}
-        return {name: _array(contents[f"{name}.npy"]) for name in names}
+    with readable(path, *ARCHIVE_FAULTS):
+        members = _members(path.read_bytes())
+        return {name: _array(members[f"{name}.npy"]) for name in names}
+
+
+def _members(data: bytes) -> dict[str, bytes]:
+    """All members of an archive, every byte of which is compared with a checksum."""
+    _check_whole(data)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {info.filename: _stored(data, info) for info in archive.infolist()}
+
+
+def _check_whole(data: bytes) -> None:
+    end = len(data) - len(_MARK) - _DIGITS
+    if _has_checksum(data[-_END_BYTES:]) and data[-_DIGITS:] != b"%08x" % zlib.crc32(memoryview(data)[:end]):
+        raise ValueError("its contents contradict its checksum")
+
+
+def _has_checksum(end: bytes) -> bool:
+    """Whether the last _END_BYTES of an archive say so: an earlier version wrote no comment. Raises ValueError."""
+    if end[-len(_MARK) - _DIGITS : -_DIGITS] == _MARK:
+        return True
+    if not (end.startswith(_END) and end.endswith(b"\0\0")):
+        raise ValueError("it does not end as it was written")
+    return False
+
+
+def _stored(data: bytes, info: zipfile.ZipInfo) -> bytes:
+    """A member, cut out of its archive: `ZipFile.read` takes longer than all else that is done with a small one."""
+    _check_stored(info)
+    start = info.header_offset + _MEMBER_BYTES + sum(_LENGTHS.unpack_from(data, info.header_offset + _MEMBER_BYTES - 4))
+    found = data[start : start + info.file_size]
+    if zlib.crc32(found) != info.CRC:
+        raise ValueError(f"{info.filename} contradicts its checksum")
+    return found
+
+
+def _check_stored(info: zipfile.ZipInfo) -> None:
+    """What is compressed is none of ours: a few kilobytes could hold gigabytes."""
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{info.filename} is compressed")
 
 
 def _contents(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Compared with its checksum. What is compressed is none of ours: a few kilobytes could hold gigabytes."""
-    if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:
-        raise ValueError(f"{name} is compressed")
+    """One member, compared with its checksum, without a look at the others."""
+    _check_stored(archive.getinfo(name))
     return archive.read(name)
 
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import IntArray
-from aeromatch_cli.formats.archives import load_arrays
+from aeromatch_cli.formats.archives import load_arrays, save_arrays
 
 # image_id0, image_id1 -> fingerprint of the verified entry, and rows of its matches.
 Dropped = Mapping[tuple[str, str], tuple[str, IntArray]]
@@ -19,7 +19,7 @@ _ARRAYS = ("images", "fingerprints", "counts", "rows", "least")
 def write_dropped(stream: BinaryIO, dropped: Dropped, least: int) -> None:
     """An .npz without pickles. least: a pair that keeps fewer matches is rejected."""
     keys = sorted(dropped)
-    np.savez(
+    save_arrays(
         stream,
         images=np.array(keys, dtype=np.str_).reshape(-1, 2),
         fingerprints=np.array([dropped[key][0] for key in keys], dtype=np.str_),

@@ -16,7 +16,7 @@ from aeromatch_cli.data import (
     JoinedKeypoints,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.archives import load_arrays, load_checked
+from aeromatch_cli.formats.archives import load_arrays, load_checked, save_arrays
 from aeromatch_cli.formats.reading import say_damaged
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
@@ -26,7 +26,7 @@ def write_features(stream: BinaryIO, features: Features, fingerprint: str) -> No
     arrays: dict[str, Any] = {name: getattr(features, name) for name in _FEATURE_ARRAYS}
     if features.colours is not None:
         arrays["colours"] = features.colours
-    np.savez(stream, fingerprint=np.array(fingerprint), **arrays)
+    save_arrays(stream, fingerprint=np.array(fingerprint), **arrays)
 
 
 def read_features(path: Path) -> Features:
@@ -41,7 +41,7 @@ def write_joined(stream: BinaryIO, joined: JoinedKeypoints, fingerprint: str) ->
     if joined.colours is not None:
         arrays["colours"] = joined.colours
     kinds = np.array(joined.kinds, dtype=np.str_)
-    np.savez(stream, fingerprint=np.array(fingerprint), kinds=kinds, kind_idx=joined.kind_idx, **arrays)
+    save_arrays(stream, fingerprint=np.array(fingerprint), kinds=kinds, kind_idx=joined.kind_idx, **arrays)
 
 
 def read_joined(path: Path) -> JoinedKeypoints:

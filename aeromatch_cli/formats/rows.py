@@ -18,7 +18,7 @@ from aeromatch_cli.data import (
     Verdict,
 )
 from aeromatch_cli.errors import BrokenFileError
-from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, load_checked
+from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, load_checked, save_arrays
 from aeromatch_cli.formats.reading import readable, say_damaged
 
 # Features of rows that earlier versions wrote.
@@ -57,7 +57,7 @@ def write_match_row(stream: BinaryIO, entries: Sequence[MatchEntry]) -> None:
     arrays["view_pairs"] = _joined([e.matches.view_pairs for e in entries], (0, 2), np.int16)
     if any(e.matches.remark for e in entries):
         arrays["remark"] = _strings([e.matches.remark for e in entries])
-    np.savez(stream, **arrays)  # type: ignore[arg-type]
+    save_arrays(stream, **arrays)
 
 
 def read_match_row(path: Path) -> dict[str, MatchEntry]:
@@ -79,9 +79,9 @@ def write_verified_row(stream: BinaryIO, entries: Sequence[VerifiedEntry]) -> No
     errors = [
         np.full(len(e.matches.indices), np.nan) if e.verdict.errors_px is None else e.verdict.errors_px for e in entries
     ]
-    np.savez(
+    save_arrays(
         stream,
-        **_row_arrays(entries),  # type: ignore[arg-type]
+        **_row_arrays(entries),
         errors_px=_joined(errors, (0,), np.float32),
         state=_strings([v.state for v in verdicts]),
         reason=_strings([v.reason for v in verdicts]),

@@ -3,6 +3,6 @@
 rows -> figures -> map, previews -> page (page.html.jinja)
 """
 
-from aeromatch_cli.report.page import run
+from aeromatch_cli.report.page import run, told_digests
 
-__all__ = ["run"]
+__all__ = ["run", "told_digests"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, Camera
-from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
@@ -41,7 +41,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.workspace import read_json, write_record, write_text
+from aeromatch_cli.workspace import Workspace, read_json, write_record, write_text
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
 MAX_TABLE_ROWS = 2000
@@ -64,7 +64,7 @@ class Notice:
 
 def run(context: Context) -> StageReport:
     """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
-    report = StageReport("report", items=1)
+    report, told = StageReport("report", items=1), told_digests(context.workspace)
     found = gather(context, pair_table)
     pairs, images = found.pairs, found.images
     page = render(context, found)
@@ -72,11 +72,19 @@ def run(context: Context) -> StageReport:
     record = context.workspace.report_files
     folder = record.parent
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file() and path != record)
-    write_record(record, {}, names)
+    write_record(record, {"told": told}, names)
     report.done = 1
     report.fingerprint = fingerprint([vars(row) for row in pairs], [vars(row) for row in images])
     report.facts = {"page": "report/index.html", "bytes": len(page.encode("utf-8"))}
     return report.write(context.workspace)
+
+
+def told_digests(workspace: Workspace) -> dict[str, str]:
+    """Digests of the files that a page tells of, by their names in the workspace. Times of files would not do to see
+    that they are as they were: clocks are set back, and a folder's server has its own."""
+    told = [path for path in workspace.reports.glob("*.json") if path != workspace.stage_report("report")]
+    told += [workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures, workspace.config]
+    return {p.relative_to(workspace.root).as_posix(): file_digest(p) for p in sorted(told) if p.is_file()}
 
 
 def render(context: Context, found: Gathered) -> str:

@@ -286,18 +286,15 @@ def _page(context: Context) -> StageReport:
 
 
 def _current_page(workspace: Workspace, *, settings: bool = True) -> StageReport | None:
-    """The page's report, where the page is as it was written and younger than everything that it tells of. settings:
-    also than the list of settings, as which a run without the page differs from one with it."""
+    """The page's report, where the page and everything that it tells of are as they were when it was written.
+    settings: also the list of settings, in which a run without the page differs from one with it."""
     own = workspace.stage_report("report")
     if not (workspace.report.is_file() and own.is_file()):
         return None
-    if not whole_record(workspace.report_files):
-        return None
-    told = [path for path in workspace.reports.glob("*.json") if path != own]
-    told += [workspace.block, workspace.images, workspace.poses, workspace.pairs, workspace.failures]
-    told += [workspace.config] if settings else []
-    made = workspace.report.stat().st_mtime_ns
-    if any(path.stat().st_mtime_ns >= made for path in told):
+    before, now = (whole_record(workspace.report_files).get("told", {}), report.told_digests(workspace))
+    if not settings:
+        before, now = ({**told, workspace.config.name: ""} for told in (before, now))
+    if before != now:
         return None
     return StageReport("report", items=1, skipped=1, facts=read_json(own)["facts"])
 
