@@ -41,18 +41,18 @@ def ground_sketch(
     canvas, nearest = np.zeros((height, width, 4), np.uint8), np.full((height, width), _FARTHEST)
     lowest_m = float(np.nanmin(heights))
     footprints = block_footprints(context.block)
-    for image_id, picture in pictures.items():
+    for image_id in pictures:
         pose, footprint = context.pose(image_id), footprints.get(image_id)
         if pose is not None and footprint is not None:
             window = _around(points, pose.center_m, lowest_m, footprint.polygon_m)
-            _lay(context, image_id, picture, points[window], canvas[window], nearest[window])
+            _lay(context, image_id, pictures, points[window], canvas[window], nearest[window])
     return canvas if canvas[..., 3].any() else None
 
 
 def _lay(
     context: Context,
     image_id: str,
-    picture: NDArray[np.uint8],
+    pictures: Mapping[str, NDArray[np.uint8]],
     points_m: FloatArray,
     canvas: NDArray[np.uint8],
     nearest: FloatArray,
@@ -69,7 +69,7 @@ def _lay(
     rows, columns = np.nonzero(distance < nearest)
     if not len(rows):
         return
-    camera = context.block.cameras[image.camera_id]
+    camera, picture = context.block.cameras[image.camera_id], pictures[image_id]
     seen = project(camera, np.asarray(pose.world_rotation), pose.center_m, points_m[rows, columns])
     scale = np.array([picture.shape[1] / image.width_px, picture.shape[0] / image.height_px])
     seen = (seen + 0.5) * scale - 0.5

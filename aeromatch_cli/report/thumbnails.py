@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
 from aeromatch_cli.stages.context import Context
@@ -80,9 +82,14 @@ def thumbnails(context: Context) -> Thumbnails:
     beside = len(images) > MAX_IMAGES
     side_px = next((side for most, side in _SIDES_PX if len(images) <= most), _SIDE_PX)
     folder = context.workspace.report.parent / FOLDER
-    with ThreadPoolExecutor(_THREADS) as pool:
-        made = list(pool.map(partial(_thumbnail, context, side_px, folder if beside else None), images))
-    pictures = {image.image_id: found for image, found in zip(images, made, strict=True) if found is not None}
+    stretches = _stretches(context, images, side_px, folder if beside else None)
+    if len(stretches) == 1:
+        made = [_thumbnails(stretches[0], _THREADS)]
+    else:
+        outcomes = context.executor.run(_thumbnails, stretches, "report", [len(one.images) for one in stretches])
+        made = [outcome.value or _thumbnails(one) for outcome, one in zip(outcomes, stretches, strict=True)]
+    found = (thumbnail for some in made for thumbnail in some)
+    pictures = {image.image_id: one for image, one in zip(images, found, strict=True) if one is not None}
     current = {found.place for found in pictures.values()}
     for path in sorted(folder.glob("*.jpg")):
         if path not in current:
@@ -90,10 +97,34 @@ def thumbnails(context: Context) -> Thumbnails:
     return Thumbnails(pictures, beside=beside)
 
 
-def _thumbnail(context: Context, side_px: int, folder: Path | None, image: Image) -> _Thumbnail | None:
-    """None where the image cannot be read. folder: where pictures beside the page lie."""
-    path = context.image_path(image)
+@dataclass(frozen=True)
+class _Stretch:
+    """Some of a block's images, where they are, and where pictures beside the page lie."""
+
+    images: tuple[Image, ...]
+    places: tuple[Path | RemoteFile, ...]
+    side_px: int
+    folder: Path | None
+
+
+def _stretches(context: Context, images: Sequence[Image], side_px: int, folder: Path | None) -> list[_Stretch]:
+    """Few images are read faster than several processes take to begin."""
+    jobs = context.executor.jobs
+    parts = 4 * jobs if folder is not None and jobs > 1 else 1
+    ends = np.linspace(0, len(images), parts + 1).astype(int)
+    places = [context.picture(image) for image in images]
+    return [_Stretch(tuple(images[a:b]), tuple(places[a:b]), side_px, folder) for a, b in itertools.pairwise(ends)]
+
+
+def _thumbnails(stretch: _Stretch, threads: int = 1) -> list[_Thumbnail | None]:
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(partial(_thumbnail, stretch.side_px, stretch.folder), stretch.places, stretch.images))
+
+
+def _thumbnail(side_px: int, folder: Path | None, place: Path | RemoteFile, image: Image) -> _Thumbnail | None:
+    """None where the image cannot be read."""
     try:
+        path = on_disk(place)
         if folder is None:
             return _encoded(path, side_px, image.exif_orientation)
         file = folder / _name(path, side_px, image.exif_orientation)
