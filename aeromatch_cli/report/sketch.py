@@ -19,6 +19,9 @@ from aeromatch_cli.stages.context import Context
 _SIDE_PX = 640
 # Ground that is seen from farther than this many flying heights aside is left out.
 _FARTHEST = 2.0
+# In a block of more images each is a few pixels of the map: what one of them sees at most so far aside is not painted
+# again.
+_MANY_IMAGES, _NEAR = 2000, 0.5
 # So much of its size is looked at around an image's footprint, whose border is found by a few rays.
 _MARGIN = 0.2
 
@@ -41,11 +44,12 @@ def ground_sketch(
     canvas, nearest = np.zeros((height, width, 4), np.uint8), np.full((height, width), _FARTHEST)
     lowest_m = float(np.nanmin(heights))
     footprints = block_footprints(context.block)
+    near = _NEAR if len(pictures) > _MANY_IMAGES else 0.0
     for image_id in pictures:
         pose, footprint = context.pose(image_id), footprints.get(image_id)
         if pose is not None and footprint is not None:
             window = _around(points, pose.center_m, lowest_m, footprint.polygon_m)
-            _lay(context, image_id, pictures, points[window], canvas[window], nearest[window])
+            _lay(context, image_id, pictures, points[window], canvas[window], nearest[window], near)
     return canvas if canvas[..., 3].any() else None
 
 
@@ -56,9 +60,10 @@ def _lay(
     points_m: FloatArray,
     canvas: NDArray[np.uint8],
     nearest: FloatArray,
+    near: float,
 ) -> None:
     """Paint what an image with an attitude shows of points_m (h, w, 3) where it is nearer, in flying heights aside,
-    than `nearest`."""
+    than `nearest`, which is not `near` yet."""
     import cv2
 
     pose, image = context.block.poses[image_id], context.image_by_id[image_id]
@@ -66,7 +71,7 @@ def _lay(
     above = pose.center_m[2] - points_m[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.where(above > 0.0, aside / above, np.inf)
-    rows, columns = np.nonzero(distance < nearest)
+    rows, columns = np.nonzero((distance < nearest) & (nearest > near))
     if not len(rows):
         return
     camera, picture = context.block.cameras[image.camera_id], pictures[image_id]

@@ -82,7 +82,8 @@ def rows_of(args: Any, known: Sequence[Row]) -> Iterator[Row]:
                 "report_mb": (work / "report" / "index.html").stat().st_size / 1e6,
                 "workspace_mb": sum(path.stat().st_size for path in work.rglob("*") if path.is_file()) / 1e6,
             }  # fmt: skip
-        shutil.rmtree(work, ignore_errors=True)
+        if not args.keep:
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def _answer(log: Path) -> dict[str, Any]:
@@ -156,6 +157,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--images", type=options.numbers, default="100,1000,10000", help="of each block, comma-separated, ascending")
     add("--preset", default="baseline")
     add("--keypoints", type=options.positive, default=200)
+    add("--keep", action="store_true", help="leave the workspaces in OUT")
     add("--seed", type=int, default=0)
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
