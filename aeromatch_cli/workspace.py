@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import logging
 import os
 import socket
 import uuid
@@ -21,6 +22,8 @@ from typing import Any, BinaryIO
 from aeromatch_cli.errors import InputError, WorkspaceError
 from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.reading import readable
+
+log = logging.getLogger("aeromatch")
 
 FORMAT_VERSION = 1
 # What precedes the checksum of a JSON file.
@@ -364,12 +367,15 @@ def write_record(path: Path, head: Mapping[str, Any], names: Iterable[str]) -> N
     write_json(path, {**head, "files": {name: file_digest(path.parent / name) for name in sorted(names)}})
 
 
-def whole_record(path: Path) -> dict[str, Any]:
-    """A record whose files are as they were written; else nothing."""
+def whole_record(path: Path, *, say: bool = False) -> dict[str, Any]:
+    """A record whose files are as they were written; else nothing. say: which is not."""
     if not path.is_file():
         return {}
     record = read_json(path)
-    return {} if changed_files(path.parent, record) else record
+    changed = changed_files(path.parent, record)
+    if changed and say:
+        log.warning("warning: %s was changed or removed since it was written: made again", path.parent / changed[0])
+    return {} if changed else record
 
 
 def changed_files(folder: Path, record: Mapping[str, Any]) -> list[str]:

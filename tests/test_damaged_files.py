@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import time
+
 import numpy as np
 import pytest
 from conftest import Site, contents, invoke
@@ -42,6 +45,31 @@ def test_damaged_files_are_made_again(done_site, name, damage):
     outcome = done_site("run")
     assert outcome.code == 0
     assert contents(done_site.work) == expected
+
+
+def test_a_damaged_adjustment_is_named(done_site):
+    path = done_site.work / "orientation" / "adjusted.npz"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    expected = contents(done_site.work)
+    outcome = done_site("run")
+    assert outcome.code == 0
+    assert f"{path} was changed or removed since it was written: made again" in outcome.stderr
+    assert contents(done_site.work) != expected
+    data[len(data) // 2] ^= 1
+    assert path.read_bytes() == data
+
+
+def test_a_page_made_while_the_clock_was_ahead_is_made_again(done_site):
+    page = ("--set", "run.report=true")
+    assert done_site("run", *page).done() == {"report": 1}
+    for path in done_site.work.rglob("*"):
+        os.utime(path, (time.time() + 1e6, time.time() + 1e6))
+    assert done_site("run", *page).done() == {}
+    before = (done_site.work / "report" / "index.html").read_text()
+    assert done_site("run", *page, "--set", "pairs.min_overlap=0.7").done()["report"] == 1
+    assert (done_site.work / "report" / "index.html").read_text() != before
 
 
 @pytest.mark.parametrize("name", ["database.db", "sparse/images.txt", "world.json"])

@@ -349,6 +349,36 @@ def test_a_flipped_byte_in_any_array_leaves_no_fingerprint(tmp_path: Path, kind:
     assert not last(path)  # type: ignore[operator]
 
 
+@pytest.mark.parametrize("kind", ["features", "matches", "verified"])
+def test_any_flipped_byte_leaves_no_fingerprint(tmp_path: Path, kind: str) -> None:
+    """Also in the names, dates and lists of a zip archive, of which its members' checksums say nothing."""
+    write, last, value = {
+        "features": (write_features, features_fingerprint, (random_features(3), "f")),
+        "matches": (write_match_row, row_fingerprints, ([entry("a", 2)],)),
+        "verified": (write_verified_row, row_fingerprints, ([verified("a", 2, state="verified")],)),
+    }[kind]
+    path = archived(tmp_path, write, *value)  # type: ignore[misc]
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        data = bytearray(whole)
+        data[at] ^= 1 << at % 8
+        path.write_bytes(data)
+        os.utime(path, ns=(0, at))
+        assert not last(path), at  # type: ignore[operator]
+    path.write_bytes(whole)
+    os.utime(path, ns=(0, len(whole)))
+    assert last(path)  # type: ignore[operator]
+
+
+def test_archives_without_a_checksum_of_the_whole_are_read(tmp_path: Path) -> None:
+    """Those of earlier versions."""
+    path = archived(tmp_path, write_features, random_features(3), "f")
+    with np.load(path) as archive:
+        np.savez(tmp_path / "earlier.npz", **archive)
+    assert features_fingerprint(tmp_path / "earlier.npz") == "f"
+    np.testing.assert_array_equal(read_features(tmp_path / "earlier.npz").sizes_px, random_features(3).sizes_px)
+
+
 def test_compressed_archives_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     np.savez_compressed(path, image_id1=np.zeros(10_000_000), fingerprint=np.array(["f"]))

@@ -206,6 +206,9 @@ def test_masks_of_another_size_are_fitted(tmp_path: Path) -> None:
     (tmp_path / "bad.png").write_bytes(b"x")
     with pytest.raises(ItemError, match="bad"):
         read_mask(tmp_path / "bad.png", 4, 2)
+    assert read_mask(tmp_path / "m.png", 401, 200).shape == (200, 401)  # reduced, and rounded
+    with pytest.raises(ItemError, match=r"m\.png is 4 x 2 pixels, its image 20 x 40, another shape"):
+        read_mask(tmp_path / "m.png", 20, 40)
 
 
 def test_frames_of_zeros_are_masked_and_black_objects_are_not() -> None:

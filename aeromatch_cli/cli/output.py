@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shlex
 import signal
 import sys
@@ -29,6 +30,7 @@ EXIT_INTERRUPTED = 130
 # Where the application keeps the arguments as they were written, in the object of the root context.
 ARGUMENTS = "aeromatch.arguments"
 _FAILURES_SHOWN = 5
+_LONGEST_WORD = 1000
 
 
 def guarded(
@@ -67,10 +69,11 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
     try:
         result = call()
     except AeromatchError as error:
-        printed(f"error: {error}", err=True)
-        record.error("error: %s", error)
+        text = _shortened(str(error))
+        printed(f"error: {text}", err=True)
+        record.error("error: %s", text)
         record.debug("stopped by", exc_info=True)
-        return {"error": str(error), "exit_code": error.exit_code}
+        return {"error": text, "exit_code": error.exit_code}
     except KeyboardInterrupt:
         _forget_interrupt()
         printed("interrupted; run the same command again to resume", err=True)
@@ -95,6 +98,11 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
         if len(result.failures) > _FAILURES_SHOWN:
             printed(f"and {len(result.failures) - _FAILURES_SHOWN} more", err=True)
     return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+
+
+def _shortened(text: str) -> str:
+    """Without the middle of what is longer than any path or number: a cell of a file may hold megabytes."""
+    return re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda found: f"{found[0][:60]}...{found[0][-20:]}", text)
 
 
 def said(quiet: bool) -> Callable[[str], None]:

@@ -26,6 +26,8 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
+# Between the shapes of a mask and of its image: a reduced mask is rounded to whole pixels.
+_MASK_STRETCH = 0.02
 
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
@@ -144,7 +146,8 @@ def write_png(stream: Any, pixels: NDArray[Any]) -> None:
 
 
 def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
-    """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError."""
+    """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError, also where its
+    shape is another one: it would be stretched over other ground."""
     import cv2
 
     try:
@@ -152,5 +155,11 @@ def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
     except ItemError as error:
         raise ItemError(f"mask: {error}") from None
     if mask.shape != (height_px, width_px):
+        height, width = mask.shape
+        if abs(width / height * height_px / width_px - 1.0) > _MASK_STRETCH:
+            raise ItemError(
+                f"mask: {path} is {width} x {height} pixels, its image {width_px} x {height_px}, another shape: "
+                "turn it as the stored image lies, or make it anew"
+            )
         mask = cv2.resize(mask, (width_px, height_px), interpolation=cv2.INTER_NEAREST)
     return np.asarray(mask) > 0

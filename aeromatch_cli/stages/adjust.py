@@ -99,7 +99,7 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
 
 def _on_file(context: Context) -> Mapping[str, Any]:
     """The record of an earlier run whose files are as they were written, else nothing."""
-    return {} if context.overwrite else whole_record(context.workspace.orientation / "adjusted.json")
+    return {} if context.overwrite else whole_record(context.workspace.orientation / "adjusted.json", say=True)
 
 
 def _remove(context: Context) -> None:

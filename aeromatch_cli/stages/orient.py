@@ -312,7 +312,7 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
 
 def _on_file(context: Context) -> Mapping[str, Any]:
     """The record of an earlier run whose files are as they were written, else nothing."""
-    return {} if context.overwrite else whole_record(context.workspace.orientation / "orientation.json")
+    return {} if context.overwrite else whole_record(context.workspace.orientation / "orientation.json", say=True)
 
 
 def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dict[str, Any]:

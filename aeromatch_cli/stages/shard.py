@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from aeromatch_cli.errors import ConfigError
@@ -18,10 +19,11 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> Shard:
         """From "i/n", 1 <= i <= n. Raises ConfigError."""
-        first, _, second = text.partition("/")
-        if not (first.isdigit() and second.isdigit() and 1 <= int(first) <= int(second)):
-            raise ConfigError(f"--shard {text!r}: write i/n with 1 <= i <= n, for example 1/4")
-        return cls(int(first), int(second))
+        found = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+        index, count = map(int, found.groups()) if found else (0, 0)
+        if not 1 <= index <= count:
+            raise ConfigError(f"--shard {text!r}: write i/n with 1 <= i <= n < 1,000,000, for example 1/4")
+        return cls(index, count)
 
     def owns(self, item_id: str) -> bool:
         return stable_hash(item_id) % self.count == self.index - 1
