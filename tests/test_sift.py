@@ -3,12 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from aeromatch_cli.data import Camera, View
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors import detection
 from aeromatch_cli.strategies.extractors.detection import root_sift
 from aeromatch_cli.strategies.extractors.merging import merge_keypoints
+from aeromatch_cli.strategies.extractors.reduction import factor_for
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.extractors.tiles import tiles
 
@@ -83,6 +85,40 @@ def test_the_budget_is_for_the_image_or_for_each_view():
     assert np.bincount(each.view_idx).tolist() == [60, 60]
     alone = [Sift(keypoints=60, budget=b)(camera_of(gray), views[:1]).descriptors for b in ("image", "view")]
     assert np.array_equal(*alone)
+
+
+def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
+    gray, valid, keypoints = texture(1800, 1400), np.ones((1400, 1800), bool), 800
+    valid[:, 1500:] = False
+    assert factor_for([source(gray, valid)], keypoints, 1200.0) == 2
+    whole = extract(gray, valid, keypoints=keypoints, pixels_per_keypoint=0.0)
+    fast = extract(gray, valid, keypoints=keypoints)
+    assert len(fast.descriptors) == len(whole.descriptors) == keypoints
+    distances, nearest = cKDTree(whole.keypoints_px).query(fast.keypoints_px)
+    same = distances < 2.0
+    assert same.mean() > 0.8
+    assert np.median(distances[same]) < 0.15
+    offset = fast.keypoints_px[same] - whole.keypoints_px[nearest[same]]
+    assert np.abs(np.median(offset, axis=0)).max() < 0.03
+
+
+def test_a_view_is_not_reduced_where_it_would_have_too_few_keypoints():
+    dull = np.full((1600, 1600), 90, np.uint8)
+    dull[:300, :300] = texture(300, 300)
+    settings = {"keypoints": 1000, "pixels_per_keypoint": 300.0}
+    assert factor_for([source(dull)], 1000, 300.0) == 2
+    assert len(extract(dull, **settings).descriptors) == len(extract(dull, keypoints=1000).descriptors)
+
+
+def test_how_often_a_view_is_halved():
+    large, small = source(np.zeros((4000, 6000), np.uint8)), source(np.zeros((600, 1000), np.uint8))
+    assert [factor_for([large], number, 1200.0) for number in (30_000, 20_000, 8_000, 4_000)] == [1, 1, 2, 4]
+    assert factor_for([large, large], 20_000, 1200.0) == 2
+    assert factor_for([large], 10, 0.0) == 1
+    half = np.arange(4000 * 6000).reshape(4000, 6000) % 2 == 0
+    assert factor_for([source(large.gray, half)], 8_000, 1200.0) == 2
+    assert factor_for([source(large.gray, half)], 12_000, 1200.0) == 1
+    assert factor_for([small], 10, 1200.0) == 1  # it takes no time as it is
 
 
 def test_fewer_only_where_fewer_exist():

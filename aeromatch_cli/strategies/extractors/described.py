@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from aeromatch_cli.data import Camera, Features, FloatArray, IntArray
 from aeromatch_cli.strategies import Strategy, ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw, concatenate, in_source
 from aeromatch_cli.strategies.extractors.merging import merge_keypoints
+from aeromatch_cli.strategies.extractors.reduction import factor_for, in_reduced_views, in_whole_views, reduced
 from aeromatch_cli.strategies.extractors.selection import distinct, even_selection
 
 # Answers this close, at sizes within a factor of two, are one blob.
@@ -50,6 +52,12 @@ class Described(Strategy):
         description="Number of keypoints per cell of the grid by which they are spread. Larger: fewer cells, less "
         "even.",
     )
+    pixels_per_keypoint: float = Field(
+        1200.0,
+        ge=0.0,
+        description="Views with more visible pixels per keypoint are halved, again and again, before keypoints are "
+        "looked for; 0: never. Smaller: less time, keypoints less accurate.",
+    )
     colours: bool = Field(False, description="Keep the colour around every keypoint; filter=colour needs it.")
 
     @abstractmethod
@@ -80,17 +88,37 @@ class Described(Strategy):
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
-        found = [in_source(camera, view, self._found(view, index)) for index, view in enumerate(views)]
-        raw = self.turned(concatenate([self._cut(found, views, group) for group in self._groups(views)]), views)
+        found, factors = self._looked_for(camera, views)
+        small = [reduced(view, factor) for view, factor in zip(views, factors.tolist(), strict=True)]
+        raw = concatenate([self._cut(found, views, group) for group in self._groups(views)])
+        turned = self.turned(in_reduced_views(raw, factors[raw.view_idx]), small)
+        raw = replace(raw, orientations_deg=turned.orientations_deg)
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
         points = raw.take(standing)
         order = np.argsort(keypoint_idx, kind="stable")  # descriptors of one keypoint side by side
         raw, numbers = raw.take(order), keypoint_idx[order].astype(np.int32)
-        return _features(points, raw, numbers, self.described(raw, views), views)
+        descriptors = self.described(in_reduced_views(raw, factors[raw.view_idx]), small)
+        return _features(points, raw, numbers, descriptors, views)
 
-    def _found(self, view: ViewPixels, view_idx: int) -> Raw:
-        """All features of one view, each blob once."""
-        raw = self.detected(view, view_idx)
+    def _looked_for(self, camera: Camera, views: Sequence[ViewPixels]) -> tuple[list[Raw], IntArray]:
+        """All features of every view, and by how much each was reduced for it (V,): less where the reduced views of a
+        budget have fewer features than it buys."""
+        found, factors = dict[int, Raw](), np.ones(len(views), np.int64)
+        for group in self._groups(views):
+            factor = factor_for([views[index] for index in group], self.keypoints, self.pixels_per_keypoint)
+            while True:
+                for index in group:
+                    found[index] = in_source(camera, views[index], self._found(views[index], factor, index))
+                if factor == 1 or sum(len(found[index].view_idx) for index in group) >= self.keypoints:
+                    break
+                factor //= 2
+            factors[group] = factor
+        return [found[index] for index in range(len(views))], factors
+
+    def _found(self, view: ViewPixels, factor: int, view_idx: int) -> Raw:
+        """All features of one view, reduced by a factor, each blob once, in the frame of the whole view."""
+        raw = self.detected(reduced(view, factor), view_idx)
+        raw = in_whole_views(raw, np.full(len(raw.view_idx), factor))
         starts = raw.starts()
         points = raw.take(starts)
         keep = distinct(points.points_px, points.sizes_px, self.strengths(points), _SAME_BLOB_PX)

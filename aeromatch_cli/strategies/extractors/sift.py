@@ -29,7 +29,7 @@ from aeromatch_cli.strategies.extractors.detection import (
 class Sift(Described):
     """SIFT keypoints and RootSIFT descriptors of all views of one image."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     descriptors: ClassVar[str] = "RootSIFT"
     name: Literal["sift"] = "sift"
     # As many as COLMAP has (8192). Twice as many as before cost 1.1 to 1.4 x the seconds of whole runs (seneca,
