@@ -67,6 +67,16 @@ def features_fingerprint(path: Path) -> str | None:
         return None
 
 
+def checked_keypoints(path: Path) -> tuple[str, FloatArray | None]:
+    """Fingerprint and keypoints (K, 2) from one reading; "" and None as `features_fingerprint` has None."""
+    try:
+        arrays = load_checked(path, ("fingerprint", "keypoints_px"))
+    except BrokenFileError as error:
+        say_damaged(path, error)
+        return "", None
+    return str(arrays["fingerprint"]), arrays["keypoints_px"]
+
+
 def known_fingerprint(path: Path) -> str | None:
     """The same, read once as long as the file is not written again."""
     return _cached_fingerprint(path, path.stat().st_mtime_ns) if path.is_file() else None

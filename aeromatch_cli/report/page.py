@@ -22,7 +22,7 @@ from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.figures import COLOURS, histogram
-from aeromatch_cli.report.gathering import Gathered, gather
+from aeromatch_cli.report.gathering import Gathered, gather, settled
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
 from aeromatch_cli.report.pair_viewer import pair_data, pair_table
 from aeromatch_cli.report.places import ground_figures, point_figures
@@ -67,7 +67,8 @@ def run(context: Context) -> StageReport:
     report, told = StageReport("report", items=1), told_digests(context.workspace)
     found = gather(context, pair_table)
     pairs, images = found.pairs, found.images
-    page = render(context, found)
+    with settled():
+        page = render(context, found)
     write_text(context.workspace.report, page)
     record = context.workspace.report_files
     folder = record.parent

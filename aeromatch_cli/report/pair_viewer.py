@@ -96,7 +96,8 @@ def pair_table(images: tuple[Image, Image], places: tuple[FloatArray, FloatArray
 
 def _steps(image: Image, points_px: FloatArray) -> NDArray[np.int64]:
     """Stored pixels (M, 2) as _STEPS of the displayed picture."""
-    size = np.array([image.width_px, image.height_px], np.float64)
-    shown = turned_points(points_px, image.width_px, image.height_px, image.exif_orientation) + 0.5
+    size, shown = np.array([image.width_px, image.height_px], np.float64), points_px
+    if image.exif_orientation != 1:
+        shown = turned_points(points_px, image.width_px, image.height_px, image.exif_orientation)
     across = size[::-1] if image.exif_orientation in (5, 6, 7, 8) else size
-    return np.clip(np.rint(shown / across * _STEPS), 0, _STEPS).astype(np.int64)
+    return np.minimum(np.maximum(np.rint((shown + 0.5) * (_STEPS / across)), 0), _STEPS).astype(np.int64)

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from html import escape
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ItemError, WorkspaceError
-from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.features import checked_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import read_pixels
@@ -63,6 +63,8 @@ def chosen_previews(pairs: Sequence[PairRow]) -> list[tuple[str, PairRow]]:
     return result + [("Rejected pair", row) for row in rejected[:MAX_REJECTED_PREVIEWS]]
 
 
+# Fingerprint, and keypoints (K, 2), of an image's features; "" and None where they cannot be read.
+Features = Callable[[str], tuple[str, FloatArray | None]]
 # Files of images kept in memory.
 _KEPT = 300
 
@@ -70,11 +72,16 @@ _KEPT = 300
 class DrawnMatches:
     """The matches of pairs as they are drawn; every file is read once, where pairs of an image follow each other."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        self._workspace, self._final = workspace, FinalEntries(workspace)
-        self._keypoints = lru_cache(_KEPT)(lambda image_id: read_keypoints(workspace.features(image_id))[0])
+    def __init__(self, workspace: Workspace, features: Features | None = None) -> None:
+        """features: of an image, by default from its file."""
+        self._workspace = workspace
+        self._features = features or lru_cache(_KEPT)(lambda i: checked_keypoints(workspace.features(i)))
         self._verified = lru_cache(_KEPT)(lambda image_id: read_verified_row(workspace.verified(image_id)))
         self._matched = lru_cache(_KEPT)(lambda image_id: read_match_row(workspace.matches(image_id)))
+
+    @cached_property
+    def _final(self) -> FinalEntries:
+        return FinalEntries(self._workspace)
 
     def of(self, row: PairRow) -> tuple[tuple[FloatArray, FloatArray], FloatArray | None]:
         """Stored pixels (M, 2) of either image, and errors (M,): verified matches with theirs, of a rejected pair those
@@ -89,8 +96,13 @@ class DrawnMatches:
             path, entry, errors = self._workspace.matches(ids[0]), self._matched(ids[0]).get(ids[1]), None
         if entry is None:
             raise WorkspaceError(f"{path} does not hold the pair; run the stage that makes it again")
-        check_features(self._workspace, ids[0], entry)
+        check_features(self._workspace, ids[0], entry, lambda image_id: self._features(image_id)[0])
         return match_points(entry.matches, *(self._keypoints(i) for i in ids)), errors
+
+    def _keypoints(self, image_id: str) -> FloatArray:
+        known = self._features(image_id)[1]
+        # What cannot be read says so itself.
+        return read_keypoints(self._workspace.features(image_id))[0] if known is None else known
 
 
 def error_classes(errors_px: FloatArray | None, count: int) -> IntArray:

@@ -197,10 +197,11 @@ def _shown_ninths(context: Context) -> dict[str, BoolArray]:
     return {image_id: shown_ninths(seen) for image_id, seen in cells.items()}
 
 
-def final_pairs(context: Context) -> Judged:
-    """Judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block."""
+def final_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
+    """Judged pairs in the order of pairs.csv, without the matches that contradict the adjusted block. features: as
+    `verified_pairs` has them."""
     final = FinalEntries(context.workspace)
-    for pair, entry in verified_pairs(context):
+    for pair, entry in verified_pairs(context, features):
         yield pair, final.left(pair.image_id0, entry)  # of present keypoints: stale ones are none of those pairs
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -210,11 +210,11 @@ def outdated_pairs(context: Context) -> list[Pair]:
     return outdated
 
 
-def verified_pairs(context: Context) -> Judged:
+def verified_pairs(context: Context, features: Callable[[str], str] | None = None) -> Judged:
     """Judged pairs in the order of pairs.csv: stale rows, of older pair lists or features that were made again since,
-    cannot leak."""
+    cannot leak. features: fingerprint of an image's features, "" of none; by default from its file."""
     row_id, row = "", dict[str, VerifiedEntry]()
-    features = cache(partial(rows.features_on_file, context.workspace))
+    features = features or cache(partial(rows.features_on_file, context.workspace))
     for pair in context.pairs:
         if pair.image_id0 != row_id:
             row_id, row = pair.image_id0, read_verified_row(context.workspace.verified(pair.image_id0))

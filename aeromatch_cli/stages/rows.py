@@ -92,9 +92,15 @@ def stale_image(image_id0: str, entry: MatchEntry | VerifiedEntry, features: Cal
     return ""
 
 
-def check_features(workspace: Workspace, image_id0: str, entry: MatchEntry | VerifiedEntry) -> None:
-    """Raises WorkspaceError where an entry's matches point into features that are no longer there."""
-    if image_id := stale_image(image_id0, entry, partial(features_on_file, workspace)):
+def check_features(
+    workspace: Workspace,
+    image_id0: str,
+    entry: MatchEntry | VerifiedEntry,
+    features: Callable[[str], str] | None = None,
+) -> None:
+    """Raises WorkspaceError where an entry's matches point into features that are no longer there. features: as
+    `stale_image` has them, by default from their files."""
+    if image_id := stale_image(image_id0, entry, features or partial(features_on_file, workspace)):
         raise WorkspaceError(
             f"{workspace.root}: the keypoints of {image_id} were found again with other settings or inputs after it "
             "was matched, so that its matches no longer hold: run `aeromatch match` and then `aeromatch filter`, or "
