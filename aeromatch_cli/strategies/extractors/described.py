@@ -33,6 +33,16 @@ def keypoints_field(default: int) -> Any:
     )
 
 
+def pixels_field(default: float) -> Any:
+    """The setting `pixels_per_keypoint` of one strategy: 0 where the finest detail has the best keypoints."""
+    return Field(
+        default,
+        ge=0.0,
+        description="Views with more visible pixels per keypoint are halved, again and again, before keypoints are "
+        "looked for; 0: never. Smaller: less time, keypoints less accurate.",
+    )
+
+
 class Described(Strategy):
     """Keypoints and descriptors of all views of one image: detect, select, describe.
 
@@ -52,12 +62,7 @@ class Described(Strategy):
         description="Number of keypoints per cell of the grid by which they are spread. Larger: fewer cells, less "
         "even.",
     )
-    pixels_per_keypoint: float = Field(
-        1200.0,
-        ge=0.0,
-        description="Views with more visible pixels per keypoint are halved, again and again, before keypoints are "
-        "looked for; 0: never. Smaller: less time, keypoints less accurate.",
-    )
+    pixels_per_keypoint: float = pixels_field(0.0)
     colours: bool = Field(False, description="Keep the colour around every keypoint; filter=colour needs it.")
 
     @abstractmethod
