@@ -36,8 +36,8 @@ class Sift(Described):
     # sheffield, every 3rd image) and give 1.7 to 1.9 x the points.
     keypoints: int = keypoints_field(8000)
     # Halved at 1,000 pixels each (rendered suburb and hills): a third of the seconds, 2.5 and 1.2 % fewer correct
-    # matches, errors of 0.24 and 0.22 -> 0.29 and 0.24 px; at 1,500 1.1 and 2.2 % fewer; 1,200 (ochota): 2 % more within
-    # 3 px of the reference. At 750 (lewis) 4 % fewer, at 600 (seneca) 9 %.
+    # matches, errors of 0.24 and 0.22 -> 0.29 and 0.24 px; at 1,500 1.1 and 2.2 % fewer; at 1,200 (ochota) 2 % more
+    # within 3 px of the reference. At 750 (lewis) 4 % fewer, at 600 (seneca) 9 %.
     pixels_per_keypoint: float = pixels_field(1000.0)
     orientation: Literal["auto", "gradient", "upright"] = Field(
         "auto",
