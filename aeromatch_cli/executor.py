@@ -253,15 +253,17 @@ class Executor:
 
     @contextmanager
     def step(self, label: str) -> Iterator[None]:
-        """Shows a part that this process waits for, as one item."""
+        """Shows a part that this process waits for, as one item; what runs inside it is not shown."""
         started = time.monotonic()
         record.info("%s: started", label)
-        self.progress.start(label, 1)
+        shown, self.progress = self.progress, SilentProgress()
+        shown.start(label, 1)
         try:
             yield
-            self.progress.advance()
+            shown.advance()
         finally:
-            self.progress.stop()
+            self.progress = shown
+            shown.stop()
             record.info("%s: %.1f s", label, time.monotonic() - started)
 
     def _advance(self, index: int) -> None:

@@ -374,7 +374,9 @@ def whole_record(path: Path, *, say: bool = False) -> dict[str, Any]:
     record = read_json(path)
     changed = changed_files(path.parent, record)
     if changed and say:
-        log.warning("warning: %s was changed or removed since it was written: made again", path.parent / changed[0])
+        log.warning(
+            "warning: %s was changed or removed since it was written, and counts as absent", path.parent / changed[0]
+        )
     return {} if changed else record
 
 

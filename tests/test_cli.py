@@ -223,20 +223,6 @@ def test_log_file_takes_every_message(site):
     assert (outcome.code, "cannot be written" in outcome.stderr) == (2, True)
 
 
-@pytest.mark.parametrize("shard", ["0/2", "3/2", "1/100000000000", "\u00b2/3", "-1/2", "1/2/3"])
-def test_shards_that_are_none_are_refused(site, shard):
-    outcome = site("run", "--shard", shard)
-    assert (outcome.code, "write i/n" in outcome.stderr) == (2, True)
-
-
-def test_a_cell_of_megabytes_is_not_echoed(site):
-    site.poses.write_text(f"image,x,y,z\n{site.names()[0]},{'7x' * 50_000},0,0\n")
-    outcome = site("run")
-    assert outcome.code == 2
-    assert "is not a number" in outcome.stderr
-    assert len(outcome.stderr) < 2000
-
-
 def test_json_is_the_last_line_even_of_errors(site):
     assert site("run", "--shard", "x").facts == {
         "command": "run",

@@ -55,7 +55,7 @@ def test_a_damaged_adjustment_is_named(done_site):
     expected = contents(done_site.work)
     outcome = done_site("run")
     assert outcome.code == 0
-    assert f"{path} was changed or removed since it was written: made again" in outcome.stderr
+    assert f"{path} was changed or removed since it was written, and counts as absent" in outcome.stderr
     assert contents(done_site.work) != expected
     data[len(data) // 2] ^= 1
     assert path.read_bytes() == data

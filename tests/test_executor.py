@@ -17,6 +17,7 @@ from dask_cluster import Processes, dask_cluster, dask_worker
 from make_slow import slow_square
 
 from aeromatch_cli.blocks.exif import read_exif
+from aeromatch_cli.cli.progress import TerminalProgress
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor, Outcome, available_cores, guarded
 from aeromatch_cli.fingerprints import stable_hash
@@ -366,3 +367,11 @@ def test_a_server_of_another_kind_is_no_dask_scheduler(monkeypatch: pytest.Monke
             pytest.raises(ConfigError, match=r"no dask scheduler answers at .* \(no answer within 1 s\)"),
         ):
             executor.run(slow_square, [1], "x")
+
+
+def test_work_inside_a_step_is_part_of_it_in_a_terminal() -> None:
+    executor = Executor("serial", 1, TerminalProgress())
+    with executor.step("report"):
+        outcomes = executor.run(abs, [-1, 2], "pictures")
+    assert [outcome.value for outcome in outcomes] == [1, 2]
+    assert [outcome.value for outcome in executor.run(abs, [-3], "shown again")] == [3]

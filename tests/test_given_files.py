@@ -78,3 +78,17 @@ def test_a_workspace_without_its_settings_is_no_folder_of_images(tmp_path: Path)
     (tmp_path / ".lock").touch()
     with pytest.raises(ConfigError, match="workspace whose run has not got as far"):
         load(str(tmp_path))
+
+
+@pytest.mark.parametrize("shard", ["0/2", "3/2", "1/100000000000", "\u00b2/3", "-1/2", "1/2/3"])
+def test_shards_that_are_none_are_refused(site: Site, shard: str) -> None:
+    outcome = site("run", "--shard", shard)
+    assert (outcome.code, "write i/n" in outcome.stderr) == (2, True)
+
+
+def test_a_cell_of_megabytes_is_not_echoed(site: Site) -> None:
+    site.poses.write_text(f"image,x,y,z\n{site.names()[0]},{'7x' * 50_000},0,0\n")
+    outcome = site("run")
+    assert outcome.code == 2
+    assert "is not a number" in outcome.stderr
+    assert len(outcome.stderr) < 2000

@@ -90,7 +90,7 @@ def test_the_budget_is_for_the_image_or_for_each_view():
 def test_few_keypoints_of_a_large_view_are_those_of_a_reduced_one():
     gray, valid, keypoints = texture(1800, 1400), np.ones((1400, 1800), bool), 800
     valid[:, 1500:] = False
-    assert factor_for([source(gray, valid)], keypoints, 1200.0) == 2
+    assert factor_for(camera_of(gray), [source(gray, valid)], keypoints, 1200.0) == 2
     whole = extract(gray, valid, keypoints=keypoints, pixels_per_keypoint=0.0)
     fast = extract(gray, valid, keypoints=keypoints)
     assert len(fast.descriptors) == len(whole.descriptors) == keypoints
@@ -106,19 +106,23 @@ def test_a_view_is_not_reduced_where_it_would_have_too_few_keypoints():
     dull = np.full((1600, 1600), 90, np.uint8)
     dull[:300, :300] = texture(300, 300)
     settings = {"keypoints": 1000, "pixels_per_keypoint": 300.0}
-    assert factor_for([source(dull)], 1000, 300.0) == 2
+    assert factor_for(camera_of(dull), [source(dull)], 1000, 300.0) == 2
     assert len(extract(dull, **settings).descriptors) == len(extract(dull, keypoints=1000).descriptors)
 
 
 def test_how_often_a_view_is_halved():
     large, small = source(np.zeros((4000, 6000), np.uint8)), source(np.zeros((600, 1000), np.uint8))
-    assert [factor_for([large], number, 1200.0) for number in (30_000, 20_000, 8_000, 4_000)] == [1, 1, 2, 4]
-    assert factor_for([large, large], 20_000, 1200.0) == 2
-    assert factor_for([large], 10, 0.0) == 1
+    camera = camera_of(large.gray)
+    assert [factor_for(camera, [large], number, 1200.0) for number in (30_000, 20_000, 8_000, 4_000)] == [1, 1, 2, 4]
+    assert factor_for(camera, [large, large], 20_000, 1200.0) == 2
+    assert factor_for(camera, [large], 10, 0.0) == 1
+    assert factor_for(camera, [small], 10, 1200.0) == 1  # it takes no time as it is
+    # Neither a mask nor the empty corners of a turned view make images of one camera differ.
     half = np.arange(4000 * 6000).reshape(4000, 6000) % 2 == 0
-    assert factor_for([source(large.gray, half)], 8_000, 1200.0) == 2
-    assert factor_for([source(large.gray, half)], 12_000, 1200.0) == 1
-    assert factor_for([small], 10, 1200.0) == 1  # it takes no time as it is
+    assert factor_for(camera, [source(large.gray, half)], 8_000, 1200.0) == 2
+    assert factor_for(camera_of(small.gray), [large], 100, 1200.0) == 1
+    sliver = source(np.zeros((3, 4000), np.uint8))
+    assert factor_for(camera, [large, sliver], 1_000, 1200.0) == 2
 
 
 def test_fewer_only_where_fewer_exist():

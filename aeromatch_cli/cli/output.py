@@ -101,7 +101,7 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
 
 
 def _shortened(text: str) -> str:
-    """Without the middle of what is longer than any path or number: a cell of a file may hold megabytes."""
+    """Without the middle of very long words: a cell of a file may hold megabytes."""
     return re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda found: f"{found[0][:60]}...{found[0][-20:]}", text)
 
 

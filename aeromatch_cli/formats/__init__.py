@@ -2,8 +2,7 @@ r"""# The workspace
 
 Every file of a workspace, format version 1. Text is UTF-8. CSV files have a header row and comma separators; an empty
 cell means unknown. Numbers are written with full float64 precision. `.npz` files are uncompressed NumPy archives
-without
-Python objects.
+without Python objects; their zip comment is `CRC-32 ` and the checksum (8 hex digits) of all that stands before it.
 
 - Pixels are (x, y); (0, 0) is the centre of the top-left pixel of the stored raster, whatever its EXIF Orientation.
 - Metres are in the world frame: the CRS of `block.json` minus its `origin_m`. x is east, y north, z up.

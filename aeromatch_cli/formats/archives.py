@@ -48,8 +48,9 @@ def save_arrays(stream: BinaryIO, **arrays: NDArray[Any]) -> None:
     made = io.BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]
     # The last field of the end record is the length of the comment.
-    head = made.getvalue()[:-2] + (len(_MARK) + _DIGITS).to_bytes(2, "little")
-    stream.write(head + _MARK + b"%08x" % zlib.crc32(head))
+    head, length = made.getbuffer()[:-2], (len(_MARK) + _DIGITS).to_bytes(2, "little")
+    stream.write(head)
+    stream.write(length + _MARK + b"%08x" % zlib.crc32(length, zlib.crc32(head)))
 
 
 def load_arrays(path: Path, names: Sequence[str], optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:

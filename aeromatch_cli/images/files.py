@@ -26,8 +26,8 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
-# Between the shapes of a mask and of its image: a reduced mask is rounded to whole pixels.
-_MASK_STRETCH = 0.02
+# A reduced mask has the shape of its image but for rounding to whole pixels.
+_MASK_ROUNDING_PX = 1.0
 
 
 def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
@@ -156,7 +156,7 @@ def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
         raise ItemError(f"mask: {error}") from None
     if mask.shape != (height_px, width_px):
         height, width = mask.shape
-        if abs(width / height * height_px / width_px - 1.0) > _MASK_STRETCH:
+        if abs(width * height_px - height * width_px) > max(width_px, height_px) * _MASK_ROUNDING_PX:
             raise ItemError(
                 f"mask: {path} is {width} x {height} pixels, its image {width_px} x {height_px}, another shape: "
                 "turn it as the stored image lies, or make it anew"

@@ -62,6 +62,12 @@ def _keypoints(step: Any, settings: Settings) -> int:
     return int(step.keypoints or min(_SLOW_KEYPOINTS, getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)))
 
 
+def _reduction(settings: Settings) -> dict[str, float]:
+    """As the user's own SIFT has it."""
+    own = settings.extract
+    return {"pixels_per_keypoint": own.pixels_per_keypoint} if isinstance(own, Sift) else {}
+
+
 # What a step changes of the settings.
 _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
     GuidedSearch: lambda _, settings: {
@@ -76,7 +82,7 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
-        "extract": Sift(keypoints=_keypoints(step, settings)),
+        "extract": Sift(keypoints=_keypoints(step, settings), **_reduction(settings)),
         "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },
 }

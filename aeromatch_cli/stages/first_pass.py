@@ -82,7 +82,7 @@ def prepared(context: Context, recipe: FirstPass) -> Context:
             "run": settings.run.model_copy(update={"keep_images": False}),
             "enhance": NoEnhancement(),
             "simulate": SourceOnly(),
-            "extract": Sift(keypoints=recipe.keypoints),
+            "extract": Sift(keypoints=recipe.keypoints, pixels_per_keypoint=0.0),  # size_px says how large
             "match": Nearest(),
             "filter": (Poselib(model="fundamental"),),
         }

@@ -38,8 +38,9 @@ def pixels_field(default: float) -> Any:
     return Field(
         default,
         ge=0.0,
-        description="Views with more visible pixels per keypoint are halved, again and again, before keypoints are "
-        "looked for; 0: never. Smaller: less time, keypoints less accurate.",
+        description="Views are halved before keypoints are looked for, again and again, while the image has more "
+        "pixels per wanted keypoint, but where too few are found; 0: never. Smaller: less time, keypoints less "
+        "accurate.",
     )
 
 
@@ -98,7 +99,7 @@ class Described(Strategy):
         raw = concatenate([self._cut(found, views, group) for group in self._groups(views)])
         turned = self.turned(in_reduced_views(raw, factors[raw.view_idx]), small)
         raw = replace(raw, orientations_deg=turned.orientations_deg)
-        keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx)
+        keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx, int(factors.max()))
         points = raw.take(standing)
         order = np.argsort(keypoint_idx, kind="stable")  # descriptors of one keypoint side by side
         raw, numbers = raw.take(order), keypoint_idx[order].astype(np.int32)
@@ -110,7 +111,7 @@ class Described(Strategy):
         budget have fewer features than it buys."""
         found, factors = dict[int, Raw](), np.ones(len(views), np.int64)
         for group in self._groups(views):
-            factor = factor_for([views[index] for index in group], self.keypoints, self.pixels_per_keypoint)
+            factor = factor_for(camera, [views[i] for i in group], self.keypoints, self.pixels_per_keypoint)
             while True:
                 for index in group:
                     found[index] = in_source(camera, views[index], self._found(views[index], factor, index))
@@ -126,7 +127,7 @@ class Described(Strategy):
         raw = in_whole_views(raw, np.full(len(raw.view_idx), factor))
         starts = raw.starts()
         points = raw.take(starts)
-        keep = distinct(points.points_px, points.sizes_px, self.strengths(points), _SAME_BLOB_PX)
+        keep = distinct(points.points_px, points.sizes_px, self.strengths(points), _SAME_BLOB_PX * factor)
         return raw.take(keep[np.cumsum(starts) - 1])
 
     def _groups(self, views: Sequence[ViewPixels]) -> list[list[int]]:

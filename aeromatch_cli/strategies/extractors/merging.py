@@ -11,12 +11,15 @@ _MERGE_DISTANCE_PX = 1.0
 _MERGE_SIZE_RATIO = 1.5
 
 
-def merge_keypoints(points_px: FloatArray, sizes_px: FloatArray, view_idx: IntArray) -> tuple[IntArray, IntArray]:
+def merge_keypoints(
+    points_px: FloatArray, sizes_px: FloatArray, view_idx: IntArray, factor: int = 1
+) -> tuple[IntArray, IntArray]:
     """Keypoint number of each feature (N,) and the feature that stands for each keypoint (K,), both int64.
 
     points_px (N, 2), sizes_px (N,) in the source frame, views ascending. Neighbours in the list of equal view, place
     and size are one keypoint (several orientations). A keypoint of a later view joins the nearest one of the views
     before it, if each is the other's nearest, within 1 px and a size ratio of 1.5; the earliest view's place stands.
+    factor: by which the views were reduced, and so the pixels that the detector scatters by are larger.
     """
     if len(points_px) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -27,7 +30,7 @@ def merge_keypoints(points_px: FloatArray, sizes_px: FloatArray, view_idx: IntAr
     views = view_idx[first]
     for view in np.unique(views)[1:]:
         old, new = np.flatnonzero((views < view) & (target == np.arange(len(first)))), np.flatnonzero(views == view)
-        hit_new, hit_old = _same_points(points_px[first], sizes_px[first], new, old)
+        hit_new, hit_old = _same_points(points_px[first] / factor, sizes_px[first], new, old)
         target[hit_new] = hit_old
     standing = np.flatnonzero(target == np.arange(len(first)))
     number = np.empty(len(first), np.int64)

@@ -11,20 +11,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from aeromatch_cli.data import IntArray
+from aeromatch_cli.data import Camera, IntArray
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw
 
-# Smaller pictures take no time.
+# Views of fewer pixels in all take hardly any time.
 _LEAST_PX = 400_000
 
 
-def factor_for(views: Sequence[ViewPixels], keypoints: int, most_px: float) -> int:
-    """The power of two by which views are reduced that share a number of keypoints, so that at most most_px visible
-    pixels are left for each, and _LEAST_PX together; 1 where most_px is 0."""
-    shown = sum(view.gray.size if view.valid is None else int(np.count_nonzero(view.valid)) for view in views)
+def factor_for(camera: Camera, views: Sequence[ViewPixels], keypoints: int, most_px: float) -> int:
+    """The power of two by which views are reduced that share a number of keypoints: the smallest that leaves at most
+    most_px pixels for each keypoint, unless fewer than _LEAST_PX pixels would be left in all; 1 where most_px is 0.
+
+    A view counts as many pixels as the image has, or its own where those are fewer: images of one camera shall be
+    reduced alike, whatever part of their views shows ground, because only then have they the same blobs.
+    """
+    pixels = sum(min(camera.width_px * camera.height_px, view.gray.size) for view in views)
+    sides = [side for view in views for side in view.gray.shape]
     factor = 1
-    while 0.0 < most_px * keypoints * factor**2 < shown and shown >= _LEAST_PX * (2 * factor) ** 2:
+    while 0.0 < most_px * keypoints * factor**2 < pixels and pixels >= _LEAST_PX * (2 * factor) ** 2:
+        if min(sides) < 2 * factor:  # a sliver
+            break
         factor *= 2
     return factor
 
@@ -35,7 +42,7 @@ def reduced(view: ViewPixels, factor: int) -> ViewPixels:
     import cv2
 
     height, width = (side // factor for side in view.gray.shape)
-    if factor == 1 or not height or not width:
+    if factor == 1:
         return view
     parts = view.gray[: height * factor, : width * factor]
     gray = cv2.resize(parts, (width, height), interpolation=cv2.INTER_AREA)

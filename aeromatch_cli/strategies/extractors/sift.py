@@ -35,10 +35,10 @@ class Sift(Described):
     # As many as COLMAP has (8192). Twice as many as before cost 1.1 to 1.4 x the seconds of whole runs (seneca,
     # sheffield, every 3rd image) and give 1.7 to 1.9 x the points.
     keypoints: int = keypoints_field(8000)
-    # Halved at 1,000 pixels each (rendered suburb and hills): a third of the seconds, 2.5 and 1.2 % fewer correct
-    # matches, errors of 0.24 and 0.22 -> 0.29 and 0.24 px; at 1,500 1.1 and 2.2 % fewer; at 1,200 (ochota) 2 % more
-    # within 3 px of the reference. At 750 (lewis) 4 % fewer, at 600 (seneca) 9 %.
-    pixels_per_keypoint: float = pixels_field(1000.0)
+    # What halving does to images with so many pixels per keypoint: 1,500 (rendered suburb and hills): 1 and 2 % fewer
+    # correct matches in a third of the seconds, errors of 0.25 and 0.27 -> 0.30 and 0.28 px; 1,000 (ochota): 2 % more
+    # within 3 px of the reference; 750 (lewis): 4 % fewer; 600 (seneca): 9 % fewer.
+    pixels_per_keypoint: float = pixels_field(900.0)
     orientation: Literal["auto", "gradient", "upright"] = Field(
         "auto",
         description="Rotate descriptors to the dominant gradient (gradient), or not at all (upright: one descriptor "
