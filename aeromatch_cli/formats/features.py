@@ -60,21 +60,23 @@ def read_keypoints(path: Path) -> tuple[FloatArray, FloatArray, NDArray[np.uint8
 
 def features_fingerprint(path: Path) -> str | None:
     """Fingerprint recorded in a feature file, None when the file is absent or any of its arrays is broken."""
-    try:
-        return str(load_checked(path, ("fingerprint",))["fingerprint"])
-    except BrokenFileError as error:
-        say_damaged(path, error)
-        return None
+    arrays = _checked(path, "fingerprint")
+    return None if arrays is None else str(arrays["fingerprint"])
 
 
 def checked_keypoints(path: Path) -> tuple[str, FloatArray | None]:
     """Fingerprint and keypoints (K, 2) from one reading; "" and None as `features_fingerprint` has None."""
+    arrays = _checked(path, "fingerprint", "keypoints_px")
+    return ("", None) if arrays is None else (str(arrays["fingerprint"]), arrays["keypoints_px"])
+
+
+def _checked(path: Path, *names: str) -> dict[str, NDArray[Any]] | None:
+    """None, and a word, where the file is absent or any of its arrays is broken."""
     try:
-        arrays = load_checked(path, ("fingerprint", "keypoints_px"))
+        return load_checked(path, names)
     except BrokenFileError as error:
         say_damaged(path, error)
-        return "", None
-    return str(arrays["fingerprint"]), arrays["keypoints_px"]
+        return None
 
 
 def known_fingerprint(path: Path) -> str | None:

@@ -94,8 +94,7 @@ class Described(Strategy):
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
-        found, factors = self._looked_for(camera, views)
-        small = [reduced(view, factor) for view, factor in zip(views, factors.tolist(), strict=True)]
+        found, small, factors = self._looked_for(camera, views)
         raw = concatenate([self._cut(found, views, group) for group in self._groups(views)])
         turned = self.turned(in_reduced_views(raw, factors[raw.view_idx]), small)
         raw = replace(raw, orientations_deg=turned.orientations_deg)
@@ -106,24 +105,25 @@ class Described(Strategy):
         descriptors = self.described(in_reduced_views(raw, factors[raw.view_idx]), small)
         return _features(points, raw, numbers, descriptors, views)
 
-    def _looked_for(self, camera: Camera, views: Sequence[ViewPixels]) -> tuple[list[Raw], IntArray]:
-        """All features of every view, and by how much each was reduced for it (V,): less where the reduced views of a
-        budget have fewer features than it buys."""
-        found, factors = dict[int, Raw](), np.ones(len(views), np.int64)
+    def _looked_for(self, camera: Camera, views: Sequence[ViewPixels]) -> tuple[list[Raw], list[ViewPixels], IntArray]:
+        """All features of every view, the reduced views that they were found in, and by how much each was reduced (V,):
+        less where the reduced views of a budget have fewer features than it buys."""
+        found, small, factors = dict[int, Raw](), list(views), np.ones(len(views), np.int64)
         for group in self._groups(views):
             factor = factor_for(camera, [views[i] for i in group], self.keypoints, self.pixels_per_keypoint)
             while True:
                 for index in group:
-                    found[index] = in_source(camera, views[index], self._found(views[index], factor, index))
+                    small[index] = reduced(views[index], factor)
+                    found[index] = in_source(camera, views[index], self._found(small[index], factor, index))
                 if factor == 1 or sum(len(found[index].view_idx) for index in group) >= self.keypoints:
                     break
                 factor //= 2
             factors[group] = factor
-        return [found[index] for index in range(len(views))], factors
+        return [found[index] for index in range(len(views))], small, factors
 
     def _found(self, view: ViewPixels, factor: int, view_idx: int) -> Raw:
-        """All features of one view, reduced by a factor, each blob once, in the frame of the whole view."""
-        raw = self.detected(reduced(view, factor), view_idx)
+        """All features of one view, which is reduced by a factor, each blob once, in the frame of the whole view."""
+        raw = self.detected(view, view_idx)
         raw = in_whole_views(raw, np.full(len(raw.view_idx), factor))
         starts = raw.starts()
         points = raw.take(starts)
