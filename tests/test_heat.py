@@ -51,17 +51,16 @@ def test_top_of_a_gaussian_is_found_below_the_pixel() -> None:
     assert values[0] == pytest.approx(2.0, abs=0.01)
 
 
-def test_a_maximum_beats_its_neighbours_in_place_and_scale() -> None:
+def test_a_maximum_beats_its_neighbours_in_place_and_leaves_those_of_other_levels() -> None:
     levels = levels_of(texture(128, 128), most=3)
     maps = [np.full(level.gray.shape, -9.0, np.float32) for level in levels]
     for number, (level, logits) in enumerate(zip(levels, maps, strict=True)):
         column, row = np.rint(level.from_picture(np.array([[60.0, 40.0]]))[0]).astype(int)
         logits[row, column] = (0.0, 2.0, 1.0)[number]
     points, sizes, values = maxima(levels, maps)
-    assert len(points) == 1
-    assert sizes[0] == pytest.approx(SIZE_PX * 2**0.5, rel=0.02)
-    assert points[0] == pytest.approx([60.0, 40.0], abs=0.75)
-    assert values[0] == pytest.approx(2.0, abs=0.01)
+    assert sizes == pytest.approx(SIZE_PX * 2 ** np.array([0.0, 0.5, 1.0]), rel=0.02)
+    assert points == pytest.approx(np.array([[60.0, 40.0]] * 3), abs=0.75)
+    assert values == pytest.approx([0.0, 2.0, 1.0], abs=0.02)
 
 
 class Peaks:

@@ -75,6 +75,12 @@ class Described(Strategy):
         del views
         return raw
 
+    def suffice(self, raw: Raw, factor: int) -> bool:
+        """Whether features (N,) that were found in views reduced by a factor, in the frames of the whole ones, make
+        finer views needless."""
+        del factor
+        return len(raw.view_idx) >= self.keypoints
+
     @abstractmethod
     def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
         """Descriptors (N, descriptor_length) of the features."""
@@ -107,7 +113,7 @@ class Described(Strategy):
 
     def _looked_for(self, camera: Camera, views: Sequence[ViewPixels]) -> tuple[list[Raw], list[ViewPixels], IntArray]:
         """All features of every view, the reduced views that they were found in, and by how much each was reduced (V,):
-        less where the reduced views of a budget have fewer features than it buys."""
+        less where the features of the reduced views of a budget do not `suffice`."""
         found, small, factors = dict[int, Raw](), list(views), np.ones(len(views), np.int64)
         for group in self._groups(views):
             factor = factor_for(camera, [views[i] for i in group], self.keypoints, self.pixels_per_keypoint)
@@ -115,7 +121,7 @@ class Described(Strategy):
                 for index in group:
                     small[index] = reduced(views[index], factor)
                     found[index] = in_source(camera, views[index], self._found(small[index], factor, index))
-                if factor == 1 or sum(len(found[index].view_idx) for index in group) >= self.keypoints:
+                if factor == 1 or self.suffice(concatenate([found[index] for index in group]), factor):
                     break
                 factor //= 2
             factors[group] = factor

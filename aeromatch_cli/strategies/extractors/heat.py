@@ -100,28 +100,22 @@ def heat(
 
 
 def maxima(levels: Sequence[Level], maps: Sequence[Logits]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """All maxima over place and scale: picture points (N, 2), sizes (N,), log odds (N,), refined below the pixel.
+    """All maxima of all levels: picture points (N, 2), sizes (N,), log odds (N,), refined below the pixel.
 
-    A maximum is larger than its eight neighbours and than the nine pixels around its place in the levels next to its
-    own.
+    A maximum is larger than its eight neighbours. It need not be larger than what lies around it in the next levels,
+    as the paper has it: of two images one takes the finer and the other the coarser keypoint where both are nearly as
+    sure, and neither is found again (ochota, every 2nd image: 20,439 matches with that rule, 22,164 without it).
     """
     import cv2
 
     square, wide = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
-    tops = [cv2.dilate(logits, square) for logits in maps]
     square[1, 1] = 0
     found_points, found_sizes, found_logits = [], [], []
-    for index, (level, logits) in enumerate(zip(levels, maps, strict=True)):
+    for level, logits in zip(levels, maps, strict=True):
         peak = logits > cv2.dilate(logits, square)
         peak &= cv2.dilate(level.gray, wide).astype(np.int16) - cv2.erode(level.gray, wide) >= _LEAST_CONTRAST
         peak[:BORDER_PX], peak[-BORDER_PX:], peak[:, :BORDER_PX], peak[:, -BORDER_PX:] = False, False, False, False
         y, x = np.nonzero(peak)
-        places = level.to_picture(np.column_stack([x, y]).astype(np.float64))
-        stands = np.ones(len(x), bool)
-        for other in (index - 1, index + 1):
-            if 0 <= other < len(levels):
-                stands &= logits[y, x] > _nearest(tops[other], levels[other].from_picture(places))
-        x, y = x[stands], y[stands]
         steps, values = refined(logits, x, y)
         points = level.to_picture(np.column_stack([x, y]) + steps)
         found_points.append(points)

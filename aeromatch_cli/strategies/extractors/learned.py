@@ -36,7 +36,7 @@ _CHOICE = 8
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks that are trained on aerial images."""
 
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
     network: ClassVar[bool] = True
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
@@ -156,6 +156,11 @@ class Learned(Described):
             octaves=np.zeros(len(points), np.int32),
             view_idx=np.full(len(points), view_idx, np.int32),
         )
+
+    def suffice(self, raw: Raw, factor: int) -> bool:
+        """Always: of finer views the surest keypoints are finer ones, which match none of the block's other images."""
+        del raw, factor
+        return True
 
     def strengths(self, raw: Raw) -> FloatArray:
         """The network's confidence; of SIFT's keypoints what `sift` chooses by."""
