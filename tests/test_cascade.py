@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from conftest import IMAGES, Site
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdict
 from aeromatch_cli.formats.features import read_joined, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
-from aeromatch_cli.stages.cascade import Evidence, _tried, _untied
+from aeromatch_cli.stages.cascade import Evidence, _tried, _untied, strategies_of
 from aeromatch_cli.stages.union import joined_keypoints, joined_matches
-from aeromatch_cli.strategies.steps import LearnedFeatures
+from aeromatch_cli.strategies.extractors.described import Described
+from aeromatch_cli.strategies.steps import LearnedFeatures, LiftedShadows
 
 CAMERA = Camera("SIMPLE_PINHOLE", 800, 600, (800.0, 399.5, 299.5))
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -100,6 +102,17 @@ def test_rare_pairs_go_without_features_where_a_third_image_ties_them() -> None:
     reasons = {("a", "b"): "", ("b", "c"): "", ("a", "c"): "few", ("c", "d"): "few", ("d", "e"): ""}
     left = {key: reason for key, reason in reasons.items() if reason}
     assert _untied(left, reasons) == {("c", "d"): "few"}
+
+
+@pytest.mark.parametrize(
+    ("words", "learned", "sift"), [((), 1500.0, 900.0), (("extract.pixels_per_keypoint=0",), 0.0, 0.0)]
+)
+def test_steps_halve_views_unless_the_user_never_does(words: tuple[str, ...], learned: float, sift: float) -> None:
+    settings = load("auto", words)
+    for step, pixels in ((LearnedFeatures(), learned), (LiftedShadows(), sift)):
+        extract = strategies_of(step, settings)["extract"]
+        assert isinstance(extract, Described)
+        assert extract.pixels_per_keypoint == pixels
 
 
 def test_a_keypoint_of_a_later_step_that_lies_on_an_earlier_one_is_that_one() -> None:

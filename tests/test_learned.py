@@ -12,6 +12,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
+from scipy.spatial import cKDTree
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry, View
@@ -134,6 +135,26 @@ def test_cuda_finds_what_the_cpu_finds(picture: NDArray[np.uint8]) -> None:
     count, share = share_right(extract(picture), extract(picture, device="auto"), np.eye(2, 3))
     assert count >= 300
     assert share > 0.95
+
+
+def test_few_keypoints_of_a_large_picture_are_those_of_half_its_size(picture: NDArray[np.uint8]) -> None:
+    large = np.tile(picture, (5, 5))[:1300, :1300]
+    fast, whole = extract(large, keypoints=1000), extract(large, keypoints=1000, pixels_per_keypoint=0.0)
+    assert len(fast.descriptors) == len(whole.descriptors) == 1000
+    assert fast.sizes_px.min() == pytest.approx(15.0, rel=0.01)
+    assert np.median(whole.sizes_px) == pytest.approx(7.5, rel=0.01)
+    small = cv2.resize(large, (650, 650), interpolation=cv2.INTER_AREA)
+    half = extract(small, keypoints=1000, pixels_per_keypoint=0.0)
+    distances, nearest = cKDTree(half.keypoints_px).query((fast.keypoints_px + 0.5) / 2.0 - 0.5)
+    same = distances < 1e-3
+    assert same.mean() > 0.8  # cells that share the budget are not the same
+    assert (fast.descriptors[same] == half.descriptors[nearest[same]]).all(axis=1).mean() > 0.95
+    # Never finer ones in their place: they would match nothing in the other images.
+    dull = np.full((1300, 1300), 90, np.uint8)
+    dull[:SIDE, :SIDE] = picture
+    few = extract(dull, keypoints=1000)
+    assert 100 < len(few.descriptors) < 1000
+    assert few.sizes_px.min() == pytest.approx(15.0, rel=0.01)
 
 
 def test_masked_ground_has_no_keypoints(picture: NDArray[np.uint8]) -> None:

@@ -127,8 +127,10 @@ def test_how_often_a_view_is_halved():
     assert [factor_for(camera, [large], number, 1200.0) for number in (30_000, 20_000, 8_000, 4_000)] == [1, 1, 2, 4]
     assert factor_for(camera, [large, large], 20_000, 1200.0) == 2
     assert factor_for(camera, [large], 10, 0.0) == 1
-    assert factor_for(camera, [small], 10, 1200.0) == 1  # it takes no time as it is
-    # Neither a mask nor the empty corners of a turned view make images of one camera differ.
+    assert factor_for(camera_of(small.gray), [small], 10, 1200.0) == 1  # it takes no time as it is
+    # Neither a mask nor how much ground a view shows makes images of one camera differ.
+    quarter = source(np.zeros((2000, 3000), np.uint8))
+    assert factor_for(camera, [quarter], 8_000, 1200.0) == 2
     half = np.arange(4000 * 6000).reshape(4000, 6000) % 2 == 0
     assert factor_for(camera, [source(large.gray, half)], 8_000, 1200.0) == 2
     assert factor_for(camera_of(small.gray), [large], 100, 1200.0) == 1

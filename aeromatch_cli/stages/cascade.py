@@ -26,6 +26,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
+from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.extractors.learned import Learned
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct
@@ -62,10 +63,11 @@ def _keypoints(step: Any, settings: Settings) -> int:
     return int(step.keypoints or min(_SLOW_KEYPOINTS, getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)))
 
 
-def _reduction(settings: Settings) -> dict[str, float]:
-    """As the user's own SIFT has it."""
+def _reduction(settings: Settings, kind: type[Described]) -> dict[str, float]:
+    """As the user's own keypoints of the kind have it; of others that they are never reduced, where that is set."""
     own = settings.extract
-    return {"pixels_per_keypoint": own.pixels_per_keypoint} if isinstance(own, Sift) else {}
+    taken = isinstance(own, Described) and (isinstance(own, kind) or own.pixels_per_keypoint == 0.0)
+    return {"pixels_per_keypoint": own.pixels_per_keypoint} if taken else {}
 
 
 # What a step changes of the settings.
@@ -76,13 +78,18 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     },
     LearnedFeatures: lambda step, settings: {
         "simulate": NeighbourViews(),
-        "extract": Learned(keypoints=_keypoints(step, settings), precision=step.precision, device=step.device),
+        "extract": Learned(
+            keypoints=_keypoints(step, settings),
+            precision=step.precision,
+            device=step.device,
+            **_reduction(settings, Learned),
+        ),
         "match": Bidirectional(ratio=0.9, guided=True),
     },
     LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
-        "extract": Sift(keypoints=_keypoints(step, settings), **_reduction(settings)),
+        "extract": Sift(keypoints=_keypoints(step, settings), **_reduction(settings, Sift)),
         "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },
 }

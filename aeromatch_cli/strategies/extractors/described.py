@@ -34,13 +34,13 @@ def keypoints_field(default: int) -> Any:
 
 
 def pixels_field(default: float) -> Any:
-    """The setting `pixels_per_keypoint` of one strategy: 0 where the finest detail has the best keypoints."""
+    """The setting `pixels_per_keypoint` of one strategy."""
     return Field(
         default,
         ge=0.0,
         description="Views are halved before keypoints are looked for, again and again, while the image has more "
-        "pixels per wanted keypoint, but where too few are found; 0: never. Smaller: less time, keypoints less "
-        "accurate.",
+        "pixels per wanted keypoint; SIFT's are not where it finds too few, or finest blobs, in them. 0: never. "
+        "Smaller: less time, keypoints less accurate.",
     )
 
 
@@ -63,7 +63,7 @@ class Described(Strategy):
         description="Number of keypoints per cell of the grid by which they are spread. Larger: fewer cells, less "
         "even.",
     )
-    pixels_per_keypoint: float = pixels_field(0.0)
+    pixels_per_keypoint: float
     colours: bool = Field(False, description="Keep the colour around every keypoint; filter=colour needs it.")
 
     @abstractmethod

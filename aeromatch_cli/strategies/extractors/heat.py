@@ -1,4 +1,4 @@
-"""Keypoints of a picture where the detector's heat is largest over place and scale.
+"""Keypoints of a picture where the detector's heat is largest, level by level.
 
 The paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837) searches Gaussian heat maps for scale-space maxima and
 refines them below the pixel; here the maps are those of `nets.detector` on levels an octave apart.

@@ -23,10 +23,10 @@ def factor_for(camera: Camera, views: Sequence[ViewPixels], keypoints: int, most
     """The power of two by which views are reduced that share a number of keypoints: the smallest that leaves at most
     most_px pixels for each keypoint, unless fewer than _LEAST_PX pixels would be left in all; 1 where most_px is 0.
 
-    A view counts as many pixels as the image has, or its own where those are fewer: images of one camera shall be
-    reduced alike, whatever part of their views shows ground, because only then have they the same blobs.
+    Every view counts as many pixels as the image has: images of one camera shall be reduced alike, however much ground
+    their views show, because only then have they the same blobs.
     """
-    pixels = sum(min(camera.width_px * camera.height_px, view.gray.size) for view in views)
+    pixels = camera.width_px * camera.height_px * len(views)
     sides = [side for view in views for side in view.gray.shape]
     factor = 1
     while 0.0 < most_px * keypoints * factor**2 < pixels and pixels >= _LEAST_PX * (2 * factor) ** 2:
