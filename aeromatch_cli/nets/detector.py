@@ -7,7 +7,7 @@ half. What a pixel answers depends on the 2 REACH_PX + 1 pixels squared around i
 contrast on FIELD_PX to every side. scripts/train detector documents the training, trained/detector.md the weights.
 
 Source: heat maps, trained on shapes and then by homographies, after DeTone, Malisiewicz and Rabinovich, SuperPoint,
-CVPR workshops 2018; their maxima over scale after the paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837).
+CVPR workshops 2018; maxima at several scales after the paper of method 3 (J. Geo-inf. Sci. 2021(10), 1823-1837).
 """
 
 from __future__ import annotations

@@ -72,7 +72,10 @@ _PRECISION: Precision = Field(
 
 
 class LearnedFeatures(Step):
-    """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search."""
+    """Learned keypoints and descriptors on ground views, the ratio test from both images, guided search.
+
+    Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
+    """
 
     cheap_to_match: ClassVar[bool] = True
     name: Literal["learned"] = "learned"

@@ -27,7 +27,8 @@ def keypoints_field(default: int) -> Any:
     return Field(
         default,
         ge=1,
-        description="Number of descriptors per image over all its views; fewer only where the image has fewer. A "
+        description="Number of descriptors per image over all its views; fewer only where the image, or what halving "
+        "leaves of it, has fewer. A "
         "keypoint with two orientations counts twice, as in OpenCV and COLMAP. With enhance.keep_source "
         "the source image and the enhanced one have this number each. Larger: more matches, more time.",
     )
@@ -39,8 +40,8 @@ def pixels_field(default: float) -> Any:
         default,
         ge=0.0,
         description="Views are halved before keypoints are looked for, again and again, while the image has more "
-        "pixels per wanted keypoint; SIFT's are not where it finds too few, or finest blobs, in them. 0: never. "
-        "Smaller: less time, keypoints less accurate.",
+        "pixels per wanted keypoint; for SIFT not where it finds too few in them, or mostly the "
+        "smallest that they show. 0: never. Smaller: less time, keypoints less accurate.",
     )
 
 
@@ -63,7 +64,7 @@ class Described(Strategy):
         description="Number of keypoints per cell of the grid by which they are spread. Larger: fewer cells, less "
         "even.",
     )
-    pixels_per_keypoint: float
+    pixels_per_keypoint: float = pixels_field(0.0)
     colours: bool = Field(False, description="Keep the colour around every keypoint; filter=colour needs it.")
 
     @abstractmethod

@@ -163,9 +163,8 @@ class Learned(Described):
         )
 
     def suffice(self, raw: Raw, factor: int) -> bool:
-        """Always: of finer views the surest keypoints are finer ones, which match none of the block's other images."""
-        del raw, factor
-        return True
+        """The network's always: the surest of finer views are finer ones, which match none of the other images."""
+        return self.detector == "network" or super().suffice(raw, factor)
 
     def strengths(self, raw: Raw) -> FloatArray:
         """The network's confidence; of SIFT's keypoints what `sift` chooses by."""

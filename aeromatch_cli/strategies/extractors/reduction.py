@@ -15,18 +15,18 @@ from aeromatch_cli.data import Camera, IntArray
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.detection import Raw
 
-# Views of fewer pixels in all take hardly any time.
+# Images of fewer pixels take hardly any time.
 _LEAST_PX = 400_000
 
 
 def factor_for(camera: Camera, views: Sequence[ViewPixels], keypoints: int, most_px: float) -> int:
-    """The power of two by which views are reduced that share a number of keypoints: the smallest that leaves at most
-    most_px pixels for each keypoint, unless fewer than _LEAST_PX pixels would be left in all; 1 where most_px is 0.
+    """The power of two by which views are reduced that share a number of keypoints: the smallest that leaves the image
+    at most most_px pixels for each keypoint, and at least _LEAST_PX in all; 1 where most_px is 0.
 
-    Every view counts as many pixels as the image has: images of one camera shall be reduced alike, however much ground
-    their views show, because only then have they the same blobs.
+    The pixels of the image count, not those of its views: images of one camera shall be reduced alike, however many
+    views they have and whatever ground these show, because only then have they the same blobs.
     """
-    pixels = camera.width_px * camera.height_px * len(views)
+    pixels = camera.width_px * camera.height_px
     sides = [side for view in views for side in view.gray.shape]
     factor = 1
     while 0.0 < most_px * keypoints * factor**2 < pixels and pixels >= _LEAST_PX * (2 * factor) ** 2:

@@ -25,10 +25,11 @@ from aeromatch_cli.strategies.extractors.detection import (
     sift_detector,
 )
 
-# Median diameter of the strongest blobs, in pixels of the reduced view, below which reducing costs too much: most are
-# then near the smallest that it shows. Rendered grass and farmland have 2.5 and 2.3, and halved views cost 11 and 3 %
-# of their correct matches; suburb, hills, desert and photographs (ochota, caliterra, brighton) have 3.1 to 5.
-_LEAST_BLOB_PX = 2.7
+# Median diameter of the strongest blobs, in pixels of the reduced view over sigma, below which reducing costs too much:
+# most are then near the smallest that it shows, 1.1. Rendered grass and farmland have 1.6 and 1.4, and halved views
+# cost 11 and 3 % of their correct matches; suburb, hills, desert and photographs (ochota, caliterra, brighton) have 1.9
+# to 3.
+_LEAST_BLOB = 1.7
 
 
 class Sift(Described):
@@ -89,8 +90,8 @@ class Sift(Described):
         """Enough of them, and most of the strongest larger than the smallest that the reduced views show."""
         if not super().suffice(raw, factor):
             return False
-        strongest = np.argsort(-self.strengths(raw), kind="stable")[: self.keypoints]
-        return bool(np.median(raw.sizes_px[strongest]) >= _LEAST_BLOB_PX * factor)
+        strongest = np.argsort(-balanced(raw), kind="stable")[: self.keypoints]
+        return bool(np.median(raw.sizes_px[strongest]) >= _LEAST_BLOB * self.sigma * factor)
 
     def described(self, raw: Raw, views: Sequence[ViewPixels]) -> NDArray[np.uint8]:
         """RootSIFT bytes (N, 128)."""
