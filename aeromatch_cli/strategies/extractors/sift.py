@@ -27,8 +27,8 @@ from aeromatch_cli.strategies.extractors.detection import (
 
 # Median diameter of the strongest blobs, in pixels of the reduced view over sigma, below which reducing costs too much:
 # most are then near the smallest that it shows, 1.1. Rendered grass and farmland have 1.6 and 1.4, and halved views
-# cost 11 and 3 % of their correct matches; suburb, hills, desert and photographs (ochota, caliterra, brighton) have 1.9
-# to 3.
+# cost 11 and 3 % of their correct matches; hills, suburb and desert have 2.1, 2.4 and 3, photographs (ochota,
+# caliterra, brighton) 1.7 to 2.9.
 _LEAST_BLOB = 1.7
 
 
