@@ -28,9 +28,9 @@ def keypoints_field(default: int) -> Any:
         default,
         ge=1,
         description="Number of descriptors per image over all its views; fewer only where the image, or what halving "
-        "leaves of it, has fewer. A "
-        "keypoint with two orientations counts twice, as in OpenCV and COLMAP. With enhance.keep_source "
-        "the source image and the enhanced one have this number each. Larger: more matches, more time.",
+        "leaves of it, has fewer. A keypoint with two orientations counts twice, as in OpenCV and COLMAP. With "
+        "enhance.keep_source the source image and the enhanced one have this number each. Larger: more matches, more "
+        "time.",
     )
 
 
@@ -40,8 +40,8 @@ def pixels_field(default: float) -> Any:
         default,
         ge=0.0,
         description="Views are halved before keypoints are looked for, again and again, while the image has more "
-        "pixels per wanted keypoint; for SIFT not where it finds too few in them, or mostly the "
-        "smallest that they show. 0: never. Smaller: less time, keypoints less accurate.",
+        "pixels per wanted keypoint; for SIFT not where it finds too few in them, or mostly the smallest that they "
+        "show. 0: never. Smaller: less time, keypoints less accurate.",
     )
 
 
