@@ -86,7 +86,7 @@ def test_of_equal_heat_the_finer_keypoint_comes_first() -> None:
     _, sizes, confidences = heat_keypoints(picture, 10, network=network)
     assert sizes == pytest.approx([SIZE_PX, SIZE_PX, 2 * SIZE_PX], rel=0.02)
     odds = np.log(confidences / (1.0 - confidences))
-    assert odds[0] - odds[2] == pytest.approx(2 * 0.3, abs=0.02)  # of log odds for each of two half octaves
+    assert odds[0] - odds[2] == pytest.approx(2 * 0.6, abs=0.02)  # of log odds for each of two half octaves
     assert len(heat_keypoints(picture, 2, network=network)[0]) == 2
 
 

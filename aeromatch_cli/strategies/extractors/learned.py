@@ -36,7 +36,7 @@ _CHOICE = 8
 class Learned(Described):
     """Keypoints, orientations and descriptors by networks that are trained on aerial images."""
 
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
     network: ClassVar[bool] = True
     descriptors: ClassVar[str] = "GeoDesc"
     name: Literal["learned"] = "learned"
