@@ -10,7 +10,7 @@ have found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -23,6 +23,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.geometry.coverage import covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.evidence import Evidence
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
@@ -38,17 +39,10 @@ from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, Lifted
 
 # The first step of every cascade.
 FIRST = "first"
-# Pairs that overlap by less tie images that others tie better: fewer matches are enough, wherever they lie.
-_TYING_OVERLAP = 0.4
 # Of features that so small a share of the pairs asks for, the pairs go without whose images a third one ties.
 _RARE = 0.02
 # Why a pair takes a step that it does not need.
 _BOTH_KNOWN = "both images have its features for other pairs"
-# A pair with fewer verified matches is never settled, however small its overlap; an image with fewer keypoints shows
-# nothing (covered lens, fog, water), and no step looks for more.
-_LEAST_MATCHES = 30
-# Images with fewer keypoints promise matches in proportion.
-_ENOUGH_KEYPOINTS = 2000
 # An image that no step has tied yet may show another place. So many partners, those with most matches, tell.
 _TRIED_PARTNERS = 3
 # Matches of two steps that are nearer than this in both images are one.
@@ -59,8 +53,10 @@ _SLOW_KEYPOINTS = 4000
 Key = tuple[str, str]
 
 
-def _keypoints(step: Any, settings: Settings) -> int:
-    return int(step.keypoints or min(_SLOW_KEYPOINTS, getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)))
+def keypoints_of(step: Any, settings: Settings) -> int:
+    """Most that a step finds in an image."""
+    own = getattr(settings.extract, "keypoints", _SLOW_KEYPOINTS)
+    return int((step.keypoints or min(_SLOW_KEYPOINTS, own)) if step.own_features else own)
 
 
 def _reduction(settings: Settings, kind: type[Described]) -> dict[str, float]:
@@ -79,7 +75,7 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     LearnedFeatures: lambda step, settings: {
         "simulate": NeighbourViews(),
         "extract": Learned(
-            keypoints=_keypoints(step, settings),
+            keypoints=keypoints_of(step, settings),
             precision=step.precision,
             device=step.device,
             **_reduction(settings, Learned),
@@ -89,48 +85,10 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
         "simulate": NeighbourViews(),
-        "extract": Sift(keypoints=_keypoints(step, settings), **_reduction(settings, Sift)),
+        "extract": Sift(keypoints=keypoints_of(step, settings), **_reduction(settings, Sift)),
         "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },
 }
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What steps have found of a pair.
-
-    verified: matches, those of two steps in one place once. overlap: share of the image that the other one shows, of
-    the image where it is larger. coverage: share of the overlap's cells that verified matches lie in; both NaN where
-    poses or ground are unknown, coverage also where there is no overlap. keypoints: of the first step, in the image
-    that has fewer. candidates: matches before verification.
-    """
-
-    verified: int
-    overlap: float
-    coverage: float
-    keypoints: int
-    candidates: int = 0
-
-    @property
-    def shows_nothing(self) -> bool:
-        """Whether one of the images has next to no keypoints."""
-        return self.keypoints < _LEAST_MATCHES
-
-    def falls_short_of(self, step: Step) -> str:
-        """Why the pair takes the step, "" where it need not."""
-        # Poses that no picture has confirmed predict nothing for pairs that overlap: taken at their word, a rendered
-        # block of grass under five cameras loses two fifths of its correct matches.
-        known = self.overlap > 0.0
-        share = self.overlap if known else 1.0
-        promised = step.below_matches * share * min(1.0, share / _TYING_OVERLAP)
-        least = max(_LEAST_MATCHES, round(promised * min(1.0, self.keypoints / _ENOUGH_KEYPOINTS)))
-        if self.verified < least:
-            unknown = "no overlap predicted" if self.overlap == 0.0 else "overlap unknown"
-            by = f"that an overlap of {100 * share:.0f} % promises" if known else f"that are enough, {unknown}"
-            return f"{self.verified} verified matches of {least} {by}"
-        if share >= _TYING_OVERLAP and self.coverage < step.below_coverage:
-            return f"verified matches in {100 * self.coverage:.0f} % of the overlap"
-        return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,12 +142,13 @@ def _steps(context: Context) -> Iterator[StepContext]:
     yield steps[0]
     for recipe in settings.cascade:
         found = evidence_of(steps)
-        reasons = {key: evidence.falls_short_of(recipe) for key, evidence in found.items()}
+        most = keypoints_of(recipe, settings)
+        reasons = {key: evidence.asks_for(recipe, most) for key, evidence in found.items()}
         left = {key: reason for key, reason in reasons.items() if reason and not found[key].shows_nothing}
         if recipe.own_features:
             left = _tried(left, found)
             if len(left) <= _RARE * len(reasons):
-                left = _untied(left, reasons)
+                left = _untied(left, [key for key, evidence in found.items() if not evidence.lacks(recipe)])
         if recipe.cheap_to_match:
             looked_at = {image_id for key in left for image_id in key}
             known = [key for key in reasons if key not in left and set(key) <= looked_at]
@@ -212,13 +171,12 @@ def _tried(left: Mapping[Key, str], found: Mapping[Key, Evidence]) -> dict[Key, 
     return {key: reason for key, reason in left.items() if key not in dropped}
 
 
-def _untied(left: Mapping[Key, str], reasons: Mapping[Key, str]) -> dict[Key, str]:
-    """Those of the pairs left whose images no third image ties: none has a pair with both that needs nothing more."""
+def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
+    """Those of the pairs left whose images no third image ties: none has pairs with both that have enough."""
     settled: dict[str, set[str]] = {}
-    for (id0, id1), reason in reasons.items():
-        if not reason:
-            settled.setdefault(id0, set()).add(id1)
-            settled.setdefault(id1, set()).add(id0)
+    for id0, id1 in enough:
+        settled.setdefault(id0, set()).add(id1)
+        settled.setdefault(id1, set()).add(id0)
     return {key: reason for key, reason in left.items() if not settled.get(key[0], set()) & settled.get(key[1], set())}
 
 
@@ -304,7 +262,7 @@ def _evidence(
             coverage = covered_share(shared.cells0, geometry.camera0, points0)
         else:
             coverage = covered_share(shared.cells1, geometry.camera1, points1)
-    return Evidence(len(points0), overlap, coverage, keypoints, candidates)
+    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg)
 
 
 def settled_by(context: Context, steps: Sequence[StepContext]) -> dict[Key, tuple[str, str]]:
@@ -316,7 +274,7 @@ def settled_by(context: Context, steps: Sequence[StepContext]) -> dict[Key, tupl
     answer: dict[Key, tuple[str, str]] = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
-        lacks = found[key].falls_short_of(last) if key in found else "not matched"
+        lacks = found[key].lacks(last) if key in found else "not matched"
         needed = [s.name for s in steps[1:] if s.reasons.get(key, _BOTH_KNOWN) != _BOTH_KNOWN]
         answer[key] = ("", lacks) if lacks else (needed[-1] if needed else FIRST, "")
     return answer

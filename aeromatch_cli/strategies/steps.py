@@ -37,11 +37,14 @@ class Step(Strategy):
     """What all steps have in common: which pairs take them.
 
     own_features: it finds keypoints of its own, else it uses those of the first step, and what it finds replaces that
-    step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
+    step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs. yields:
+    weights by which `stages.evidence` expects how many matches a pair has after the step, as `scripts/bench evidence`
+    has found them; None: nothing is expected.
     """
 
     own_features: ClassVar[bool] = True
     cheap_to_match: ClassVar[bool] = False
+    yields: ClassVar[tuple[float, ...] | None] = None
     name: str
     below_matches: int = _below_matches(600)
     below_coverage: float = Field(
@@ -50,6 +53,12 @@ class Step(Strategy):
         le=1.0,
         description="And by pairs with an overlap of 40 % or more whose verified matches lie in less than this share "
         "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
+    )
+    large_gain: float = Field(
+        0.75,
+        ge=0.0,
+        description="And by pairs with up to twice as many matches as would be enough, where the step is expected to "
+        "bring this share more of them (0.75: 75 %). Larger: fewer pairs take it, less time.",
     )
 
 

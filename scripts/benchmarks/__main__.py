@@ -23,6 +23,7 @@ TABLE: Table = {
     "lightglue": ("benchmarks.lightglue.command", "the network beside the ratio test, and its seconds"),
     "extraction": ("benchmarks.extraction", "seconds of an image's features, by extractor"),
     "probability": ("benchmarks.probability", "how far the probability that a match is right can be relied on"),
+    "evidence": ("benchmarks.evidence", "how many matches a step of auto is expected to bring, and how many it brings"),
     "filters": ("benchmarks.filters", "filters on the same matches, by exact truth"),
     "rectification": ("benchmarks.rectification", "scale and rotation that remain between views of oblique pairs"),
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),

@@ -32,6 +32,7 @@ PAGES: Mapping[str, str] = {
     "bench_methods": "methods.md",
     "bench_presets": "auto.md",
     "bench_presets_second": "auto.md",
+    "bench_evidence": "auto.md",
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
     "bench_growth_blocks": "large.md",
