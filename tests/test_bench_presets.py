@@ -32,13 +32,28 @@ def test_the_best_of_each_kind_stands_beside_auto() -> None:
     assert block in text
     steep = "| 20-40 degrees | 60 | 100.0 % | 0.50 | `baseline` 15 | 75.0 % | 4.00 | `aliked` 20 | 100.0 % | 3.00 |"
     assert steep in text
+    assert "| city | 10.0 | `baseline` 4.0 | 2.50 | `baseline` 4.0 | 2.50 |" in text
+    assert "| mixed | 10.0 | `baseline` 4.0 | 2.50 | `baseline` 4.0 | 2.50 |" in text
     assert "| `auto` | 150 | 93.8 % | 0.50 | 37.5 % | 2 of 2 | 10 | 18 |" in text
     assert "| `aliked` | 50 | 83.3 % | 0.50 | 12.5 % | 1 of 2 | 6 | - |" in text
+
+
+def test_a_step_of_auto_is_no_other_preset() -> None:
+    found = [
+        *rows("auto", [90, 60], [100, 60], seconds=5.0, run_seconds=9.0),
+        *rows("auto[cascade=none]", [80, 60], [90, 60], seconds=1.0, run_seconds=2.0),
+        *rows("baseline", [60, 15], [60, 20], seconds=2.0, run_seconds=4.0),
+    ]
+    text = table_of(Namespace(presets=["auto", "auto[cascade=none]", "baseline"], peers=[]), found)
+    assert "| 150 | 93.8 % | 0.50 | `baseline` 75 | 93.8 % | 2.00 | - | - | - |" in text
+    assert "| city | 10.0 | `baseline` 4.0 | 2.50 | `baseline` 4.0 | 2.50 |" in text
 
 
 def test_quality_and_seconds_are_per_pair(tmp_path: Path) -> None:
     found = rows("auto", [90, 60], [100, 60], seconds=5.0, run_seconds=9.0)
     found += rows("aliked", [30, 20], [40, 20], seconds=3.0)
+    draw_quality(tmp_path / "steps.svg", [*found, *rows("auto[cascade=none]", [80, 9], [90, 60], seconds=1.0)])
+    assert "auto's first step" in (tmp_path / "steps.svg").read_text()
     assert quality(found) == [("auto", 5.0, 75.0, 0.9375), ("aliked", 3.0, 25.0, 50 / 60)]
     draw_quality(tmp_path / "quality.svg", found)
     again = tmp_path / "again.svg"

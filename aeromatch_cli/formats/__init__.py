@@ -175,8 +175,10 @@ that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each key
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones), `settled_by` (the step after which it needed nothing more, empty where it lacks matches in the end),
-`lacks` (what it lacks in the end). Features, matches and verdicts of a step lie in its folder, laid out like this
-workspace; those of the workspace itself join them. `guided` has no features: it uses those of the first step.
+`lacks` (what it lacks in the end), `matches` (verified ones of all steps, one place once), `expected` (how many it may
+have after the last step, by what was known before it; empty where overlap or view angle are unknown). Features, matches
+and verdicts of a step lie in its folder, laid out like this workspace; the workspace's own join them. `guided` has no
+features: it uses those of the first step.
 
 ### matches/<id0>.npz
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -94,12 +94,14 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
 @dataclass(frozen=True, eq=False)
 class StepContext:
     """A step with its context. features_of: the step whose features it uses. reasons: why each pair takes it, "" in the
-    first. reports: of extract, match and filter, where this command has run them."""
+    first. expected: verified matches that each pair judged before may have after it, NaN where unknown. reports: of
+    extract, match and filter, where this command has run them."""
 
     name: str
     features_of: str
     context: Context
     reasons: Mapping[Key, str]
+    expected: Mapping[Key, float] = field(default_factory=dict)
     reports: tuple[StageReport, ...] = ()
 
     @property
@@ -153,7 +155,8 @@ def _steps(context: Context) -> Iterator[StepContext]:
             looked_at = {image_id for key in left for image_id in key}
             known = [key for key in reasons if key not in left and set(key) <= looked_at]
             left |= {key: reasons[key] or _BOTH_KNOWN for key in known}
-        steps.append(_further_step(context, recipe, left))
+        expected = {key: evidence.expected(recipe, most) for key, evidence in found.items()}
+        steps.append(replace(_further_step(context, recipe, left), expected=expected))
         yield steps[-1]
 
 
@@ -265,16 +268,24 @@ def _evidence(
     return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg)
 
 
-def settled_by(context: Context, steps: Sequence[StepContext]) -> dict[Key, tuple[str, str]]:
-    """Of every pair the step after which it needed nothing more, or "", and what it lacks in the end.
+@dataclass(frozen=True)
+class Outcome:
+    """Of a pair: the step after which it needed nothing more, or ""; what it lacks in the end; verified matches of all
+    steps, one place once."""
 
-    A pair that took a step only because its features were there is settled by one before it.
-    """
+    settled_by: str
+    lacks: str
+    matches: int
+
+
+def outcomes(context: Context, steps: Sequence[StepContext]) -> dict[Key, Outcome]:
+    """Of every pair. One that took a step only because its features were there is settled by one before it."""
     found, last = evidence_of(steps), context.settings.cascade[-1]
-    answer: dict[Key, tuple[str, str]] = {}
+    answer: dict[Key, Outcome] = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         lacks = found[key].lacks(last) if key in found else "not matched"
         needed = [s.name for s in steps[1:] if s.reasons.get(key, _BOTH_KNOWN) != _BOTH_KNOWN]
-        answer[key] = ("", lacks) if lacks else (needed[-1] if needed else FIRST, "")
+        settled = "" if lacks else needed[-1] if needed else FIRST
+        answer[key] = Outcome(settled, lacks, found[key].verified if key in found else 0)
     return answer

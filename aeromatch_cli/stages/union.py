@@ -208,27 +208,32 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
     report.failures += _failures(steps, "match")
     if len(counts) < len(tasks):
         counts = [_matches_on_file(task) for task in tasks]
-    settled = cascade.settled_by(context, steps)
-    by = Counter(name for name, _ in settled.values())
+    outcomes = cascade.outcomes(context, steps)
+    by = Counter(outcome.settled_by for outcome in outcomes.values())
     report.facts = {
         "matches": sum(counts),
         "settled_by": {step.name: by[step.name] for step in steps},
         "not_settled": by[""],
     }
-    _write_steps(context, steps, settled)
+    _write_steps(context, steps, outcomes)
     report.fingerprint = fingerprint(sorted(fp for task in tasks for fp in task.pairs.values()))
     return report.write(context.workspace)
 
 
-def _write_steps(context: Context, steps: Sequence[StepContext], settled: Mapping[Key, tuple[str, str]]) -> None:
-    """steps.csv: which steps every pair took, and why, which one settled it, and what it lacks in the end."""
+def _write_steps(context: Context, steps: Sequence[StepContext], outcomes: Mapping[Key, cascade.Outcome]) -> None:
+    """steps.csv: which steps every pair took, and why, which one settled it, what it lacks in the end, and how many
+    matches it has and may have."""
     lines: list[tuple[Any, ...]] = []
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         taken = [step for step in steps if key in step.reasons]
         reasons = "; ".join(f"{step.name}: {step.reasons[key]}" for step in taken if step.reasons[key])
-        lines.append((*key, "+".join(step.name for step in taken), reasons, *settled[key]))
-    header = "image_id0", "image_id1", "steps", "reasons", "settled_by", "lacks"
+        expected = steps[-1].expected.get(key, float("nan"))
+        may_have = "" if np.isnan(expected) else round(expected)
+        own = outcomes[key]
+        names = "+".join(step.name for step in taken)
+        lines.append((*key, names, reasons, own.settled_by, own.lacks, own.matches, may_have))
+    header = "image_id0", "image_id1", "steps", "reasons", "settled_by", "lacks", "matches", "expected"
     write_text(context.workspace.steps, csv_text(header, lines))
 
 

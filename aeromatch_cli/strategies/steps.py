@@ -55,10 +55,10 @@ class Step(Strategy):
         "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
     )
     large_gain: float = Field(
-        0.75,
+        0.8,
         ge=0.0,
-        description="And by pairs with up to twice as many matches as would be enough, where the step is expected to "
-        "bring this share more of them (0.75: 75 %). Larger: fewer pairs take it, less time.",
+        description="And by pairs with less than twice as many matches as would be enough, where the step is expected "
+        "to bring this share more of them (0.8: 80 %). Larger: fewer pairs take it, less time.",
     )
 
 
@@ -66,7 +66,9 @@ class GuidedSearch(Step):
     """The first step's keypoints matched once more, within the windows that the poses predict and around the places
     that verified matches predict."""
 
+    version: ClassVar[int] = 2
     own_features: ClassVar[bool] = False
+    yields: ClassVar[tuple[float, ...] | None] = (-0.677, 0.786, 0.311, -0.015, -0.016)
     name: Literal["guided"] = "guided"
     # Two rendered nadir blocks (hills, suburb): 28,543 correct matches with 1000, 30,869 with 1500, 33,635 with 2000,
     # where `fusion` has 30,058.
@@ -86,7 +88,9 @@ class LearnedFeatures(Step):
     Views are halved as by `extract=learned` itself, but never where `extract.pixels_per_keypoint` is 0.
     """
 
+    version: ClassVar[int] = 2
     cheap_to_match: ClassVar[bool] = True
+    yields: ClassVar[tuple[float, ...] | None] = (0.037, 0.919, -0.412, 0.091, 0.582)
     name: Literal["learned"] = "learned"
     # Two rendered nadir blocks (city, farmland): 16,664 correct matches with 600, 35,677 with 1000, 37,216 for every
     # pair; on easy ground (hills, suburb, sheffield, seneca) no pair has fewer.

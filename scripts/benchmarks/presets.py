@@ -4,10 +4,11 @@ A preset is one `aeromatch run PRESET` with the block's noisy poses (5 % of the 
 orientation, pairs, features, matches, verification and consistency. Peers get every pair of the block that overlaps by
 20 % or more, those that read poses the noisy ones. All pairs with so much overlap count, whether a preset tries them or
 not. As by default (8,000 and 4,000), methods with SIFT may have twice the descriptors of those with networks, which
-take longer for each; a cascade has both. Correct: within 3 px of the exact place. Best: the preset, or peer, with most
-correct matches in that line. Median error: of the medians of pairs. Seconds: of features, each image's once, matching
-and verification, on --jobs cores; orientation, start-up and export, which peers do without, are in the seconds of the
-whole command alone.
+take longer for each; a cascade has both. `auto[cascade=none]` is `auto` without its further steps, and so on: the
+picture shows what each step brings and takes; none of them counts as another preset. Correct: within 3 px of the exact
+place. Best: the preset, or peer, with most correct matches in that line. Median error: of the medians of pairs.
+Seconds: of features, each image's once, matching and verification, on --jobs cores; orientation, start-up and export,
+which peers do without, are in the seconds of the whole command alone.
 
 Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has is
 not made again: a killed run goes on there. A preset may be PRESET[key=value,key=value].
@@ -116,7 +117,7 @@ def _compared(args: argparse.Namespace, rows: Sequence[Row], label: str) -> list
         f"{median(ours, 'median_error_px'):.2f}",
     ]  # fmt: skip
     for names in (args.presets, args.peers):
-        others = [name for name in names if name != _JUDGED and name in of]
+        others = [name for name in names if parse_method(name)[0] != _JUDGED and name in of]
         if not others:
             line += ["-", "-", "-"]
             continue
@@ -126,8 +127,22 @@ def _compared(args: argparse.Namespace, rows: Sequence[Row], label: str) -> list
     return line
 
 
+def _seconds(args: argparse.Namespace, rows: Sequence[Row], label: str) -> list[object]:
+    """A line: seconds of the judged preset beside those of the fastest and the slowest other one."""
+    known = {method[0]: total(own, "seconds") for method, own in grouped(rows, "method") if method[0] in args.presets}
+    others = {method: seconds for method, seconds in known.items() if parse_method(method)[0] != _JUDGED}
+    line: list[object] = [label, f"{known[_JUDGED]:.1f}"]
+    for pick in (min, max):
+        if not others:
+            line += ["-", "-"]
+            continue
+        other = pick(others, key=lambda method: others[method])
+        line += [f"{code(other)} {others[other]:.1f}", f"{ratio(known[_JUDGED], others[other]):.2f}"]
+    return line
+
+
 def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
-    """Blocks, classes of view angle, and methods."""
+    """Blocks, classes of view angle, seconds, and methods."""
     heads = ["correct", "of kept", "error px", "best preset", "of kept", "auto / it", "best peer", "of kept",
              "auto / it"]  # fmt: skip
     blocks = [
@@ -140,6 +155,10 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
         for name in classes
         if (own := [row for row in rows if row["angle"] == name])
     ]
+    seconds_of = [
+        _seconds(args, own, str(label)) for key in ("scene", "flight") for (label,), own in grouped(rows, key)
+    ]
+    beside = ["", "s", "fastest other preset, s", "auto / it", "slowest, s", "auto / it"]
     methods = []
     for (method,), own in grouped(rows, "method"):
         seconds, whole = (f"{total(own, key):.0f}" if key in own[0] else "-" for key in ("seconds", "run_seconds"))
@@ -154,6 +173,7 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
         [
             "#### By block\n\n" + markdown(["block", *heads], blocks),
             "#### By view angle\n\n" + markdown(["view angle", *heads], angles),
+            "#### Seconds by scene and by flight\n\n" + markdown(beside, seconds_of),
             "#### By method\n\n"
             + markdown(
                 [
@@ -175,7 +195,8 @@ def table_of(args: argparse.Namespace, rows: Sequence[Row]) -> str:
 def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("presets", __doc__)
     add = parser.add_argument
-    add("--presets", type=split_methods, default="auto,baseline,fusion,oblique", help="comma-separated, auto first")
+    steps = "auto[cascade=none],auto[cascade=guided]"
+    add("--presets", type=split_methods, default=f"auto,{steps},baseline,fusion,oblique", help="comma-separated")
     add("--peers", type=options.names, default="pycolmap-guided", help=f"comma-separated of {', '.join(PEERS)}")
     options.add_rendered(parser, scenes=",".join(PRESETS), size="800x600", images=12, flights="nadir,mixed,oblique")
     add("--seeds", type=options.positive, default=1, help="so many, from --seed on")

@@ -10,6 +10,7 @@ from benchmarks.tables import Row, grouped, ratio, total
 
 _SIZE_IN = (7.5, 5.0)
 _OURS, _PEERS = "#1f6f3f", "#8a8a8a"
+_WHOLE, _STEPS = "auto", "auto[cascade="
 # Lines of as many correct matches a second.
 _RATES = (10, 30, 100, 300, 1000, 3000)
 
@@ -27,6 +28,12 @@ def quality(rows: Sequence[Row]) -> list[tuple[str, float, float, float]]:
     ]
 
 
+def _words(method: str) -> str:
+    """auto[cascade=guided]: auto up to the step guided."""
+    last = method.removeprefix(_STEPS).removesuffix("]")
+    return method if last == method else "auto's first step" if last == "none" else f"auto up to {last}"
+
+
 def _label(axis: Any, points: Sequence[tuple[str, float, float, float]], ours: Container[object]) -> None:
     """Beside every point, where no other label and no point is. Limits and scales of the axis must stand."""
     from matplotlib.transforms import Bbox
@@ -38,7 +45,7 @@ def _label(axis: Any, points: Sequence[tuple[str, float, float, float]], ours: C
     for method, seconds, correct, right in points:
         for side, (right_of, above) in (("left", (6, 5)), ("left", (6, -11)), ("right", (-6, 5)), ("right", (-6, -11))):
             label = axis.annotate(
-                f"{method}, {100 * right:.1f} % right", (seconds, correct), xytext=(right_of, above),
+                f"{_words(method)}, {100 * right:.1f} % right", (seconds, correct), xytext=(right_of, above),
                 textcoords="offset points", fontsize=8, color=_OURS if method in ours else _PEERS, ha=side, zorder=4,
             )  # fmt: skip
             box = label.get_window_extent()
@@ -62,6 +69,8 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
     points = [point for point in quality(rows) if point[2] > 0.0]  # a logarithm has no place for none
     for method, seconds, correct, _ in points:
         axis.scatter(seconds, correct, color=_OURS if method in ours else _PEERS, s=36, zorder=3)
+    steps = sorted(point[1:3] for point in points if point[0] == _WHOLE or point[0].startswith(_STEPS))
+    axis.plot(*zip(*steps, strict=True), color=_OURS, linewidth=0.8, zorder=2)
     # Room for the labels.
     low, high = 0.8 * min(point[1] for point in points), 4.0 * max(point[1] for point in points)
     bottom, top = 0.8 * min(point[2] for point in points), 1.2 * max(point[2] for point in points)
