@@ -80,7 +80,9 @@ class Evidence:
         lacks = self.lacks(step)
         if lacks:
             return lacks + (f", {expected:.0f} expected" if np.isfinite(expected) else "")
-        if self.verified < _PLENTY * self.enough(step) and expected >= (1.0 + step.large_gain) * self.verified:
+        # Small overlaps promise large gains of few matches: easy blocks would load networks for them.
+        ties, plenty = self.overlap >= _TYING_OVERLAP, self.verified >= _PLENTY * self.enough(step)
+        if ties and not plenty and expected >= (1.0 + step.large_gain) * self.verified:
             return f"{self.verified} verified matches, {expected:.0f} expected"
         return ""
 

@@ -55,10 +55,11 @@ class Step(Strategy):
         "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
     )
     large_gain: float = Field(
-        0.8,
+        0.7,
         ge=0.0,
-        description="And by pairs with less than twice as many matches as would be enough, where the step is expected "
-        "to bring this share more of them (0.8: 80 %). Larger: fewer pairs take it, less time.",
+        description="And by pairs with an overlap of 40 % or more and less than twice as many matches as are enough, "
+        "where the step is expected to bring this share more of them (0.7: 70 %). Larger: fewer pairs take it, less "
+        "time.",
     )
 
 
@@ -68,7 +69,7 @@ class GuidedSearch(Step):
 
     version: ClassVar[int] = 2
     own_features: ClassVar[bool] = False
-    yields: ClassVar[tuple[float, ...] | None] = (-0.677, 0.786, 0.311, -0.015, -0.016)
+    yields: ClassVar[tuple[float, ...] | None] = (-0.34, 0.744, 0.29, -0.19, 0.005)
     name: Literal["guided"] = "guided"
     # Two rendered nadir blocks (hills, suburb): 28,543 correct matches with 1000, 30,869 with 1500, 33,635 with 2000,
     # where `fusion` has 30,058.
@@ -90,7 +91,7 @@ class LearnedFeatures(Step):
 
     version: ClassVar[int] = 2
     cheap_to_match: ClassVar[bool] = True
-    yields: ClassVar[tuple[float, ...] | None] = (0.037, 0.919, -0.412, 0.091, 0.582)
+    yields: ClassVar[tuple[float, ...] | None] = (1.276, 0.807, -0.33, -0.15, 0.43)
     name: Literal["learned"] = "learned"
     # Two rendered nadir blocks (city, farmland): 16,664 correct matches with 600, 35,677 with 1000, 37,216 for every
     # pair; on easy ground (hills, suburb, sheffield, seneca) no pair has fewer.
