@@ -70,7 +70,7 @@ def real_blocks(args: argparse.Namespace) -> Iterator[Block]:
         reference = source / "reference"
         given = "--poses", str(reference / "poses.csv"), "--cameras", str(reference / "block.json")
         keypoints = args.keypoints[k % len(args.keypoints)]
-        yield Block(f"{name}, every {every}th image, {keypoints}", images, given, keypoints)
+        yield Block(f"{name}, 1 image of {every}, {keypoints}", images, given, keypoints)
 
 
 def rows_of(args: argparse.Namespace, block: Block) -> list[Row]:
