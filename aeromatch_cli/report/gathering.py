@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,9 +25,11 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import checked_keypoints, read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.geometry.coverage import cells_of
 from aeromatch_cli.images.remote import RemoteFile
 from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
+from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
@@ -89,11 +90,9 @@ class _Found:
 
     def mark(self, image: Image, points_px: FloatArray) -> None:
         """The cells of an image that its matches (M, 2) touch."""
-        # np.clip takes as long as all the rest on a few hundred matches.
-        cells = ((points_px + 0.5) * (COVERAGE_CELLS / np.array((image.width_px, image.height_px)))).astype(np.int64)
-        cells = np.minimum(np.maximum(cells, 0), COVERAGE_CELLS - 1)
+        cells = cells_of((image.width_px, image.height_px), points_px, COVERAGE_CELLS)
         seen = self.seen.setdefault(image.image_id, np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), dtype=bool))
-        seen[cells[:, 1], cells[:, 0]] = True
+        seen[cells[:, 0], cells[:, 1]] = True
 
 
 def gather(context: Context, draw: Draw | None = None) -> Gathered:
@@ -114,11 +113,9 @@ def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
     if jobs == 1 or len(context.pairs) < _FEW_PAIRS:
         return [_read(Stretch(context, draw))]
     alone = replace(context, executor=Executor("serial"))  # workers begin no workers
-    ends = np.linspace(0, len(context.pairs), _STRETCHES * jobs + 1).astype(int)
-    tasks = [Stretch(replace(alone, pairs=context.pairs[a:b]), draw) for a, b in itertools.pairwise(ends)]
-    outcomes = context.executor.run(_read, tasks, "report", [len(task.context.pairs) for task in tasks])
-    # What failed is tried here once more: only so does it say which file is broken.
-    return [outcome.value or _read(task) for outcome, task in zip(outcomes, tasks, strict=True)]
+    parts = stretches(len(context.pairs), _STRETCHES * jobs)
+    tasks = [Stretch(replace(alone, pairs=context.pairs[part]), draw) for part in parts]
+    return made_of(context.executor, _read, tasks, [len(task.context.pairs) for task in tasks])
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
+from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.workspace import write_atomically
 
@@ -82,12 +82,11 @@ def thumbnails(context: Context) -> Thumbnails:
     beside = len(images) > MAX_IMAGES
     side_px = next((side for most, side in _SIDES_PX if len(images) <= most), _SIDE_PX)
     folder = context.workspace.report.parent / FOLDER
-    stretches = _stretches(context, images, side_px, folder if beside else None)
-    if len(stretches) == 1:
-        made = [_thumbnails(stretches[0], _THREADS)]
+    tasks = _stretches(context, images, side_px, folder if beside else None)
+    if len(tasks) == 1:
+        made = [_thumbnails(tasks[0], _THREADS)]
     else:
-        outcomes = context.executor.run(_thumbnails, stretches, "report", [len(one.images) for one in stretches])
-        made = [outcome.value or _thumbnails(one) for outcome, one in zip(outcomes, stretches, strict=True)]
+        made = made_of(context.executor, _thumbnails, tasks, [len(task.images) for task in tasks])
     found = (thumbnail for some in made for thumbnail in some)
     pictures = {image.image_id: one for image, one in zip(images, found, strict=True) if one is not None}
     current = {found.place for found in pictures.values()}
@@ -111,9 +110,10 @@ def _stretches(context: Context, images: Sequence[Image], side_px: int, folder: 
     """Few images are read faster than several processes take to begin."""
     jobs = context.executor.jobs
     parts = 4 * jobs if folder is not None and jobs > 1 else 1
-    ends = np.linspace(0, len(images), parts + 1).astype(int)
     places = [context.picture(image) for image in images]
-    return [_Stretch(tuple(images[a:b]), tuple(places[a:b]), side_px, folder) for a, b in itertools.pairwise(ends)]
+    return [
+        _Stretch(tuple(images[part]), tuple(places[part]), side_px, folder) for part in stretches(len(images), parts)
+    ]
 
 
 def _thumbnails(stretch: _Stretch, threads: int = 1) -> list[_Thumbnail | None]:

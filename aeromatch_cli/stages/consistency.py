@@ -19,7 +19,7 @@ from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
-from aeromatch_cli.geometry.coverage import CELLS, shared_cells, shown_ninths
+from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
 from aeromatch_cli.orientation.alone import block_of_pair
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.remaining import without_dropped
@@ -178,9 +178,9 @@ def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
     for image_id, track in sorted(adjusted.tracks.items()):
         image = context.image_by_id[image_id]
         places = read_keypoints(context.workspace.features(image_id))[0][track[:, 0]]
-        cells = np.clip(np.floor((places + 0.5) * 3.0 / (image.width_px, image.height_px)), 0, 2).astype(int)
+        cells = cells_of((image.width_px, image.height_px), places, 3)
         held = np.zeros((3, 3), dtype=bool)
-        held[cells[:, 1], cells[:, 0]] = True
+        held[cells[:, 0], cells[:, 1]] = True
         empty = shown[image_id] & ~held
         found[image_id] = [int(held.sum()), int(empty.sum()), int((seen[track[:, 1]] > 2).sum())]
     return found
