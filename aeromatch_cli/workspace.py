@@ -158,6 +158,15 @@ class Workspace:
     def verified(self, image_id0: str) -> Path:
         return self.root / "verified" / f"{image_id0}.npz"
 
+    def refined(self, image_id: str) -> Path:
+        """Where its keypoints were measured anew."""
+        return self.root / "refined" / f"{image_id}.npz"
+
+    @property
+    def refined_files(self) -> Path:
+        """Record of these files."""
+        return self.root / "refined" / "files.json"
+
     def export(self, exporter: str) -> Path:
         return self.root / "export" / exporter
 

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 # What `run` goes through, in order, and the share of its time that a stage takes, roughly: blocks of twelve small
 # images to some of 12 megapixels, preset auto (reports/<stage>.json).
-_SHARES = {"orient": 0.3, "pairs": 0.05, "extract": 0.15, "match": 0.3, "filter": 0.03, "adjust": 0.13,
-           "consistency": 0.02, "export": 0.01, "report": 0.02}  # fmt: skip
+_SHARES = {"orient": 0.3, "pairs": 0.05, "extract": 0.15, "match": 0.25, "filter": 0.03, "refine": 0.05,
+           "adjust": 0.13, "consistency": 0.02, "export": 0.01, "report": 0.02}  # fmt: skip
 RUN_STAGES = tuple(_SHARES)
 
 

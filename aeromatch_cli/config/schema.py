@@ -17,6 +17,7 @@ from aeromatch_cli.strategies.filters import FILTERS
 from aeromatch_cli.strategies.matchers import MATCHERS
 from aeromatch_cli.strategies.orienters import ORIENTERS
 from aeromatch_cli.strategies.pairings import PAIRINGS
+from aeromatch_cli.strategies.refiners import REFINERS
 from aeromatch_cli.strategies.simulators import SIMULATORS
 from aeromatch_cli.strategies.steps import STEPS
 
@@ -179,6 +180,9 @@ class Settings(_Section):
         min_length=1,  # without a filter no pair is ever verified
         description="Which matches are kept: a chain of filters; each gets what the previous one kept.",
     )
+    refine: _choice(REFINERS) = Field(  # type: ignore[valid-type]
+        REFINERS["least-squares"](), description="How exactly the places of verified tie points are measured."
+    )
     consistency: _choice(CONSISTENCIES) = Field(  # type: ignore[valid-type]
         CONSISTENCIES["block"](), description="What is done about verified matches that contradict the adjusted block."
     )
@@ -258,6 +262,7 @@ FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
     "match": MATCHERS,
     "cascade": STEPS,
     "filter": FILTERS,
+    "refine": REFINERS,
     "consistency": CONSISTENCIES,
     "export": EXPORTERS,
 }

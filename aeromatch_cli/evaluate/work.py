@@ -19,7 +19,7 @@ from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
-from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.stages.consistency import FinalEntries
@@ -109,8 +109,8 @@ class _Keypoints:
 
     def __getitem__(self, image_id: str) -> FloatArray:
         if image_id not in self._read:
-            path = self._workspace.features(image_id)
-            self._read[image_id] = read_keypoints(path)[0] if path.is_file() else _NOTHING
+            paths = self._workspace.features(image_id), self._workspace.refined(image_id)
+            self._read[image_id] = read_final_keypoints(*paths)
         return self._read[image_id]
 
 

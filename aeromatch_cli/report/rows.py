@@ -25,6 +25,7 @@ STAGE_ORDER = (
     "extract",
     "match",
     "filter",
+    "refine",
     "adjust",
     "consistency",
     "export",

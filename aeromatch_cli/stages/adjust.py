@@ -21,7 +21,7 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
-from aeromatch_cli.stages import orient
+from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
@@ -94,7 +94,8 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
     known = sorted(context.focal_sigmas.items()), sorted(context.angles.items())
-    return fingerprint(versions, context.settings.orient, held, state, known, pairs, control)
+    measured = refine.current_fingerprint(context)
+    return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:

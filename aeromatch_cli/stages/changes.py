@@ -25,6 +25,7 @@ _FIRST_STAGE = {
     "match": "match",
     "cascade": "match",
     "filter": "filter",
+    "refine": "refine",
     "adjust": "adjust",
     "consistency": "consistency",
     "export": "export",

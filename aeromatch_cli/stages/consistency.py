@@ -17,7 +17,6 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
 from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
-from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
 from aeromatch_cli.orientation.alone import block_of_pair
@@ -170,14 +169,14 @@ def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
     """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, ninths without any though
     another image of its pairs shows them, and its points that three or more images see: a block adjustment wants points
     everywhere, and in many images."""
-    shown = _shown_ninths(context)
+    shown, places_px = _shown_ninths(context), contents_of(context).keypoints_px
     seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
     for track in adjusted.tracks.values():
         seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
     found = {}
     for image_id, track in sorted(adjusted.tracks.items()):
         image = context.image_by_id[image_id]
-        places = read_keypoints(context.workspace.features(image_id))[0][track[:, 0]]
+        places = places_px(image_id)[track[:, 0]]
         cells = cells_of((image.width_px, image.height_px), places, 3)
         held = np.zeros((3, 3), dtype=bool)
         held[cells[:, 0], cells[:, 1]] = True

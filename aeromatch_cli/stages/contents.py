@@ -10,7 +10,7 @@ import numpy as np
 from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
 from aeromatch_cli.errors import BrokenFileError, InputError
-from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
@@ -46,9 +46,8 @@ def contents_of(
     """
 
     def keypoints_px(image_id: str) -> FloatArray:
-        path = context.workspace.features(image_id)
         # An image whose extraction failed is exported without keypoints, so that ids stay complete.
-        return read_keypoints(path)[0] if path.exists() else np.zeros((0, 2), np.float32)
+        return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
     if not context.settings.match.reads_pixels:
         return _contents(context, keypoints_px, _pairs(context, verified), adjusted)

@@ -10,6 +10,7 @@ from typing import Any
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import file_digest, fingerprint
+from aeromatch_cli.stages import refine
 from aeromatch_cli.stages.consistency import final_block, final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
@@ -46,6 +47,7 @@ def run(context: Context) -> StageReport:
         block.origin_m,
         sorted(context.guessed_cameras),
         [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in context.pairs],
+        refine.current_fingerprint(context),
         None if adjusted is None else file_digest(context.workspace.final_or_adjusted),
         file_digest(context.workspace.dropped) if context.workspace.dropped.is_file() else None,
     ]

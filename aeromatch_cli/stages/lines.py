@@ -37,6 +37,11 @@ def _picture_lines(stage: StageReport) -> list[str]:
         words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
     if "settled_by" in facts:
         words.append(settled_words(facts))
+    if facts.get("shift_px") is not None:
+        words.append(
+            f"{facts['measured']} of {facts['keypoints']} keypoints measured by least squares, by "
+            f"{facts['shift_px']:.2f} px (median)"
+        )
     if "remark" in facts:
         words.append(facts["remark"])
     return [f"          {'; '.join(words)}"] if words else []

@@ -27,6 +27,7 @@ from aeromatch_cli.stages import (
     filter,  # noqa: A004
     match,
     pairs,
+    refine,
     simulate,
     unchanged,
     union,
@@ -61,7 +62,7 @@ SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
 # What a command rests on: everything before it in this chain.
-_CHAIN = ("orient", "pairs", "extract", "match", "filter", "adjust", "consistency", "export", "report")
+_CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
 
 
 @dataclass(frozen=True)
@@ -177,11 +178,12 @@ def _repairing(
 # What each command makes again of what it finds damaged, besides the tables of the block and the orientation.
 _MAKES = {
     "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",),
-    "adjust": ("adjust", "consistency"), "export": ("adjust", "consistency", "export"), "report": ("report",),
+    "adjust": ("refine", "adjust", "consistency"), "export": ("refine", "adjust", "consistency", "export"),
+    "report": ("report",),
 }  # fmt: skip
 _MADE_BY = {
     "features": "extract", "matches": "match", "verified": "filter", "export": "export", "report": "report",
-    "steps": "match",
+    "steps": "match", "refined": "refine",
 }  # fmt: skip
 
 
@@ -243,10 +245,10 @@ def _there(settings: Settings) -> bool:
 
 def _one_stage(command: str, context: Context) -> list[StageReport]:
     if command == "adjust":
-        return [adjust.run(context), consistency.run(context)]
+        return [refine.run(context), adjust.run(context), consistency.run(context)]
     if command == "export":
         kept = replace(context, overwrite=False)
-        return [adjust.run(kept), consistency.run(kept), export.run(context)]
+        return [refine.run(kept), adjust.run(kept), consistency.run(kept), export.run(context)]
     return [STAGES[command](context)]
 
 
@@ -271,7 +273,7 @@ def _run_all(context: Context) -> list[StageReport]:
         if not reports[-1].facts["verified_matches"]:
             report.run(context)  # in any case: nothing else says why
             raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
-        reports += [adjust.run(context), consistency.run(context), export.run(context)]
+        reports += [refine.run(context), adjust.run(context), consistency.run(context), export.run(context)]
         if context.settings.run.report:
             reports.append(_page(context))
     return reports

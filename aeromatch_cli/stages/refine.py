@@ -1,0 +1,296 @@
+"""refine: measures tie points anew in the pixels of their images, once it is known which keypoints correspond.
+
+Of the keypoints of one point the one with most matches stands for it; the others are brought onto what it shows, each
+by the keypoint through which it is tied to it. First patches around all these keypoints are cut out of every image,
+which is read once; then every image's keypoints are measured by its patches and those of its neighbours.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
+from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
+from aeromatch_cli.formats.refined import write_refined
+from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
+from aeromatch_cli.geometry.level import level_affinities
+from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
+from aeromatch_cli.stages.contents import with_current_pairs
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.enhance import source_of
+from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.stage_report import StageReport, run_stage
+from aeromatch_cli.stages.versions import library_version
+from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, LeastSquares, Patches
+from aeromatch_cli.workspace import translated_os_errors, whole_record, write_atomically, write_record
+
+VERSION = 1
+_PATCHES = "patches"
+
+
+@dataclass(frozen=True, eq=False)
+class CutTask:
+    """An image, the stored pixels (N, 2) around which patches are wanted, and the file that gets them."""
+
+    source: Source
+    points_px: FloatArray
+    path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class ByImage:
+    """Keypoints of one image that are measured by those of another: patches (N,) of either, their places (N, 2), and
+    what is known of both images, the other one first."""
+
+    image_id: str
+    patches: IntArray
+    own_patches: IntArray
+    places_px: FloatArray
+    own_places_px: FloatArray
+    geometry: PairGeometry
+
+
+@dataclass(frozen=True, eq=False)
+class MeasureTask:
+    """All keypoints of one image that are measured by others."""
+
+    image_id: str
+    by: tuple[ByImage, ...]
+    recipe: LeastSquares
+    folder: Path
+    scales: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """(N, 2) shifts, (N,) whether they hold, (N, 2, 2) pixels from the other image's, in the order of the task."""
+
+    shifts_px: FloatArray
+    held: BoolArray
+    matrices: FloatArray
+
+
+def run(context: Context) -> StageReport:
+    """Write refined/<id>.npz of all images where they are not up to date."""
+    report = StageReport("refine")
+    recipe, folder = context.settings.refine, context.workspace.refined_files.parent
+    if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
+        _remove(folder)
+        return report.write(context.workspace)
+    context, _ = with_current_pairs(context)
+    report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
+    record = {} if context.overwrite else whole_record(context.workspace.refined_files, say=True)
+    if record.get("fingerprint") == report.fingerprint:
+        report.skipped, report.facts = report.items, record["facts"]
+        return report.write(context.workspace)
+    _remove(folder)
+    folder.mkdir(parents=True)
+    table = _Table.of(context)
+    cut = [
+        CutTask(source_of(context, context.image_by_id[i]), table.places_px[i][numbers], _patches(folder, i))
+        for i, numbers in table.wanted.items()
+    ]
+    run_stage(context, report, cut_patches, cut, list(table.wanted))
+    tasks = _tasks(context, table, recipe, folder, {i for i in table.wanted if _patches(folder, i).is_file()})
+    outcomes = context.executor.run(measure, tasks, report.stage, [1] * len(tasks))
+    found = {task.image_id: outcome.value for task, outcome in zip(tasks, outcomes, strict=True) if outcome.value}
+    report.failures += [
+        (task.image_id, outcome.error) for task, outcome in zip(tasks, outcomes, strict=True) if outcome.value is None
+    ]
+    report.facts = _write(context, table, tasks, found)
+    report.done = report.items - len(report.failures)
+    for path in folder.glob(f"*.{_PATCHES}.npy"):
+        path.unlink()
+    names = sorted(path.name for path in folder.glob("*.npz"))
+    if not report.failures:
+        write_record(context.workspace.refined_files, {"fingerprint": report.fingerprint, "facts": report.facts}, names)
+    return report.write(context.workspace)
+
+
+def current_fingerprint(context: Context) -> str:
+    """Of the measured places of the present results."""
+    recipe, block = context.settings.refine, context.block
+    if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
+        return ""
+    state = [sorted(block.cameras.items()), sorted(block.poses.items())]
+    sources = [source_of(context, image).fingerprint for image in block.images]
+    pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
+    return fingerprint(VERSION, recipe, library_version("opencv-python-headless"), state, sources, pairs)
+
+
+def _remove(folder: Path) -> None:
+    with translated_os_errors(folder):
+        shutil.rmtree(folder, ignore_errors=not folder.is_dir())
+
+
+def _patches(folder: Path, image_id: str) -> Path:
+    return folder / f"{image_id}.{_PATCHES}.npy"
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Keypoints of the whole block, numbered through. first: image_id -> its first one. places_px: of each image.
+    wanted: image_id -> numbers in the image of the keypoints that are measured or measured by."""
+
+    first: Mapping[str, int]
+    places_px: Mapping[str, FloatArray]
+    trees: Trees
+    wanted: Mapping[str, IntArray]
+
+    @classmethod
+    def of(cls, context: Context) -> _Table:
+        places, first, count = {}, {}, 0
+        for image in context.block.images:
+            path = context.workspace.features(image.image_id)
+            if path.is_file():
+                places[image.image_id] = read_keypoints(path)[0].astype(np.float64)
+                first[image.image_id], count = count, count + len(places[image.image_id])
+        ends, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+        for pair, entry in verified_pairs(context):
+            # Without both attitudes nobody knows how one image's surroundings look in the other.
+            if entry.verdict.state == "verified" and _comparable(context.geometry(pair)):
+                offsets = first[pair.image_id0], first[pair.image_id1]
+                ends.append(entry.matches.indices.astype(np.int64) + offsets)
+                scores.append(entry.matches.scores.astype(np.float64))
+        trees = trees_of(count, np.concatenate(ends), np.concatenate(scores))
+        children = np.flatnonzero(trees.parent >= 0)
+        needed = np.zeros(count, dtype=bool)
+        needed[children] = needed[trees.parent[children]] = True
+        wanted = {i: np.flatnonzero(needed[at : at + len(places[i])]) for i, at in first.items()}
+        return cls(first, places, trees, {i: numbers for i, numbers in wanted.items() if len(numbers)})
+
+
+def _comparable(geometry: PairGeometry) -> bool:
+    poses = geometry.pose0, geometry.pose1
+    return geometry.ground_z_m is not None and all(p is not None and p.world_rotation is not None for p in poses)
+
+
+def cut_patches(task: CutTask) -> int:
+    """Write the patches of an image, each stretched to 8 bits by itself; how many there are."""
+    pixels, _ = read_source(task.source, colour=False)
+    places = in_working_frame(task.points_px, task.source.scale)
+    side = 2 * PATCH_HALF_PX + 1
+    padded = np.pad(pixels, PATCH_HALF_PX, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    middles = np.clip(np.rint(places).astype(np.int64), 0, np.array(pixels.shape[1::-1]) - 1)
+    patches = windows[middles[:, 1], middles[:, 0]].astype(np.float32)
+    low, high = patches.min(axis=(1, 2), keepdims=True), patches.max(axis=(1, 2), keepdims=True)
+    scaled = patches if pixels.dtype == np.uint8 else (patches - low) * (255.0 / np.maximum(high - low, 1e-9))
+    write_atomically(task.path, lambda stream: np.save(stream, np.rint(scaled).astype(np.uint8)))
+    return len(patches)
+
+
+def in_working_frame(points_px: FloatArray, scale: float) -> FloatArray:
+    """Stored pixels (N, 2) in the raster that is worked on, half-pixel correct."""
+    return points_px if scale >= 1.0 else apply_homography(resize_matrix(scale), points_px)
+
+
+def _tasks(context: Context, table: _Table, recipe: LeastSquares, folder: Path, cut: set[str]) -> list[MeasureTask]:
+    """One for every image of which patches are cut, by those of the images that are cut too."""
+    scales = {i: source_of(context, context.image_by_id[i]).scale for i in cut}
+    starts = np.array([table.first[i] for i in table.first])
+    names = list(table.first)
+    tasks = []
+    for image_id in sorted(cut):
+        own = table.first[image_id] + table.wanted[image_id]
+        children = own[table.trees.parent[own] >= 0]
+        parents = table.trees.parent[children]
+        of_image = np.searchsorted(starts, parents, side="right") - 1
+        by = []
+        for number in np.unique(of_image):
+            other = names[number]
+            if other not in cut:
+                continue
+            here = of_image == number
+            numbers, own_numbers = parents[here] - table.first[other], children[here] - table.first[image_id]
+            by.append(
+                ByImage(
+                    other, np.searchsorted(table.wanted[other], numbers),
+                    np.searchsorted(table.wanted[image_id], own_numbers), table.places_px[other][numbers],
+                    table.places_px[image_id][own_numbers], _geometry(context, other, image_id),
+                )
+            )  # fmt: skip
+        if by:
+            tasks.append(MeasureTask(image_id, tuple(by), recipe, folder, scales))
+    return tasks
+
+
+def _geometry(context: Context, first: str, second: str) -> PairGeometry:
+    nowhere = float("nan")
+    geometry = context.geometry(Pair(min(first, second), max(first, second), nowhere, nowhere, ""))
+    return geometry if first < second else geometry.turned()
+
+
+def measure(task: MeasureTask) -> Measured:
+    """The keypoints of one image, in the order of the task."""
+    own: NDArray[np.uint8] = np.load(_patches(task.folder, task.image_id), mmap_mode="r")
+    parts = []
+    for one in task.by:
+        other = np.load(_patches(task.folder, one.image_id), mmap_mode="r")
+        scale, own_scale = task.scales[one.image_id], task.scales[task.image_id]
+        matrices = level_affinities(one.geometry, one.places_px, one.own_places_px)
+        first = _with_places(other[one.patches], in_working_frame(one.places_px, scale))
+        second = _with_places(own[one.own_patches], in_working_frame(one.own_places_px, own_scale))
+        shifts, held = task.recipe(first, second, matrices * (own_scale / scale))
+        parts.append((shifts / own_scale, held, matrices))
+    return Measured(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _with_places(pixels: NDArray[np.uint8], places_px: FloatArray) -> Patches:
+    return Patches(pixels, places_px - np.rint(places_px))
+
+
+def _write(context: Context, table: _Table, tasks: list[MeasureTask], found: Mapping[str, Measured]) -> dict[str, Any]:
+    """Files of all images; figures of what was measured."""
+    count = len(table.trees.parent)
+    shifts, held = np.zeros((count, 2)), np.zeros(count, dtype=bool)
+    matrices = np.broadcast_to(np.eye(2), (count, 2, 2)).copy()
+    for task in tasks:
+        if task.image_id in found:
+            rows = (
+                table.first[task.image_id]
+                + table.wanted[task.image_id][np.concatenate([one.own_patches for one in task.by])]
+            )
+            measured = found[task.image_id]
+            shifts[rows], held[rows], matrices[rows] = measured.shifts_px, measured.held, measured.matrices
+    # What could not be measured stands for itself, and for those that are measured by it.
+    trees = replace(table.trees, depth=_depths(table.trees, held))
+    moved = shifts_through(trees, matrices, shifts)
+    recipe = context.settings.refine
+    assert isinstance(recipe, LeastSquares)
+    far = np.linalg.norm(moved, axis=1) > recipe.max_shift_px
+    moved[far] = 0.0
+    measured_ = (table.trees.depth == 0) | (held & ~far)
+    for image_id, places in table.places_px.items():
+        part = slice(table.first[image_id], table.first[image_id] + len(places))
+        own = known_fingerprint(context.workspace.features(image_id)) or ""
+        write_atomically(
+            context.workspace.refined(image_id),
+            lambda stream, p=places + moved[part], m=measured_[part], f=own: write_refined(stream, p, m, f),  # type: ignore[misc]
+        )
+    matched = table.trees.depth > 0
+    lengths = np.linalg.norm(moved[held & ~far], axis=1)
+    return {
+        "keypoints": int(matched.sum()),
+        "measured": int((held & ~far).sum()),
+        "shift_px": round(float(np.median(lengths)), 4) if len(lengths) else None,
+    }
+
+
+def _depths(trees: Trees, held: BoolArray) -> IntArray:
+    """(K,) measured keypoints on the way to one that is not."""
+    depth = np.where(held, -1, 0)
+    depth[trees.depth < 0] = -1
+    for level in range(1, int(trees.depth.max(initial=0)) + 1):
+        here = np.flatnonzero(held & (trees.depth == level))
+        depth[here] = depth[trees.parent[here]] + 1
+    return np.asarray(depth)
