@@ -66,6 +66,14 @@ class AdjustFacts(Facts):
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
 
 
+class RefineFacts(Facts):
+    """Of `refine`: tie points measured anew."""
+
+    keypoints: int | None = Field(None, description="Matched keypoints, without those that stand for their points.")
+    measured: int | None = Field(None, description="Those of them that were measured.")
+    shift_px: float | None = Field(None, description="By how much they were moved, median, pixels.")
+
+
 class ConsistencyFacts(Facts):
     """Of `consistency`: the final matches."""
 
@@ -106,6 +114,10 @@ class Filter(StageOutcome):
     facts: FilterFacts
 
 
+class Refine(StageOutcome):
+    facts: RefineFacts
+
+
 class Adjust(StageOutcome):
     facts: AdjustFacts
 
@@ -126,6 +138,7 @@ class Stages(BaseModel):
     extract: StageOutcome | None = None
     match: Match | None = None
     filter: Filter | None = None
+    refine: Refine | None = None
     adjust: Adjust | None = None
     consistency: Consistency | None = None
     export: StageOutcome | None = None

@@ -10,8 +10,9 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ from aeromatch_cli.workspace import translated_os_errors, whole_record, write_at
 
 VERSION = 1
 _PATCHES = "patches"
+# Images whose keypoints are measured before patches are given up that no later image needs.
+_IMAGES_AT_ONCE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +75,20 @@ class MeasureTask:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """(N, 2) shifts, (N,) whether they hold, (N, 2, 2) pixels from the other image's, in the order of the task."""
+    """Of keypoints (N,): shifts (N, 2), whether they hold, pixels from those of the other image (N, 2, 2)."""
 
     shifts_px: FloatArray
     held: BoolArray
     matrices: FloatArray
+
+    @classmethod
+    def nothing(cls, count: int) -> Measured:
+        matrices = np.zeros((count, 2, 2), np.float32)
+        return cls(np.zeros((count, 2), np.float32), np.zeros(count, dtype=bool), matrices)
+
+    def set(self, rows: IntArray, values: Measured) -> None:
+        self.shifts_px[rows], self.held[rows] = values.shifts_px, values.held
+        self.matrices[rows] = np.nan_to_num(values.matrices)
 
 
 def run(context: Context) -> StageReport:
@@ -93,25 +105,15 @@ def run(context: Context) -> StageReport:
         report.skipped, report.facts = report.items, record["facts"]
         return report.write(context.workspace)
     _remove(folder)
-    folder.mkdir(parents=True)
-    table = _Table.of(context)
-    cut = [
-        CutTask(source_of(context, context.image_by_id[i]), table.places_px[i][numbers], _patches(folder, i))
-        for i, numbers in table.wanted.items()
-    ]
-    run_stage(context, report, cut_patches, cut, list(table.wanted))
-    tasks = _tasks(context, table, recipe, folder, {i for i in table.wanted if _patches(folder, i).is_file()})
-    outcomes = context.executor.run(measure, tasks, report.stage, [1] * len(tasks))
-    found = {task.image_id: outcome.value for task, outcome in zip(tasks, outcomes, strict=True) if outcome.value}
-    report.failures += [
-        (task.image_id, outcome.error) for task, outcome in zip(tasks, outcomes, strict=True) if outcome.value is None
-    ]
-    report.facts = _write(context, table, tasks, found)
+    with translated_os_errors(folder):
+        folder.mkdir(parents=True)
+    with context.executor.step("refine"):
+        table = _Table.of(context)
+    found = _measured(context, table, recipe, report)
+    report.facts = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    for path in folder.glob(f"*.{_PATCHES}.npy"):
-        path.unlink()
-    names = sorted(path.name for path in folder.glob("*.npz"))
     if not report.failures:
+        names = sorted(path.name for path in folder.glob("*.npz"))
         write_record(context.workspace.refined_files, {"fingerprint": report.fingerprint, "facts": report.facts}, names)
     return report.write(context.workspace)
 
@@ -168,6 +170,22 @@ class _Table:
         wanted = {i: np.flatnonzero(needed[at : at + len(places[i])]) for i, at in first.items()}
         return cls(first, places, trees, {i: numbers for i, numbers in wanted.items() if len(numbers)})
 
+    def measured_by(self, image_id: str) -> dict[str, tuple[IntArray, IntArray]]:
+        """Other image -> numbers there of keypoints, and here of those that are measured by them."""
+        names, starts = list(self.first), np.fromiter(self.first.values(), np.int64)
+        own = self.first[image_id] + self.wanted[image_id]
+        children = own[self.trees.parent[own] >= 0]
+        parents = self.trees.parent[children]
+        # Images without keypoints start where the next one does.
+        of_image = np.searchsorted(starts, parents, side="right") - 1
+        return {
+            names[number]: (
+                parents[of_image == number] - starts[number],
+                children[of_image == number] - self.first[image_id],
+            )
+            for number in np.unique(of_image)
+        }
+
 
 def _comparable(geometry: PairGeometry) -> bool:
     poses = geometry.pose0, geometry.pose1
@@ -194,34 +212,57 @@ def in_working_frame(points_px: FloatArray, scale: float) -> FloatArray:
     return points_px if scale >= 1.0 else apply_homography(resize_matrix(scale), points_px)
 
 
-def _tasks(context: Context, table: _Table, recipe: LeastSquares, folder: Path, cut: set[str]) -> list[MeasureTask]:
-    """One for every image of which patches are cut, by those of the images that are cut too."""
-    scales = {i: source_of(context, context.image_by_id[i]).scale for i in cut}
-    starts = np.array([table.first[i] for i in table.first])
-    names = list(table.first)
-    tasks = []
-    for image_id in sorted(cut):
-        own = table.first[image_id] + table.wanted[image_id]
-        children = own[table.trees.parent[own] >= 0]
-        parents = table.trees.parent[children]
-        of_image = np.searchsorted(starts, parents, side="right") - 1
-        by = []
-        for number in np.unique(of_image):
-            other = names[number]
-            if other not in cut:
+def _measured(context: Context, table: _Table, recipe: LeastSquares, report: StageReport) -> Measured:
+    """Of all keypoints of the block. Patches are there as long as they are needed: those of 10,000 images would fill a
+    disk."""
+    folder = context.workspace.refined_files.parent
+    by = {image_id: table.measured_by(image_id) for image_id in table.wanted}
+    batches = [list(by)[at : at + _IMAGES_AT_ONCE] for at in range(0, len(by), _IMAGES_AT_ONCE)]
+    needed = [sorted({*batch, *(other for image_id in batch for other in by[image_id])}) for batch in batches]
+    last = {image_id: number for number, names in enumerate(needed) for image_id in names}
+    found, cut = Measured.nothing(len(table.trees.parent)), set[str]()
+    for number, batch in enumerate(batches):
+        new = [image_id for image_id in needed[number] if image_id not in cut]
+        sources = [source_of(context, context.image_by_id[i]) for i in new]
+        cuts = [
+            CutTask(source, table.places_px[i][table.wanted[i]], _patches(folder, i))
+            for i, source in zip(new, sources, strict=True)
+        ]
+        run_stage(context, report, cut_patches, cuts, new)
+        cut.update(new)
+        tasks = [_task(context, table, recipe, image_id, by[image_id]) for image_id in batch]
+        tasks = [task for task in tasks if task.by]
+        outcomes = context.executor.run(measure, tasks, report.stage)
+        for task, outcome in zip(tasks, outcomes, strict=True):
+            if outcome.value is None:
+                report.failures.append((task.image_id, outcome.error))
                 continue
-            here = of_image == number
-            numbers, own_numbers = parents[here] - table.first[other], children[here] - table.first[image_id]
-            by.append(
-                ByImage(
-                    other, np.searchsorted(table.wanted[other], numbers),
-                    np.searchsorted(table.wanted[image_id], own_numbers), table.places_px[other][numbers],
-                    table.places_px[image_id][own_numbers], _geometry(context, other, image_id),
-                )
-            )  # fmt: skip
-        if by:
-            tasks.append(MeasureTask(image_id, tuple(by), recipe, folder, scales))
-    return tasks
+            own = np.concatenate([one.own_patches for one in task.by])
+            found.set(table.first[task.image_id] + table.wanted[task.image_id][own], outcome.value)
+        for image_id in needed[number]:
+            if last[image_id] == number:
+                _patches(folder, image_id).unlink(missing_ok=True)
+    return found
+
+
+def _task(
+    context: Context, table: _Table, recipe: LeastSquares, image_id: str, by: Mapping[str, tuple[IntArray, IntArray]]
+) -> MeasureTask:
+    """Of one image, by those of the images whose patches are there."""
+    folder, parts = context.workspace.refined_files.parent, []
+    scales: dict[str, float] = {}
+    for other, (numbers, own_numbers) in by.items():
+        if not (_patches(folder, other).is_file() and _patches(folder, image_id).is_file()):
+            continue  # its picture could not be read
+        scales |= {i: source_of(context, context.image_by_id[i]).scale for i in (other, image_id)}
+        parts.append(
+            ByImage(
+                other, np.searchsorted(table.wanted[other], numbers),
+                np.searchsorted(table.wanted[image_id], own_numbers), table.places_px[other][numbers],
+                table.places_px[image_id][own_numbers], _geometry(context, other, image_id),
+            )
+        )  # fmt: skip
+    return MeasureTask(image_id, tuple(parts), recipe, folder, scales)
 
 
 def _geometry(context: Context, first: str, second: str) -> PairGeometry:
@@ -249,41 +290,28 @@ def _with_places(pixels: NDArray[np.uint8], places_px: FloatArray) -> Patches:
     return Patches(pixels, places_px - np.rint(places_px))
 
 
-def _write(context: Context, table: _Table, tasks: list[MeasureTask], found: Mapping[str, Measured]) -> dict[str, Any]:
+def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquares) -> dict[str, Any]:
     """Files of all images; figures of what was measured."""
-    count = len(table.trees.parent)
-    shifts, held = np.zeros((count, 2)), np.zeros(count, dtype=bool)
-    matrices = np.broadcast_to(np.eye(2), (count, 2, 2)).copy()
-    for task in tasks:
-        if task.image_id in found:
-            rows = (
-                table.first[task.image_id]
-                + table.wanted[task.image_id][np.concatenate([one.own_patches for one in task.by])]
-            )
-            measured = found[task.image_id]
-            shifts[rows], held[rows], matrices[rows] = measured.shifts_px, measured.held, measured.matrices
     # What could not be measured stands for itself, and for those that are measured by it.
-    trees = replace(table.trees, depth=_depths(table.trees, held))
-    moved = shifts_through(trees, matrices, shifts)
-    recipe = context.settings.refine
-    assert isinstance(recipe, LeastSquares)
-    far = np.linalg.norm(moved, axis=1) > recipe.max_shift_px
-    moved[far] = 0.0
-    measured_ = (table.trees.depth == 0) | (held & ~far)
+    trees = replace(table.trees, depth=_depths(table.trees, found.held))
+    moved = shifts_through(trees, found.matrices, found.shifts_px)
+    held = found.held & (np.linalg.norm(moved, axis=1) <= recipe.max_shift_px)
+    moved[~held] = 0.0
     for image_id, places in table.places_px.items():
         part = slice(table.first[image_id], table.first[image_id] + len(places))
-        own = known_fingerprint(context.workspace.features(image_id)) or ""
-        write_atomically(
-            context.workspace.refined(image_id),
-            lambda stream, p=places + moved[part], m=measured_[part], f=own: write_refined(stream, p, m, f),  # type: ignore[misc]
-        )
-    matched = table.trees.depth > 0
-    lengths = np.linalg.norm(moved[held & ~far], axis=1)
+        features = known_fingerprint(context.workspace.features(image_id)) or ""
+        values = places + moved[part], held[part] | (table.trees.depth[part] == 0), features
+        write_atomically(context.workspace.refined(image_id), partial(_written, values))
+    lengths = np.linalg.norm(moved[held], axis=1)
     return {
-        "keypoints": int(matched.sum()),
-        "measured": int((held & ~far).sum()),
+        "keypoints": int((table.trees.depth > 0).sum()),
+        "measured": int(held.sum()),
         "shift_px": round(float(np.median(lengths)), 4) if len(lengths) else None,
     }
+
+
+def _written(values: tuple[FloatArray, BoolArray, str], stream: BinaryIO) -> None:
+    write_refined(stream, *values)
 
 
 def _depths(trees: Trees, held: BoolArray) -> IntArray:

@@ -9,6 +9,7 @@ Calls, by family (table in the family's __init__):
   extractors  strategy(camera, views) -> Features                    views: ViewPixels of one image
   matchers    strategy(features0, features1, geometry) -> Matches      those with reads_pixels: also rasters, of both
   filters     strategy(candidates, geometry, seed) -> Verdict            points in stored pixels
+  refiners    strategy(first, second, second_from_first) -> shifts, held   patches around matched keypoints
   exporters   strategy(contents, folder) -> ExportSummary            the only family that writes: a foreign format
   orienters   no call: a recipe of the first pass and the orientation that `stages.orient` follows
 """

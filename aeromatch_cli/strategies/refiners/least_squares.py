@@ -17,21 +17,24 @@ from pydantic import Field
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.strategies import Strategy
 
-# A window has so many samples to each side of its middle, weighted by a Gaussian of so many samples.
-_HALF, _SIGMA = 7, 4.7
+# A window has so many samples to each side of its middle, weighted by a Gaussian of so many samples. Smaller ones are
+# better at roofs (city 0.29 for 0.37 px with 5 for 7), larger ones on grass (0.22 for 0.16 px).
+_HALF, _SIGMA = 6, 4.0
 # A patch has so many pixels to each side of its middle.
 PATCH_HALF_PX = 15
-_ITERATIONS = 6
+_ITERATIONS = 8
 # A step, in samples, below which a window has come to rest, and beyond which no single step goes.
 _REST, _LONGEST = 0.1, 1.0
+# All windows are left alone once none of them moves by more samples.
+_STILL = 0.01
 # Samples are at least and at most so many pixels of the first image apart.
 _FINEST, _COARSEST = 0.6, 1.6
 # And in the second image at most so many.
 _MOST_STRETCHED = 1.6
 # Contrast of a window, in grey levels, and least share of the stronger derivative that the weaker one has: edges slide.
 _LEAST_CONTRAST, _LEAST_CORNER = 1.0, 0.02
-# Of the pixels beside a sample bicubic interpolation reads two.
-_MARGIN_PX = 2.0
+# Of the pixels beside a sample interpolation reads one.
+_MARGIN_PX = 1.0
 # OpenCV's remap takes pictures of 32,767 rows at most.
 _PATCHES_AT_ONCE = 1000
 
@@ -51,15 +54,18 @@ class LeastSquares(Strategy):
     """Least-squares matching: every tie point is measured anew in the pixels of its images, to a tenth of a pixel."""
 
     name: Literal["least-squares"] = "least-squares"
+    # Rendered hills, city and grass under two suns, `auto`: median errors 0.24, 0.38 and 0.17 px with 0.5 and with 0.3,
+    # 0.26, 0.37 and 0.31 px with 0.7.
     min_correlation: float = Field(
-        0.7,
+        0.5,
         ge=-1.0,
         le=1.0,
-        description="Least correlation of both windows (15 x 15 samples) where the point is measured. Larger: fewer "
+        description="Least correlation of both windows (13 x 13 samples) where the point is measured. Larger: fewer "
         "points are moved, the others stay where the detector put them.",
     )
+    # The same blocks: 48,466 correct matches with 3 px, 48,043 with 2 px.
     max_shift_px: float = Field(
-        2.0,
+        3.0,
         gt=0.0,
         description="Largest distance from where the detector put the point, pixels. Larger: more points are moved, "
         "some to another place.",
@@ -76,8 +82,9 @@ class LeastSquares(Strategy):
         return shifts, held
 
     def _shifts(self, first: Patches, second: Patches, second_from_first: FloatArray) -> tuple[FloatArray, BoolArray]:
-        apart, comparable = _sampling(second_from_first)
-        matrices = second_from_first * apart[:, None, None]
+        seen = np.nan_to_num(second_from_first)
+        apart, comparable = _sampling(seen)
+        matrices = seen * apart[:, None, None]
         template, inside = _sampled(first, apart[:, None, None] * np.eye(2), np.zeros((len(apart), 2)), _HALF + 1)
         held = comparable & inside
         middle, contrast = _levels(template[:, 1:-1, 1:-1])
@@ -103,7 +110,7 @@ class LeastSquares(Strategy):
             last = np.clip(-np.einsum("nij,nj->ni", inverse, wrong), -_LONGEST, _LONGEST)
             held &= inside
             steps += last
-            if not (np.abs(last[held]) > 0.3 * _REST).any():
+            if not (np.abs(last[held]) > _STILL).any():
                 break
         correlation = (window * template) @ _WEIGHTS
         shifts = np.einsum("nij,nj->ni", matrices, steps)
@@ -157,7 +164,8 @@ def _sampled(patches: Patches, matrices: FloatArray, shifts: FloatArray, half: i
     places = np.clip(places, _MARGIN_PX, side - 1 - _MARGIN_PX)
     places[..., 1] += np.arange(count, dtype=np.float32)[:, None] * side
     sheet = patches.pixels.reshape(-1, side).astype(np.float32)
-    found = cv2.remap(sheet, places[..., 0], places[..., 1], cv2.INTER_CUBIC)
+    # OpenCV's bicubic weights move what they interpolate by up to 0.04 px, bilinear ones by 0.01 px.
+    found = cv2.remap(sheet, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
     return np.asarray(found, np.float32).reshape(count, 2 * half + 1, 2 * half + 1), np.asarray(inside)
 
 
