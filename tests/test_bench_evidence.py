@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
-from benchmarks.evidence import draw, table_of, with_expected
+from benchmarks.evidence import draw, main, table_of, with_expected
 
 from aeromatch_cli.stages.evidence import Evidence, columns
 from aeromatch_cli.strategies.steps import LearnedFeatures
@@ -45,3 +45,11 @@ def test_the_picture_is_the_same_each_time(tmp_path: Path) -> None:
         draw(tmp_path / name, found)
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     assert "verified matches expected after the step" in (tmp_path / "a.svg").read_text()
+    draw(tmp_path / "few.svg", found[:3])
+
+
+def test_weights_are_not_found_on_the_blocks_that_judge_them(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--fit", "3,4", "--seed", "4", "--out", "nowhere"])
+    assert stopped.value.code == 2
+    assert "--fit holds 4" in capsys.readouterr().err

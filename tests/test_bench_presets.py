@@ -53,7 +53,11 @@ def test_quality_and_seconds_are_per_pair(tmp_path: Path) -> None:
     found = rows("auto", [90, 60], [100, 60], seconds=5.0, run_seconds=9.0)
     found += rows("aliked", [30, 20], [40, 20], seconds=3.0)
     draw_quality(tmp_path / "steps.svg", [*found, *rows("auto[cascade=none]", [80, 9], [90, 60], seconds=1.0)])
-    assert "auto's first step" in (tmp_path / "steps.svg").read_text()
+    drawn = (tmp_path / "steps.svg").read_text()
+    assert "auto's first step" in drawn
+    other = "baseline[match.ratio=0.8]"
+    draw_quality(tmp_path / "other.svg", [*found, *rows(other, [80, 9], [90, 60], seconds=1.0)])
+    assert f"{other}, 59.3 % right" in (tmp_path / "other.svg").read_text()
     assert quality(found) == [("auto", 5.0, 75.0, 0.9375), ("aliked", 3.0, 25.0, 50 / 60)]
     draw_quality(tmp_path / "quality.svg", found)
     again = tmp_path / "again.svg"

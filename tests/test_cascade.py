@@ -205,8 +205,8 @@ def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(
     whole = _rows(site.work / "verified")
     assert len(whole) == len(guided) == len(first)
     assert sum(len(e.matches.indices) for e in guided) > sum(len(e.matches.indices) for e in first)
-    assert [int(row["matches"]) for row in rows] == [len(e.matches.indices) for e in guided]
-    expected, found = (np.array([float(row[key]) for row in rows]) for key in ("expected", "matches"))
+    assert [int(row["verified"]) for row in rows] == [len(e.matches.indices) for e in guided]
+    expected, found = (np.array([float(row[key]) for row in rows]) for key in ("expected", "verified"))
     assert np.abs(np.log(expected / found)).max() < 0.7, rows
     for joined, own in zip(whole, guided, strict=True):
         np.testing.assert_array_equal(joined.matches.indices, own.matches.indices)

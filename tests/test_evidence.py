@@ -79,6 +79,18 @@ def test_more_matches_promise_more_after_the_step(verified: int, overlap: float,
     for step in (GuidedSearch(), LearnedFeatures()):
         expected = pair.expected(step, 4000)
         assert 0.0 <= expected < replace(pair, verified=verified + 50).expected(step, 4000)
+        assert expected >= (verified if step.own_features else 0)
+
+
+def test_nothing_is_expected_of_images_that_show_nothing() -> None:
+    for keypoints in (0, 29):
+        assert np.isnan(replace(USUAL, verified=0, keypoints=keypoints).expected(STEP, 4000))
+
+
+def test_no_more_keypoints_are_expected_than_a_picture_holds() -> None:
+    """One for a hundred pixels: 480 x 360 have 1728, however many are allowed."""
+    small = replace(USUAL, verified=300, pixels=480 * 360)
+    assert small.expected(STEP, 4000) == small.expected(STEP, 1728) > small.expected(STEP, 1500)
 
 
 def test_learned_features_are_expected_to_bring_more_where_sift_finds_few_keypoints() -> None:
@@ -95,7 +107,8 @@ def test_a_pair_with_enough_takes_a_step_that_is_expected_to_bring_much_more() -
     expected = poor.expected(STEP, 4000)
     gain = expected / poor.verified - 1.0
     asks, rests = (STEP.model_copy(update={"large_gain": gain + off}) for off in (-0.01, 0.01))
-    assert poor.asks_for(asks, 4000) == f"400 verified matches, {expected:.0f} expected"
+    about = float(f"{expected:.2g}")
+    assert poor.asks_for(asks, 4000) == f"enough with 400 verified matches, but about {about:.0f} expected after it"
     assert poor.asks_for(rests, 4000) == ""
     # Twice as many as are enough are plenty.
     plenty = replace(poor, verified=2 * poor.enough(STEP))
@@ -106,5 +119,6 @@ def test_what_a_lacking_pair_is_expected_to_have_is_said() -> None:
     lacking = replace(USUAL, verified=100)
     words = "100 verified matches of 360 that an overlap of 60 % promises"
     assert lacking.lacks(STEP) == words
-    assert lacking.asks_for(STEP, 4000) == f"{words}, {lacking.expected(STEP, 4000):.0f} expected"
+    about = float(f"{lacking.expected(STEP, 4000):.2g}")
+    assert lacking.asks_for(STEP, 4000) == f"{words}, about {about:.0f} expected after it"
     assert lacking.asks_for(LiftedShadows(below_matches=600), 4000) == words

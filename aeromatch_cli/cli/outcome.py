@@ -42,7 +42,7 @@ class MatchFacts(Facts):
 
     matches: int | None = Field(None, description="Before verification, of the pairs of this run.")
     settled_by: dict[str, int] = Field({}, description="With a cascade: step -> pairs that needed nothing after it.")
-    not_settled: int | None = Field(None, description="With a cascade: pairs left with fewer matches than promised.")
+    not_settled: int | None = Field(None, description="With a cascade: pairs left with few matches, or gaps.")
 
 
 class FilterFacts(Facts):

@@ -172,7 +172,8 @@ class Settings(_Section):
     )
     cascade: Annotated[tuple[_choice(STEPS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
         (),
-        description="Further steps for pairs that the settings above leave with too few matches, cheapest first; the "
+        description="Further steps for pairs that the settings above leave with too few matches, or that may have many "
+        "more, cheapest first; the "
         "matches of all steps of a pair are verified together.",
     )
     filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]

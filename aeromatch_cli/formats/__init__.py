@@ -119,6 +119,14 @@ N images, P points, O observations, C cameras.
 As `adjusted.npz`, with the points and observations that are left once the matches of `dropped.npz` are gone; absent
 where that is all. `export` and `report` show these.
 
+### refined/<id>.npz
+
+Where keypoints were measured anew by least-squares matching (`refine`); absent with `refine=none`. What is adjusted,
+judged, exported and evaluated has these places; features, matches and two-view models keep those of the detector.
+
+- `keypoints_px` (K, 2) float32: of all keypoints of features/<id>.npz; `measured` (K,) bool: those that stand for their
+  points, or were brought onto one that does. `fingerprint`: that of the features. `files.json` is the record of all.
+
 ### orientation/dropped.npz
 
 Verified matches that contradict the adjusted block or are not likely to be right, of D pairs. Whoever reads results
@@ -175,10 +183,11 @@ that found a keypoint; `numbers_<step>` (K_step,) int32: number here of each key
 
 Only with a `cascade`. `image_id0`, `image_id1`, `steps` (those that the pair took, joined by +), `reasons` (why it took
 the further ones), `settled_by` (the step after which it needed nothing more, empty where it lacks matches in the end),
-`lacks` (what it lacks in the end), `matches` (verified ones of all steps, one place once), `expected` (how many it may
-have after the last step, by what was known before it; empty where overlap or view angle are unknown). Features, matches
-and verdicts of a step lie in its folder, laid out like this workspace; the workspace's own join them. `guided` has no
-features: it uses those of the first step.
+`lacks` (what it lacks in the end), `verified` (verified matches of all steps, those that two of them have found counted
+once, before the pair is verified as a whole), `expected` (how many were expected after the last step that it took;
+empty where overlap or view angle are unknown, or nothing is known of the step). Features, matches and verdicts of a
+step lie in its folder, laid out like this workspace; the workspace's own join them. `guided` has no features: it uses
+those of the first step.
 
 ### matches/<id0>.npz
 
@@ -214,6 +223,7 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
   `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
   `images_without_keypoints`.
+- `facts` of refine: `keypoints` (matched ones, without those that stand for their points), `measured`, `shift_px`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
   `weakly_tied` (as of filter, of those that stay), `points`, `observations` (of the adjusted block), `points_left`,
@@ -223,7 +233,7 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
   (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images
   show them, and its points that three or more images see).
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
-  matches than their overlap promises). Of extract with a cascade: `images_by_step`.
+  matches than their overlap promises, or with empty parts of it). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
   `weakly_tied` (images with few verified matches).
 - `facts` of export: exporter -> files and counts.

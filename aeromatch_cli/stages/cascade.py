@@ -1,7 +1,8 @@
 """cascade: steps from cheap to expensive, each for the pairs that those before it leave with too few matches.
 
 Every step is a small workspace of its own below WORK/steps, made by the stages extract, match and filter. A pair takes
-a further step where its verified matches are few for its overlap, or leave parts of the overlap empty. Whether it does
+a further step where its verified matches are few for its overlap or leave parts of it empty, or where learned features
+may bring many more. Whether it does
 depends on this pair, and of steps whose features cost much and matches little on others of its images: a shard takes
 such pairs as far as it sees them, the command that ends the work of all shards the rest. `union` joins what the steps
 have found.
@@ -94,13 +95,14 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
 @dataclass(frozen=True, eq=False)
 class StepContext:
     """A step with its context. features_of: the step whose features it uses. reasons: why each pair takes it, "" in the
-    first. expected: verified matches that each pair judged before may have after it, NaN where unknown. reports: of
-    extract, match and filter, where this command has run them."""
+    first. needed: the pairs that lacked something before it. expected: verified matches that pairs may have after it,
+    NaN where unknown. reports: of extract, match and filter, where this command has run them."""
 
     name: str
     features_of: str
     context: Context
     reasons: Mapping[Key, str]
+    needed: frozenset[Key] = frozenset()
     expected: Mapping[Key, float] = field(default_factory=dict)
     reports: tuple[StageReport, ...] = ()
 
@@ -155,8 +157,9 @@ def _steps(context: Context) -> Iterator[StepContext]:
             looked_at = {image_id for key in left for image_id in key}
             known = [key for key in reasons if key not in left and set(key) <= looked_at]
             left |= {key: reasons[key] or _BOTH_KNOWN for key in known}
-        expected = {key: evidence.expected(recipe, most) for key, evidence in found.items()}
-        steps.append(replace(_further_step(context, recipe, left), expected=expected))
+        needed = frozenset(key for key in left if found[key].lacks(recipe))
+        expected = {key: found[key].expected(recipe, most) for key in left}
+        steps.append(replace(_further_step(context, recipe, left), needed=needed, expected=expected))
         yield steps[-1]
 
 
@@ -265,27 +268,28 @@ def _evidence(
             coverage = covered_share(shared.cells0, geometry.camera0, points0)
         else:
             coverage = covered_share(shared.cells1, geometry.camera1, points1)
-    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg)
+    pixels = min(camera.width_px * camera.height_px for camera in (geometry.camera0, geometry.camera1))
+    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg, pixels)
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Of a pair: the step after which it needed nothing more, or ""; what it lacks in the end; verified matches of all
-    steps, one place once."""
+    steps, those that two of them have found counted once."""
 
     settled_by: str
     lacks: str
-    matches: int
+    verified: int
 
 
 def outcomes(context: Context, steps: Sequence[StepContext]) -> dict[Key, Outcome]:
-    """Of every pair. One that took a step only because its features were there is settled by one before it."""
+    """Of every pair. One that took a step though it lacked nothing is settled by one before it."""
     found, last = evidence_of(steps), context.settings.cascade[-1]
     answer: dict[Key, Outcome] = {}
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         lacks = found[key].lacks(last) if key in found else "not matched"
-        needed = [s.name for s in steps[1:] if s.reasons.get(key, _BOTH_KNOWN) != _BOTH_KNOWN]
+        needed = [step.name for step in steps[1:] if key in step.needed]
         settled = "" if lacks else needed[-1] if needed else FIRST
         answer[key] = Outcome(settled, lacks, found[key].verified if key in found else 0)
     return answer

@@ -1,7 +1,7 @@
 """evidence: what steps of a cascade have found of a pair, what it lacks, and what a further step may find.
 
-The logarithm of the expected number is linear in those of what is known. Weights are the steps' own (`Step.yields`),
-found on rendered blocks by `scripts/bench evidence`, which draws how far they hold on others. Coverage, candidates and
+The logarithm of the expected number is linear in those of what is known. The weights are the steps' own, found on
+rendered blocks by `scripts/bench evidence`, which draws how far they hold on others. Coverage, candidates and
 what the pairs of the same images have found say nothing that matches, keypoints, overlap and view angle do not say.
 """
 
@@ -26,8 +26,11 @@ _ENOUGH_KEYPOINTS = 2000
 _PLENTY = 2.0
 # Added to numbers whose logarithm is taken: below it they are much the same.
 _FEW = 10.0
+_DAMPING = 0.1
 # Beyond it views differ in all they can, degrees.
 _MOST_ANGLE_DEG = 90.0
+# No step finds more keypoints in an image than one for so many of its pixels.
+_PIXELS_PER_KEYPOINT = 100.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Evidence:
     the image where it is larger. coverage: share of the overlap's cells that verified matches lie in; both NaN where
     poses or ground are unknown, coverage also where there is no overlap. keypoints: of the first step, in the image
     that has fewer. candidates: matches before verification. angle_deg: between both views of the ground, NaN where
-    unknown.
+    unknown. pixels: of the smaller image.
     """
 
     verified: int
@@ -47,6 +50,7 @@ class Evidence:
     keypoints: int
     candidates: int = 0
     angle_deg: float = float("nan")
+    pixels: float = float("inf")
 
     @property
     def shows_nothing(self) -> bool:
@@ -79,40 +83,51 @@ class Evidence:
         expected = self.expected(step, keypoints)
         lacks = self.lacks(step)
         if lacks:
-            return lacks + (f", {expected:.0f} expected" if np.isfinite(expected) else "")
+            return lacks + (f", about {_rounded(expected)} expected after it" if np.isfinite(expected) else "")
         # Small overlaps promise large gains of few matches: easy blocks would load networks for them.
         ties, plenty = self.overlap >= _TYING_OVERLAP, self.verified >= _PLENTY * self.enough(step)
-        if ties and not plenty and expected >= (1.0 + step.large_gain) * self.verified:
-            return f"{self.verified} verified matches, {expected:.0f} expected"
+        gain = getattr(step, "large_gain", np.inf)
+        if ties and not plenty and expected >= (1.0 + gain) * self.verified:
+            return f"enough with {self.verified} verified matches, but about {_rounded(expected)} expected after it"
         return ""
 
     def expected(self, step: Step, keypoints: int) -> float:
         """Verified matches that the pair can be expected to have after the step; NaN where overlap or view angle are
-        unknown, or weights for the step. keypoints: most that the step finds in an image."""
+        unknown, an image shows nothing, or there are no weights for the step. keypoints: most that the step finds in
+        an image."""
         known = columns(self, keypoints)
-        return float("nan") if step.yields is None or known is None else expected_number(known, step.yields)
+        if step.expectation_weights is None or known is None or self.shows_nothing:
+            return float("nan")
+        number = expected_number(known, step.expectation_weights)
+        return max(number, float(self.verified)) if step.own_features else number
+
+
+def _rounded(number: float) -> int:
+    """To two digits."""
+    return int(float(f"{number:.2g}"))
 
 
 def columns(evidence: Evidence, keypoints: int) -> FloatArray | None:
     """(5,) what the model is linear in: one, and of verified matches, keypoints in the overlap, view angle, and the
-    step's keypoints in the overlap. None where overlap or view angle are unknown."""
+    most keypoints that the step may find in the overlap. None where overlap or view angle are unknown."""
     if not (evidence.overlap > 0.0 and np.isfinite(evidence.angle_deg)):
         return None
-    counts = evidence.verified, evidence.keypoints * evidence.overlap, keypoints * evidence.overlap
+    most = min(keypoints, evidence.pixels / _PIXELS_PER_KEYPOINT)
+    counts = evidence.verified, evidence.keypoints * evidence.overlap, most * evidence.overlap
     verified, own, further = np.log(np.array(counts) + _FEW)
     return np.array([1.0, verified, own, min(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG, further])
 
 
-def expected_number(known: FloatArray, yields: Sequence[float]) -> float:
+def expected_number(known: FloatArray, weights: Sequence[float]) -> float:
     """Of verified matches of a pair with such `columns` (5,) after a step with these weights (5,)."""
-    return max(0.0, float(np.exp(known @ np.array(yields))) - _FEW)
+    return max(0.0, float(np.exp(known @ np.array(weights))) - _FEW)
 
 
 def fitted_weights(known: Sequence[FloatArray], found: Sequence[int]) -> FloatArray:
-    """(5,) weights by least squares of the logarithm. known: `columns` of pairs; found: their verified matches after
-    the step."""
+    """(5,) weights by least squares of the logarithm, damped a little: where the step uses the first one's keypoints,
+    two columns say the same. known: `columns` of pairs; found: their verified matches after the step."""
     values, wanted = np.array(known), np.log(np.array(found) + _FEW)
-    return np.asarray(np.linalg.solve(values.T @ values + 0.1 * np.eye(values.shape[1]), values.T @ wanted))
+    return np.asarray(np.linalg.solve(values.T @ values + _DAMPING * np.eye(values.shape[1]), values.T @ wanted))
 
 
 def log_error(expected: FloatArray, found: FloatArray) -> FloatArray:

@@ -221,19 +221,19 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
 
 
 def _write_steps(context: Context, steps: Sequence[StepContext], outcomes: Mapping[Key, cascade.Outcome]) -> None:
-    """steps.csv: which steps every pair took, and why, which one settled it, what it lacks in the end, and how many
-    matches it has and may have."""
+    """steps.csv: which steps every pair took, and why, which one settled it, what it lacks in the end, how many
+    verified matches it has, and how many were expected."""
     lines: list[tuple[Any, ...]] = []
     for pair in context.pairs:
         key = pair.image_id0, pair.image_id1
         taken = [step for step in steps if key in step.reasons]
         reasons = "; ".join(f"{step.name}: {step.reasons[key]}" for step in taken if step.reasons[key])
-        expected = steps[-1].expected.get(key, float("nan"))
-        may_have = "" if np.isnan(expected) else round(expected)
+        expected = taken[-1].expected.get(key, float("nan"))
+        after_last = "" if np.isnan(expected) else round(expected)
         own = outcomes[key]
         names = "+".join(step.name for step in taken)
-        lines.append((*key, names, reasons, own.settled_by, own.lacks, own.matches, may_have))
-    header = "image_id0", "image_id1", "steps", "reasons", "settled_by", "lacks", "matches", "expected"
+        lines.append((*key, names, reasons, own.settled_by, own.lacks, own.verified, after_last))
+    header = "image_id0", "image_id1", "steps", "reasons", "settled_by", "lacks", "verified", "expected"
     write_text(context.workspace.steps, csv_text(header, lines))
 
 

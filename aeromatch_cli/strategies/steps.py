@@ -1,4 +1,5 @@
-"""Further steps of a cascade: recipes for pairs that the cheaper steps before leave with too few matches.
+"""Further steps of a cascade: recipes for pairs that the cheaper steps before leave with too few matches, or that may
+have many more.
 
 The first step is what the settings say of enhance, simulate, extract and match. `stages.cascade` follows the recipes;
 the matches of all steps of a pair are verified together.
@@ -37,14 +38,14 @@ class Step(Strategy):
     """What all steps have in common: which pairs take them.
 
     own_features: it finds keypoints of its own, else it uses those of the first step, and what it finds replaces that
-    step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs. yields:
-    weights by which `stages.evidence` expects how many matches a pair has after the step, as `scripts/bench evidence`
-    has found them; None: nothing is expected.
+    step's matches. cheap_to_match: pairs take the step, too, whose images are both looked at for other pairs.
+    expectation_weights: by which `stages.evidence` expects how many matches a pair has after the step, as
+    `scripts/bench evidence` has found them; None: nothing is expected.
     """
 
     own_features: ClassVar[bool] = True
     cheap_to_match: ClassVar[bool] = False
-    yields: ClassVar[tuple[float, ...] | None] = None
+    expectation_weights: ClassVar[tuple[float, ...] | None] = None
     name: str
     below_matches: int = _below_matches(600)
     below_coverage: float = Field(
@@ -54,13 +55,6 @@ class Step(Strategy):
         description="And by pairs with an overlap of 40 % or more whose verified matches lie in less than this share "
         "of its cells (8 x 8 in the image). Larger: more pairs take it, more time.",
     )
-    large_gain: float = Field(
-        0.7,
-        ge=0.0,
-        description="And by pairs with an overlap of 40 % or more and less than twice as many matches as are enough, "
-        "where the step is expected to bring this share more of them (0.7: 70 %). Larger: fewer pairs take it, less "
-        "time.",
-    )
 
 
 class GuidedSearch(Step):
@@ -69,7 +63,7 @@ class GuidedSearch(Step):
 
     version: ClassVar[int] = 2
     own_features: ClassVar[bool] = False
-    yields: ClassVar[tuple[float, ...] | None] = (-0.34, 0.744, 0.29, -0.19, 0.005)
+    expectation_weights: ClassVar[tuple[float, ...] | None] = (-0.34, 0.744, 0.29, -0.19, 0.005)
     name: Literal["guided"] = "guided"
     # Two rendered nadir blocks (hills, suburb): 28,543 correct matches with 1000, 30,869 with 1500, 33,635 with 2000,
     # where `fusion` has 30,058.
@@ -91,11 +85,18 @@ class LearnedFeatures(Step):
 
     version: ClassVar[int] = 2
     cheap_to_match: ClassVar[bool] = True
-    yields: ClassVar[tuple[float, ...] | None] = (1.276, 0.807, -0.33, -0.15, 0.43)
+    expectation_weights: ClassVar[tuple[float, ...] | None] = (1.276, 0.807, -0.33, -0.15, 0.43)
     name: Literal["learned"] = "learned"
     # Two rendered nadir blocks (city, farmland): 16,664 correct matches with 600, 35,677 with 1000, 37,216 for every
     # pair; on easy ground (hills, suburb, sheffield, seneca) no pair has fewer.
     below_matches: int = _below_matches(1000)
+    large_gain: float = Field(
+        0.7,
+        ge=0.0,
+        description="Also taken by pairs with enough matches, but less than twice as many, and an overlap of 40 % or "
+        "more, where the step is expected to bring this share more (0.7: 70 %; with the other defaults where an image "
+        "has some 5000 keypoints or fewer). Larger: fewer pairs take it, less time; 100: none.",
+    )
     keypoints: int | None = _KEYPOINTS
     precision: Precision = _PRECISION
     device: Device = DEVICE
@@ -110,4 +111,4 @@ class LiftedShadows(Step):
     device: Device = DEVICE
 
 
-STEPS: Mapping[str, type[Strategy]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}
+STEPS: Mapping[str, type[Step]] = {"guided": GuidedSearch, "learned": LearnedFeatures, "shadow": LiftedShadows}

@@ -3,12 +3,13 @@
 Every block is one `aeromatch run auto` whose pairs all take every step; rendered blocks with their noisy poses, real
 ones (--data, every k-th image) with their reference poses. Before each step, `aeromatch_cli.stages.evidence` says of
 every pair with known overlap what it is expected to have after it. The number behind a block's name: SIFT descriptors
-per image. Found: verified matches of all steps together, in
-one place once. Error: root mean square of the difference of logarithms, as a factor. Gain: matches after over before.
+per image. Found: verified matches of all steps together, those that two steps have found counted once. Error: root mean
+square of the difference of logarithms, as a factor. Gain: matches after over before.
 
---fit SEEDS renders other blocks of the same scenes and flights, finds the weights from these alone, and prints them:
-`yields` of the steps are those of the command that docs/results/auto.md shows. Writes OUT/results.json, OUT/evidence.md
-and OUT/evidence.svg. What OUT has is not made again.
+--fit SEEDS renders other blocks of the same scenes and flights, with other numbers of descriptors for each scene, finds
+the weights from these alone, and prints them: `expectation_weights` of the steps are those of the command that
+docs/results/auto.md shows. Writes OUT/results.json, OUT/evidence.md and OUT/evidence.svg. What OUT has is not made
+again.
 """
 
 from __future__ import annotations
@@ -55,8 +56,9 @@ class Block:
     keypoints: int
 
 
-def rendered_blocks(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]:
-    for k, (seed, flight, scene) in enumerate(product(seeds, args.flights, args.scenes)):
+def rendered_blocks(args: argparse.Namespace, seeds: Sequence[int], first: int = 0) -> Iterator[Block]:
+    """first: which of the numbers of descriptors the first block has."""
+    for k, (seed, flight, scene) in enumerate(product(seeds, args.flights, args.scenes), start=first):
         folder = render_asked(args, scene, flight=flight, seed=seed)
         given = "--poses", str(folder / NOISY_POSES), "--cameras", str(folder / "block.json"), "--crs", "local"
         keypoints = args.keypoints[k % len(args.keypoints)]
@@ -110,13 +112,12 @@ def all_rows(args: argparse.Namespace, blocks: Sequence[Block]) -> list[Row]:
 
 def with_expected(rows: Sequence[Row]) -> list[Row]:
     """The rows with what the steps' weights expect."""
+    weights = {name: step.expectation_weights for name, step in STEPS.items()}
     return [
-        {**row, "expected": _expected(row)} for row in rows if getattr(STEPS[row["step"]], "yields", None) is not None
+        {**row, "expected": expected_number(np.array(row["columns"]), own)}
+        for row in rows
+        if (own := weights[row["step"]]) is not None
     ]
-
-
-def _expected(row: Row) -> float:
-    return expected_number(np.array(row["columns"]), STEPS[row["step"]].yields)  # type: ignore[attr-defined]
 
 
 def _factor(rows: Sequence[Row]) -> float:
@@ -166,10 +167,10 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     for (step,), own in grouped(rows, "step"):
         expected, found = (np.array([row[key] for row in own], float) + 1.0 for key in ("expected", "found"))
         every += [expected, found]
-        axis.scatter(expected, found, s=4, alpha=0.25, color=_COLOURS.get(step), linewidths=0, rasterized=False)
+        axis.scatter(expected, found, s=4, alpha=0.25, color=_COLOURS.get(step), linewidths=0)
         edges = np.quantile(expected, np.linspace(0, 1, 9))
         number_of = np.clip(np.searchsorted(edges, expected, side="right") - 1, 0, 7)
-        middles = [(np.median(expected[number_of == k]), np.median(found[number_of == k])) for k in range(8)]
+        middles = [(np.median(expected[number_of == k]), np.median(found[number_of == k])) for k in set(number_of)]
         axis.plot(*zip(*middles, strict=True), marker="o", markersize=4, color=_COLOURS.get(step), label=step)
     low, high = (float(pick(np.concatenate(every))) for pick in (np.min, np.max))
     axis.plot([low, high], [low, high], color="#999999", linewidth=0.8)
@@ -199,11 +200,13 @@ def main(arguments: Sequence[str]) -> None:
     add("--jobs", type=options.positive, default=2, help="blocks at a time")
     options.add_output(parser)
     args = options.parse(parser, arguments, {"scenes": "suburb", "flights": "nadir", "size": "480x360", "images": 4})
+    if args.fit and args.seed in args.fit:
+        parser.error(f"--fit holds {args.seed}, the seed of the blocks that are judged: give others")
     limit_threads(1)
     if args.fit:
-        for (step,), own in grouped(all_rows(args, list(rendered_blocks(args, args.fit))), "step"):
+        for (step,), own in grouped(all_rows(args, list(rendered_blocks(args, args.fit, first=1))), "step"):
             weights = fitted_weights([np.array(row["columns"]) for row in own], [row["found"] for row in own])
-            print(f"{step}: yields =", tuple(round(float(weight), 3) for weight in weights))
+            print(f"{step}: expectation_weights =", tuple(round(float(weight), 3) for weight in weights))
     blocks = [*rendered_blocks(args, [args.seed]), *real_blocks(args)]
     rows = with_expected(all_rows(args, blocks))
     write_rows(args.out / "results.json", rows)

@@ -29,9 +29,15 @@ def quality(rows: Sequence[Row]) -> list[tuple[str, float, float, float]]:
 
 
 def _words(method: str) -> str:
-    """auto[cascade=guided]: auto up to the step guided."""
+    """auto[cascade=guided]: auto up to the step guided. Others by their names."""
     last = method.removeprefix(_STEPS).removesuffix("]")
-    return method if last == method else "auto's first step" if last == "none" else f"auto up to {last}"
+    if not _is_step(method) or method == _WHOLE:
+        return method
+    return "auto's first step" if last == "none" else f"auto up to {last}"
+
+
+def _is_step(method: str) -> bool:
+    return method == _WHOLE or (method.startswith(_STEPS) and "," not in method)
 
 
 def _label(axis: Any, points: Sequence[tuple[str, float, float, float]], ours: Container[object]) -> None:
@@ -69,7 +75,7 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
     points = [point for point in quality(rows) if point[2] > 0.0]  # a logarithm has no place for none
     for method, seconds, correct, _ in points:
         axis.scatter(seconds, correct, color=_OURS if method in ours else _PEERS, s=36, zorder=3)
-    steps = sorted(point[1:3] for point in points if point[0] == _WHOLE or point[0].startswith(_STEPS))
+    steps = sorted(point[1:3] for point in points if _is_step(point[0]))
     axis.plot(*zip(*steps, strict=True), color=_OURS, linewidth=0.8, zorder=2)
     # Room for the labels.
     low, high = 0.8 * min(point[1] for point in points), 4.0 * max(point[1] for point in points)
