@@ -24,6 +24,7 @@ TABLE: Table = {
     "extraction": ("benchmarks.extraction", "seconds of an image's features, by extractor"),
     "probability": ("benchmarks.probability", "how far the probability that a match is right can be relied on"),
     "evidence": ("benchmarks.evidence", "how many matches a step of auto is expected to bring, and how many it brings"),
+    "refine": ("benchmarks.refine", "errors of tie points with and without least-squares matching, by exact truth"),
     "filters": ("benchmarks.filters", "filters on the same matches, by exact truth"),
     "rectification": ("benchmarks.rectification", "scale and rotation that remain between views of oblique pairs"),
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),

@@ -33,6 +33,7 @@ PAGES: Mapping[str, str] = {
     "bench_presets": "auto.md",
     "bench_presets_second": "auto.md",
     "bench_evidence": "auto.md",
+    "bench_refine": "auto.md",
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
     "bench_growth_blocks": "large.md",
