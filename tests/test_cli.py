@@ -355,10 +355,10 @@ def test_progress_says_which_stage_of_how_many(capsys):
             progress.advance(count)
     lines = capsys.readouterr().err.splitlines()
     assert [line.rpartition(",")[0] for line in lines] == [
-        "1/9 first pass: match: 100 % (1/1)",
-        "4/9 step first: match: 70 % (7/10)",
-        "4/9 step first: match: 100 % (10/10)",
-        "4/9 step guided: extract: 100 % (1/1)",  # it does not go back to the third
+        "1/10 first pass: match: 100 % (1/1)",
+        "4/10 step first: match: 70 % (7/10)",
+        "4/10 step first: match: 100 % (10/10)",
+        "4/10 step guided: extract: 100 % (1/1)",  # it does not go back to the third
         "read: 100 % (1/1)",
     ]
 

@@ -102,7 +102,7 @@ def test_learned_features_are_expected_to_bring_more_where_sift_finds_few_keypoi
 
 
 def test_a_pair_with_enough_takes_a_step_that_is_expected_to_bring_much_more() -> None:
-    poor = replace(USUAL, verified=400, keypoints=1500)
+    poor = replace(USUAL, verified=400, keypoints=1500, sought=4000)
     assert not poor.lacks(STEP)
     expected = poor.expected(STEP, 4000)
     gain = expected / poor.verified - 1.0
@@ -110,9 +110,14 @@ def test_a_pair_with_enough_takes_a_step_that_is_expected_to_bring_much_more() -
     about = float(f"{expected:.2g}")
     assert poor.asks_for(asks, 4000) == f"enough with 400 verified matches, but about {about:.0f} expected after it"
     assert poor.asks_for(rests, 4000) == ""
+    # Where the first step finds what it looks for, and in small overlaps, it is enough.
+    eager = STEP.model_copy(update={"large_gain": 0.0})
+    assert poor.asks_for(eager, 4000)
+    for changed in ({"sought": 2000}, {"pixels": 1500 * 75.0}, {"overlap": 0.39}):
+        assert replace(poor, **changed).asks_for(eager, 4000) == ""
     # Twice as many as are enough are plenty.
     plenty = replace(poor, verified=2 * poor.enough(STEP))
-    assert plenty.asks_for(STEP.model_copy(update={"large_gain": 0.0}), 4000) == ""
+    assert plenty.asks_for(eager, 4000) == ""
 
 
 def test_what_a_lacking_pair_is_expected_to_have_is_said() -> None:

@@ -65,7 +65,7 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     assert verified(halves) == expected
     rest = done_site("run", "--workspace", halves)
     assert rest.code == 0
-    assert set(rest.done()) == {"adjust", "consistency", "export"}
+    assert set(rest.done()) == {"refine", "adjust", "consistency", "export"}
     assert contents(halves)["export/colmap/database.db"] == contents(done_site.work)["export/colmap/database.db"]
 
     swapped = Site(tmp_path / "swapped")
@@ -84,11 +84,11 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
     [
         (
             "match.ratio=0.75",
-            {"match": PAIRS, "filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
+            {"match": PAIRS, "filter": PAIRS, "refine": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
         (
             "filter.poselib.threshold_px=3",
-            {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
+            {"filter": PAIRS, "refine": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
         (
             "extract.keypoints=300",
@@ -96,15 +96,16 @@ def test_processes_shards_and_file_order_give_identical_matches(done_site, rende
                 "extract": IMAGES,
                 "match": PAIRS,
                 "filter": PAIRS,
+                "refine": IMAGES,
                 "adjust": IMAGES,
                 "consistency": PAIRS,
                 "export": 1,
             },
         ),
-        ("seed=5", {"filter": PAIRS, "adjust": IMAGES, "consistency": PAIRS, "export": 1}),
+        ("seed=5", {"filter": PAIRS, "refine": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1}),
         (
             "block.sigma_position_m=9",
-            {"orient": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
+            {"orient": IMAGES, "refine": IMAGES, "adjust": IMAGES, "consistency": PAIRS, "export": 1},
         ),
         ("export.colmap.pose_priors=false", {"export": 1}),
     ],
@@ -249,8 +250,8 @@ def test_overwrite_redoes_everything(done_site):
     before = contents(done_site.work)
     outcome = done_site("run", "--overwrite")
     assert outcome.done() == {
-        "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "adjust": IMAGES,
-        "consistency": PAIRS, "export": 1
+        "orient": IMAGES, "pairs": PAIRS, "extract": IMAGES, "match": PAIRS, "filter": PAIRS, "refine": IMAGES,
+        "adjust": IMAGES, "consistency": PAIRS, "export": 1,
     }  # fmt: skip
     assert contents(done_site.work) == before
 

@@ -269,7 +269,8 @@ def _evidence(
         else:
             coverage = covered_share(shared.cells1, geometry.camera1, points1)
     pixels = min(camera.width_px * camera.height_px for camera in (geometry.camera0, geometry.camera1))
-    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg, pixels)
+    sought = getattr(context.settings.extract, "keypoints", 0)
+    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg, pixels, sought)
 
 
 @dataclass(frozen=True)

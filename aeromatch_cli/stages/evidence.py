@@ -29,8 +29,10 @@ _FEW = 10.0
 _DAMPING = 0.1
 # Beyond it views differ in all they can, degrees.
 _MOST_ANGLE_DEG = 90.0
-# No step finds more keypoints in an image than one for so many of its pixels.
-_PIXELS_PER_KEYPOINT = 100.0
+# No step finds more keypoints in an image than one for so many of its pixels, nor the first one on the best texture.
+_PIXELS_PER_KEYPOINT, _PIXELS_PER_FIRST = 100.0, 75.0
+# An image with a smaller share of the keypoints that the first step may find has little texture for it.
+_POOR = 0.75
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Evidence:
     the image where it is larger. coverage: share of the overlap's cells that verified matches lie in; both NaN where
     poses or ground are unknown, coverage also where there is no overlap. keypoints: of the first step, in the image
     that has fewer. candidates: matches before verification. angle_deg: between both views of the ground, NaN where
-    unknown. pixels: of the smaller image.
+    unknown. pixels: of the smaller image. sought: most keypoints that the first step looks for in an image.
     """
 
     verified: int
@@ -51,11 +53,17 @@ class Evidence:
     candidates: int = 0
     angle_deg: float = float("nan")
     pixels: float = float("inf")
+    sought: int = 0
 
     @property
     def shows_nothing(self) -> bool:
         """Whether one of the images has next to no keypoints."""
         return self.keypoints < _LEAST_MATCHES
+
+    @property
+    def poor(self) -> bool:
+        """Whether one of the images has little texture for the first step."""
+        return self.keypoints < _POOR * min(self.sought, self.pixels / _PIXELS_PER_FIRST)
 
     def enough(self, step: Step) -> int:
         """Verified matches with which the pair needs no step like this."""
@@ -84,10 +92,11 @@ class Evidence:
         lacks = self.lacks(step)
         if lacks:
             return lacks + (f", about {_rounded(expected)} expected after it" if np.isfinite(expected) else "")
-        # Small overlaps promise large gains of few matches: easy blocks would load networks for them.
+        # Small overlaps promise large gains of few matches, and where the first step finds what it looks for it does
+        # well: easy blocks would load networks for nothing.
         ties, plenty = self.overlap >= _TYING_OVERLAP, self.verified >= _PLENTY * self.enough(step)
         gain = getattr(step, "large_gain", np.inf)
-        if ties and not plenty and expected >= (1.0 + gain) * self.verified:
+        if self.poor and ties and not plenty and expected >= (1.0 + gain) * self.verified:
             return f"enough with {self.verified} verified matches, but about {_rounded(expected)} expected after it"
         return ""
 

@@ -94,8 +94,8 @@ class LearnedFeatures(Step):
         0.7,
         ge=0.0,
         description="Also taken by pairs with enough matches, but less than twice as many, and an overlap of 40 % or "
-        "more, where the step is expected to bring this share more (0.7: 70 %; with the other defaults where an image "
-        "has some 5000 keypoints or fewer). Larger: fewer pairs take it, less time; 100: none.",
+        "more, where an image has less than three quarters of the keypoints that were looked for and the step is "
+        "expected to bring this share more matches (0.7: 70 %). Larger: fewer pairs take it, less time; 100: none.",
     )
     keypoints: int | None = _KEYPOINTS
     precision: Precision = _PRECISION
