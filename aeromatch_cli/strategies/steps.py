@@ -63,7 +63,7 @@ class GuidedSearch(Step):
 
     version: ClassVar[int] = 2
     own_features: ClassVar[bool] = False
-    expectation_weights: ClassVar[tuple[float, ...] | None] = (-0.34, 0.744, 0.29, -0.19, 0.005)
+    expectation_weights: ClassVar[tuple[float, ...] | None] = (-0.046, 0.734, 0.37, -0.105, -0.112)
     name: Literal["guided"] = "guided"
     # Two rendered nadir blocks (hills, suburb): 28,543 correct matches with 1000, 30,869 with 1500, 33,635 with 2000,
     # where `fusion` has 30,058.
@@ -85,7 +85,7 @@ class LearnedFeatures(Step):
 
     version: ClassVar[int] = 2
     cheap_to_match: ClassVar[bool] = True
-    expectation_weights: ClassVar[tuple[float, ...] | None] = (1.276, 0.807, -0.33, -0.15, 0.43)
+    expectation_weights: ClassVar[tuple[float, ...] | None] = (0.989, 0.852, -0.348, -0.018, 0.449)
     name: Literal["learned"] = "learned"
     # Two rendered nadir blocks (city, farmland): 16,664 correct matches with 600, 35,677 with 1000, 37,216 for every
     # pair; on easy ground (hills, suburb, sheffield, seneca) no pair has fewer.
