@@ -103,7 +103,7 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
         ),
     ),
     "adjust": (
-        "Adjust the oriented block from the verified matches: poses, cameras and points.",
+        "Measure the verified tie points in the pixels and adjust the oriented block: poses, cameras and points.",
         (
             "aeromatch adjust --workspace WORK",
             "aeromatch adjust --workspace WORK --gcp gcp_list.txt",
