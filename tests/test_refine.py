@@ -6,14 +6,17 @@ import json
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import Site
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry, Pose
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import read_final_keypoints
@@ -21,7 +24,10 @@ from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
+from aeromatch_cli.stages import refine
+from aeromatch_cli.stages.refine import _far_inside
 from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, LeastSquares, Patches
 from aeromatch_cli.workspace import Workspace
 
@@ -178,6 +184,7 @@ def test_without_refinement_tie_points_stay_where_the_detector_put_them(done_sit
     assert not list(work.refined_files.parent.glob("*.npy"))
     outcome = done_site("run", "--set", "refine=none")
     assert outcome.code == 0, outcome.stderr
+    assert outcome.facts["stages"]["refine"]["facts"]["measured"] is None
     assert not work.refined_files.parent.exists()
     for image in read_images(work.images):
         np.testing.assert_array_equal(final(work)(image.image_id), read_keypoints(work.features(image.image_id))[0])
@@ -191,6 +198,36 @@ def test_a_damaged_file_is_made_again(done_site: Site) -> None:
     path.write_bytes(before[:-30])
     assert done_site("run").code == 0
     assert path.read_bytes() == before
+
+
+def test_near_the_edge_of_a_picture_or_of_a_mask_nothing_is_measured() -> None:
+    valid = np.ones((80, 100), dtype=bool)
+    valid[30, 70] = False
+    places = np.array([[50, 40], [12, 40], [13, 40], [86, 40], [87, 40], [50, 66], [50, 67], [70, 43], [70, 44]])
+    everywhere = [True, False, True, True, False, True, False, True, True]
+    assert _far_inside((80, 100), None, places).tolist() == everywhere
+    assert _far_inside((80, 100), valid, places).tolist() == [*everywhere[:7], False, True]
+
+
+@pytest.mark.slow
+def test_what_lacked_a_picture_is_made_again_when_it_is_back(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Workspace(done_site.work)
+    kept = [work.adjusted, work.dropped, *sorted(work.refined_files.parent.glob("*.npz"))]
+    before = {path: path.read_bytes() for path in kept if path.is_file()}
+    name = done_site.names()[1]
+
+    def unreadable(source: Source, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
+        if source.path.name == name:
+            raise ItemError(f"image {name} cannot be read")
+        return read_source(source, colour=colour)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(refine, "read_source", unreadable)
+        outcome = done_site("adjust", "--overwrite", "--executor", "serial")
+    assert outcome.code == 1
+    assert work.adjusted.read_bytes() != before[work.adjusted]
+    assert done_site("adjust").code == 0
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def final(work: Workspace) -> Callable[[str], FloatArray]:

@@ -122,7 +122,8 @@ where that is all. `export` and `report` show these.
 ### refined/<id>.npz
 
 Where keypoints were measured anew by least-squares matching (`refine`); absent with `refine=none`. What is adjusted,
-judged, exported and evaluated has these places; features, matches and two-view models keep those of the detector.
+judged, exported and evaluated has these places; features, matches, two-view models and the report's pictures keep those
+of the detector.
 
 - `keypoints_px` (K, 2) float32: of all keypoints of features/<id>.npz; `measured` (K,) bool: those that stand for their
   points, or were brought onto one that does. `fingerprint`: that of the features. `files.json` is the record of all.

@@ -94,7 +94,7 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
     known = sorted(context.focal_sigmas.items()), sorted(context.angles.items())
-    measured = refine.current_fingerprint(context)
+    measured = refine.made_fingerprint(context)
     return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
 
 

@@ -47,7 +47,7 @@ def run(context: Context) -> StageReport:
         block.origin_m,
         sorted(context.guessed_cameras),
         [(pair.image_id0, pair.image_id1, pair_fingerprint(context, pair)) for pair in context.pairs],
-        refine.current_fingerprint(context),
+        refine.made_fingerprint(context),
         None if adjusted is None else file_digest(context.workspace.final_or_adjusted),
         file_digest(context.workspace.dropped) if context.workspace.dropped.is_file() else None,
     ]

@@ -31,8 +31,8 @@ from aeromatch_cli.stages.enhance import source_of
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, LeastSquares, Patches
-from aeromatch_cli.workspace import translated_os_errors, whole_record, write_atomically, write_record
+from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, REACH_PX, LeastSquares, Patches
+from aeromatch_cli.workspace import read_json, translated_os_errors, whole_record, write_atomically, write_record
 
 VERSION = 1
 _PATCHES = "patches"
@@ -97,6 +97,7 @@ def run(context: Context) -> StageReport:
     recipe, folder = context.settings.refine, context.workspace.refined_files.parent
     if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
         _remove(folder)
+        report.facts = {"keypoints": None, "measured": None, "shift_px": None}
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
     report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
@@ -112,10 +113,18 @@ def run(context: Context) -> StageReport:
     found = _measured(context, table, recipe, report)
     report.facts = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    if not report.failures:
-        names = sorted(path.name for path in folder.glob("*.npz"))
-        write_record(context.workspace.refined_files, {"fingerprint": report.fingerprint, "facts": report.facts}, names)
+    # What is made of places that lack some must not count as made of all.
+    lacking = sorted({item for item, _ in report.failures})
+    made = fingerprint(report.fingerprint, lacking) if lacking else report.fingerprint
+    names = sorted(path.name for path in folder.glob("*.npz"))
+    write_record(context.workspace.refined_files, {"fingerprint": made, "facts": report.facts}, names)
     return report.write(context.workspace)
+
+
+def made_fingerprint(context: Context) -> str:
+    """Of the measured places on file, "" where there are none."""
+    record = context.workspace.refined_files
+    return str(read_json(record).get("fingerprint", "")) if record.is_file() else ""
 
 
 def current_fingerprint(context: Context) -> str:
@@ -123,7 +132,8 @@ def current_fingerprint(context: Context) -> str:
     recipe, block = context.settings.refine, context.block
     if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
         return ""
-    state = [sorted(block.cameras.items()), sorted(block.poses.items())]
+    heights = [context.ground_z_m(image.image_id) for image in block.images]
+    state = [sorted(block.cameras.items()), sorted(block.poses.items()), heights]
     sources = [source_of(context, image).fingerprint for image in block.images]
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
     return fingerprint(VERSION, recipe, library_version("opencv-python-headless"), state, sources, pairs)
@@ -193,8 +203,9 @@ def _comparable(geometry: PairGeometry) -> bool:
 
 
 def cut_patches(task: CutTask) -> int:
-    """Write the patches of an image, each stretched to 8 bits by itself; how many there are."""
-    pixels, _ = read_source(task.source, colour=False)
+    """Write the patches of an image, each stretched to 8 bits by itself; how many there are. Those near its edge, or
+    near what a mask hides, are empty: nothing is measured there."""
+    pixels, valid = read_source(task.source, colour=False)
     places = in_working_frame(task.points_px, task.source.scale)
     side = 2 * PATCH_HALF_PX + 1
     padded = np.pad(pixels, PATCH_HALF_PX, mode="edge")
@@ -203,8 +214,20 @@ def cut_patches(task: CutTask) -> int:
     patches = windows[middles[:, 1], middles[:, 0]].astype(np.float32)
     low, high = patches.min(axis=(1, 2), keepdims=True), patches.max(axis=(1, 2), keepdims=True)
     scaled = patches if pixels.dtype == np.uint8 else (patches - low) * (255.0 / np.maximum(high - low, 1e-9))
+    scaled[~_far_inside(pixels.shape, valid, middles)] = 0.0
     write_atomically(task.path, lambda stream: np.save(stream, np.rint(scaled).astype(np.uint8)))
     return len(patches)
+
+
+def _far_inside(shape: tuple[int, ...], valid: BoolArray | None, places: IntArray) -> BoolArray:
+    """Which places (N, 2), x and y, have nothing invalid within the reach of a window."""
+    import cv2
+
+    inside = (places >= REACH_PX) & (places < np.array(shape[1::-1]) - REACH_PX)
+    if valid is None:
+        return np.asarray(inside.all(axis=1))
+    whole = cv2.erode(valid.astype(np.uint8), np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8))
+    return np.asarray(inside.all(axis=1) & (whole[places[:, 1], places[:, 0]] > 0))
 
 
 def in_working_frame(points_px: FloatArray, scale: float) -> FloatArray:
@@ -295,7 +318,11 @@ def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquare
     # What could not be measured stands for itself, and for those that are measured by it.
     trees = replace(table.trees, depth=_depths(table.trees, found.held))
     moved = shifts_through(trees, found.matrices, found.shifts_px)
-    held = found.held & (np.linalg.norm(moved, axis=1) <= recipe.max_shift_px)
+    scales = np.ones(len(moved))
+    for image_id, places in table.places_px.items():
+        at = table.first[image_id]
+        scales[at : at + len(places)] = source_of(context, context.image_by_id[image_id]).scale
+    held = found.held & (np.linalg.norm(moved, axis=1) * scales <= recipe.max_shift_px)
     moved[~held] = 0.0
     for image_id, places in table.places_px.items():
         part = slice(table.first[image_id], table.first[image_id] + len(places))

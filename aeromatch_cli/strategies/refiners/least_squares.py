@@ -33,6 +33,8 @@ _FINEST, _COARSEST = 0.6, 1.6
 _MOST_STRETCHED = 1.6
 # Contrast of a window, in grey levels, and least share of the stronger derivative that the weaker one has: edges slide.
 _LEAST_CONTRAST, _LEAST_CORNER = 1.0, 0.02
+# No window, shifted or not, reaches further from its keypoint.
+REACH_PX = 13
 # Of the pixels beside a sample interpolation reads one.
 _MARGIN_PX = 1.0
 # OpenCV's remap takes pictures of 32,767 rows at most.
@@ -60,15 +62,15 @@ class LeastSquares(Strategy):
         0.5,
         ge=-1.0,
         le=1.0,
-        description="Least correlation of both windows (13 x 13 samples) where the point is measured. Larger: fewer "
-        "points are moved, the others stay where the detector put them.",
+        description="Least correlation of both windows (13 x 13 samples) of a keypoint that is moved. Larger: fewer "
+        "keypoints are moved, the others stay where the detector put them.",
     )
     # The same blocks: 48,466 correct matches with 3 px, 48,043 with 2 px.
     max_shift_px: float = Field(
         3.0,
         gt=0.0,
-        description="Largest distance from where the detector put the point, pixels. Larger: more points are moved, "
-        "some to another place.",
+        description="Largest distance from where the detector put the keypoint, pixels (reduced ones with "
+        "block.max_size_px). Larger: more keypoints are moved, some to another place.",
     )
 
     def __call__(self, first: Patches, second: Patches, second_from_first: FloatArray) -> tuple[FloatArray, BoolArray]:
