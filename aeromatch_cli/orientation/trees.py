@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,14 +51,13 @@ def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
         towards, nearer = towards[depth[towards] < 0], nearer[depth[towards] < 0]
 
 
-def shifts_through(trees: Trees, matrices: Sequence[FloatArray] | FloatArray, shifts: FloatArray) -> FloatArray:
+def shifts_through(trees: Trees, matrices: FloatArray, shifts: FloatArray) -> FloatArray:
     """(K, 2) by how much each keypoint is moved so that it shows what the first one of its point shows.
 
     shifts: (K, 2) that bring each onto its parent where the detector put that one. matrices: (K, 2, 2) pixels of its
     image from pixels of its parent's.
     """
     moved = np.array(shifts, dtype=np.float64)
-    matrices = np.asarray(matrices)
     for depth in range(2, int(trees.depth.max(initial=0)) + 1):
         here = np.flatnonzero(trees.depth == depth)
         moved[here] += np.einsum("nij,nj->ni", matrices[here], moved[trees.parent[here]])

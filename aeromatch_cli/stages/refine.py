@@ -150,13 +150,17 @@ def _patches(folder: Path, image_id: str) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Keypoints of the whole block, numbered through. first: image_id -> its first one. places_px: of each image.
-    wanted: image_id -> numbers in the image of the keypoints that are measured or measured by."""
+    """Keypoints of the whole block, numbered through. first: image_id -> its first one. places_px, sources: of each
+    image. wanted: image_id -> numbers in the image of the keypoints that are measured or measured by. names, starts:
+    ids (N,) and first keypoints (N,) of the images, in order."""
 
     first: Mapping[str, int]
     places_px: Mapping[str, FloatArray]
+    sources: Mapping[str, Source]
     trees: Trees
     wanted: Mapping[str, IntArray]
+    names: tuple[str, ...]
+    starts: IntArray
 
     @classmethod
     def of(cls, context: Context) -> _Table:
@@ -178,19 +182,20 @@ class _Table:
         needed = np.zeros(count, dtype=bool)
         needed[children] = needed[trees.parent[children]] = True
         wanted = {i: np.flatnonzero(needed[at : at + len(places[i])]) for i, at in first.items()}
-        return cls(first, places, trees, {i: numbers for i, numbers in wanted.items() if len(numbers)})
+        wanted = {i: numbers for i, numbers in wanted.items() if len(numbers)}
+        sources = {i: source_of(context, context.image_by_id[i]) for i in places}
+        return cls(first, places, sources, trees, wanted, tuple(first), np.fromiter(first.values(), np.int64))
 
     def measured_by(self, image_id: str) -> dict[str, tuple[IntArray, IntArray]]:
         """Other image -> numbers there of keypoints, and here of those that are measured by them."""
-        names, starts = list(self.first), np.fromiter(self.first.values(), np.int64)
         own = self.first[image_id] + self.wanted[image_id]
         children = own[self.trees.parent[own] >= 0]
         parents = self.trees.parent[children]
         # Images without keypoints start where the next one does.
-        of_image = np.searchsorted(starts, parents, side="right") - 1
+        of_image = np.searchsorted(self.starts, parents, side="right") - 1
         return {
-            names[number]: (
-                parents[of_image == number] - starts[number],
+            self.names[number]: (
+                parents[of_image == number] - self.starts[number],
                 children[of_image == number] - self.first[image_id],
             )
             for number in np.unique(of_image)
@@ -246,11 +251,7 @@ def _measured(context: Context, table: _Table, recipe: LeastSquares, report: Sta
     found, cut = Measured.nothing(len(table.trees.parent)), set[str]()
     for number, batch in enumerate(batches):
         new = [image_id for image_id in needed[number] if image_id not in cut]
-        sources = [source_of(context, context.image_by_id[i]) for i in new]
-        cuts = [
-            CutTask(source, table.places_px[i][table.wanted[i]], _patches(folder, i))
-            for i, source in zip(new, sources, strict=True)
-        ]
+        cuts = [CutTask(table.sources[i], table.places_px[i][table.wanted[i]], _patches(folder, i)) for i in new]
         run_stage(context, report, cut_patches, cuts, new)
         cut.update(new)
         tasks = [_task(context, table, recipe, image_id, by[image_id]) for image_id in batch]
@@ -277,7 +278,7 @@ def _task(
     for other, (numbers, own_numbers) in by.items():
         if not (_patches(folder, other).is_file() and _patches(folder, image_id).is_file()):
             continue  # its picture could not be read
-        scales |= {i: source_of(context, context.image_by_id[i]).scale for i in (other, image_id)}
+        scales |= {i: table.sources[i].scale for i in (other, image_id)}
         parts.append(
             ByImage(
                 other, np.searchsorted(table.wanted[other], numbers),
@@ -321,7 +322,7 @@ def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquare
     scales = np.ones(len(moved))
     for image_id, places in table.places_px.items():
         at = table.first[image_id]
-        scales[at : at + len(places)] = source_of(context, context.image_by_id[image_id]).scale
+        scales[at : at + len(places)] = table.sources[image_id].scale
     held = found.held & (np.linalg.norm(moved, axis=1) * scales <= recipe.max_shift_px)
     moved[~held] = 0.0
     for image_id, places in table.places_px.items():
