@@ -11,6 +11,7 @@ from conftest import Site, contents
 from dask_cluster import Processes, dask_cluster, dask_worker
 
 pytestmark = pytest.mark.slow
+FOLDERS = ("features", "matches", "verified", "refined")
 
 
 class Killer(threading.Thread):
@@ -23,8 +24,8 @@ class Killer(threading.Thread):
         self.over = threading.Event()
 
     def run(self) -> None:
-        for folder in ("features", "matches", "verified"):
-            while not any((self.work / folder).glob("*.npz")) and not self.over.is_set():
+        for folder in FOLDERS:
+            while not any((self.work / folder).glob("*.np?")) and not self.over.is_set():
                 time.sleep(0.001)
             if self.over.is_set():
                 return
@@ -51,6 +52,6 @@ def test_a_worker_killed_in_every_stage_changes_nothing(done_site: Site, count: 
                 process.kill()
                 process.wait()
     assert outcome.code == 0
-    assert killer.killed == ["features", "matches", "verified"]
+    assert killer.killed == [*FOLDERS]
     assert done_site("run", "--workspace", work).done() == {}
     assert contents(work) == contents(done_site.work)

@@ -224,10 +224,70 @@ def test_what_lacked_a_picture_is_made_again_when_it_is_back(done_site: Site, mo
     with monkeypatch.context() as patch:
         patch.setattr(refine, "read_source", unreadable)
         outcome = done_site("adjust", "--overwrite", "--executor", "serial")
-    assert outcome.code == 1
+        assert outcome.code == 1
+        made = {path: path.stat().st_mtime_ns for path in (work.adjusted, work.refined_files)}
+        again = done_site("adjust", "--executor", "serial")
+        # What can be made without it is not made again.
+        assert again.code == 1
+        assert "cannot be read" in (work.failures).read_text()
+        assert {path: path.stat().st_mtime_ns for path in made} == made
     assert work.adjusted.read_bytes() != before[work.adjusted]
     assert done_site("adjust").code == 0
+    assert "cannot be read" not in (work.failures).read_text()
     assert {path: path.read_bytes() for path in before} == before
+
+
+@pytest.mark.slow
+def test_images_measured_in_parts_are_measured_alike(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Workspace(done_site.work)
+    files = sorted(work.refined_files.parent.iterdir())
+    before = {path: path.read_bytes() for path in files}
+    monkeypatch.setattr(refine, "_IMAGES_AT_ONCE", 2)
+    assert done_site("adjust", "--overwrite", "--executor", "serial").code == 0
+    assert {path: path.read_bytes() for path in sorted(work.refined_files.parent.iterdir())} == before
+
+
+def cut(folder: Path, pixels: NDArray[Any], places_px: FloatArray, scale: float = 1.0) -> NDArray[np.uint8]:
+    """Patches of a picture that is written and read again."""
+    import cv2
+
+    cv2.imwrite(str(folder / "a.tif"), pixels)
+    camera = Camera("SIMPLE_PINHOLE", pixels.shape[1], pixels.shape[0], (500.0, 0.0, 0.0))
+    source = Source(folder / "a.tif", None, camera, None, scale, "")
+    assert refine.cut_patches(refine.CutTask(source, places_px, folder / "patches.npy")) == len(places_px)
+    return np.asarray(np.load(folder / "patches.npy"))
+
+
+def test_pictures_of_16_bits_are_measured_like_those_of_8(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(200.0), np.arange(90.0))
+    places = np.array([[50.0, 45.0], [150.0, 45.0]])
+    wanted = np.array([0.6, -0.4])
+    made = []
+    for dx, dy in ([0, 0], wanted):
+        pixels = 4000.0 + 20.0 * surface(x - dx, y - dy, 5)
+        made.append(Patches(cut(tmp_path, pixels.round().astype(np.uint16), places), np.zeros((2, 2))))
+    shifts, held = LeastSquares()(made[0], made[1], many(np.eye(2))[:2])
+    assert held.all()
+    np.testing.assert_allclose(shifts, [wanted] * 2, atol=0.05)
+
+
+def test_reduced_images_are_measured_in_reduced_pixels(tmp_path: Path) -> None:
+    """Both at half their size: shifts of stored pixels come out, to the same share of the pixels worked on."""
+    x, y = np.meshgrid(np.arange(400.0), np.arange(300.0))
+    wanted = np.array([0.9, -0.7])
+    grid = np.stack(np.meshgrid(np.arange(80.0, 340.0, 40.0), np.arange(80.0, 240.0, 40.0)), axis=-1).reshape(-1, 2)
+    made = []
+    for dx, dy in ([0, 0], wanted):
+        pixels = 64.0 + 0.5 * surface((x - dx) * 0.5, (y - dy) * 0.5, 9)
+        made.append(Patches(cut(tmp_path, pixels.round().astype(np.uint8), grid, 0.5), off_middle(grid)))
+    shifts, held = LeastSquares()(made[0], made[1], np.broadcast_to(np.eye(2), (len(grid), 2, 2)))
+    assert held.all()
+    np.testing.assert_allclose(shifts / 0.5, np.broadcast_to(wanted, shifts.shape), atol=0.1)
+
+
+def off_middle(grid: FloatArray) -> FloatArray:
+    places = refine.in_working_frame(grid, 0.5)
+    return places - np.rint(places)
 
 
 def final(work: Workspace) -> Callable[[str], FloatArray]:

@@ -27,14 +27,15 @@ def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 
-    parent, depth = np.full(keypoints, -1, np.int64), np.full(keypoints, -1, np.int64)
+    parent, depth = np.full(keypoints, -1, np.int32), np.full(keypoints, -1, np.int32)
     if not len(ends):
         return Trees(parent, depth)
-    both = np.concatenate([ends, ends[:, ::-1]]).astype(np.int64)
+    both = np.concatenate([ends, ends[:, ::-1]]).astype(np.int32)
     order = np.lexsort((both[:, 0], -np.concatenate([scores, scores]), both[:, 1]))
     towards, nearer = both[order, 1], both[order, 0]
     degree = np.bincount(ends.ravel(), minlength=keypoints)
-    graph = sparse.coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(keypoints, keypoints))
+    there = np.ones(len(ends), np.int8)
+    graph = sparse.coo_matrix((there, (ends[:, 0], ends[:, 1])), shape=(keypoints, keypoints))
     _, point = connected_components(graph, directed=False)
     matched = np.flatnonzero(degree)
     matched = matched[np.lexsort((matched, -degree[matched], point[matched]))]

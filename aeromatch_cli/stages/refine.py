@@ -8,7 +8,7 @@ which is read once; then every image's keypoints are measured by its patches and
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -102,9 +102,10 @@ def run(context: Context) -> StageReport:
     context, _ = with_current_pairs(context)
     report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
     record = {} if context.overwrite else whole_record(context.workspace.refined_files, say=True)
-    if record.get("fingerprint") == report.fingerprint:
-        report.skipped, report.facts = report.items, record["facts"]
+    if record.get("asked") == report.fingerprint and _nothing_is_back(context, record["lacking"], report):
+        report.skipped, report.facts = report.items - len(report.failures), record["facts"]
         return report.write(context.workspace)
+    report.failures.clear()
     _remove(folder)
     with translated_os_errors(folder):
         folder.mkdir(parents=True)
@@ -117,8 +118,22 @@ def run(context: Context) -> StageReport:
     lacking = sorted({item for item, _ in report.failures})
     made = fingerprint(report.fingerprint, lacking) if lacking else report.fingerprint
     names = sorted(path.name for path in folder.glob("*.npz"))
-    write_record(context.workspace.refined_files, {"fingerprint": made, "facts": report.facts}, names)
+    head = {"asked": report.fingerprint, "fingerprint": made, "lacking": lacking, "facts": report.facts}
+    write_record(context.workspace.refined_files, head, names)
     return report.write(context.workspace)
+
+
+def _nothing_is_back(context: Context, lacking: Sequence[str], report: StageReport) -> bool:
+    """Whether images whose pictures could not be read still cannot be; then they are the failures of this run too."""
+    sources = [source_of(context, context.image_by_id[image_id]) for image_id in lacking]
+    run_stage(context, report, _read, sources, lacking)
+    report.done = 0
+    return len(report.failures) == len(lacking)
+
+
+def _read(source: Source) -> bool:
+    read_source(source, colour=False)
+    return True
 
 
 def made_fingerprint(context: Context) -> str:
@@ -150,56 +165,65 @@ def _patches(folder: Path, image_id: str) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Keypoints of the whole block, numbered through. first: image_id -> its first one. places_px, sources: of each
-    image. wanted: image_id -> numbers in the image of the keypoints that are measured or measured by. names, starts:
-    ids (N,) and first keypoints (N,) of the images, in order."""
+    """Matched keypoints of the whole block, numbered through. first: image_id -> its first one. indices: which of the
+    image's keypoints they are. places_px: (N, 2) of each image. names, starts: ids and first keypoints (N,) of the
+    images, in order. Blocks of 10,000 images have 100 million of them: hence 32 bits."""
 
     first: Mapping[str, int]
+    indices: Mapping[str, IntArray]
     places_px: Mapping[str, FloatArray]
     sources: Mapping[str, Source]
     trees: Trees
-    wanted: Mapping[str, IntArray]
     names: tuple[str, ...]
     starts: IntArray
 
     @classmethod
     def of(cls, context: Context) -> _Table:
-        places, first, count = {}, {}, 0
-        for image in context.block.images:
-            path = context.workspace.features(image.image_id)
-            if path.is_file():
-                places[image.image_id] = read_keypoints(path)[0].astype(np.float64)
-                first[image.image_id], count = count, count + len(places[image.image_id])
-        ends, scores = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+        matches, scores = [], [np.zeros(0, np.float32)]
+        used: dict[str, BoolArray] = {}
+        places = _places(context)
         for pair, entry in verified_pairs(context):
             # Without both attitudes nobody knows how one image's surroundings look in the other.
             if entry.verdict.state == "verified" and _comparable(context.geometry(pair)):
-                offsets = first[pair.image_id0], first[pair.image_id1]
-                ends.append(entry.matches.indices.astype(np.int64) + offsets)
-                scores.append(entry.matches.scores.astype(np.float64))
-        trees = trees_of(count, np.concatenate(ends), np.concatenate(scores))
-        children = np.flatnonzero(trees.parent >= 0)
-        needed = np.zeros(count, dtype=bool)
-        needed[children] = needed[trees.parent[children]] = True
-        wanted = {i: np.flatnonzero(needed[at : at + len(places[i])]) for i, at in first.items()}
-        wanted = {i: numbers for i, numbers in wanted.items() if len(numbers)}
-        sources = {i: source_of(context, context.image_by_id[i]) for i in places}
-        return cls(first, places, sources, trees, wanted, tuple(first), np.fromiter(first.values(), np.int64))
+                ids = pair.image_id0, pair.image_id1
+                for image_id, indices in zip(ids, entry.matches.indices.T, strict=True):
+                    used.setdefault(image_id, np.zeros(len(places[image_id]), dtype=bool))[indices] = True
+                matches.append((ids, entry.matches.indices.astype(np.int32)))
+                scores.append(entry.matches.scores.astype(np.float32))
+        indices = {i: np.flatnonzero(used[i]).astype(np.int32) for i in places if i in used}
+        starts = np.cumsum([0, *map(len, indices.values())])
+        first = dict(zip(indices, starts[:-1].tolist(), strict=True))
+        ends = [np.zeros((0, 2), np.int32)]
+        for ids, pair_indices in matches:
+            sides = zip(ids, pair_indices.T, strict=True)
+            ends.append(
+                np.column_stack([first[i] + np.searchsorted(indices[i], of) for i, of in sides]).astype(np.int32)
+            )
+        trees = trees_of(int(starts[-1]), np.concatenate(ends), np.concatenate(scores))
+        sources = {i: source_of(context, context.image_by_id[i]) for i in indices}
+        matched = {i: places[i][of] for i, of in indices.items()}
+        return cls(first, indices, matched, sources, trees, tuple(first), starts[:-1])
 
     def measured_by(self, image_id: str) -> dict[str, tuple[IntArray, IntArray]]:
-        """Other image -> numbers there of keypoints, and here of those that are measured by them."""
-        own = self.first[image_id] + self.wanted[image_id]
-        children = own[self.trees.parent[own] >= 0]
-        parents = self.trees.parent[children]
-        # Images without keypoints start where the next one does.
+        """Other image -> which of its matched keypoints measure which of this image's, by their places in the lists."""
+        parents = self.trees.parent[self.part(image_id)]
+        children = np.flatnonzero(parents >= 0)
+        parents = parents[children]
         of_image = np.searchsorted(self.starts, parents, side="right") - 1
         return {
-            self.names[number]: (
-                parents[of_image == number] - self.starts[number],
-                children[of_image == number] - self.first[image_id],
-            )
+            self.names[number]: (parents[of_image == number] - self.starts[number], children[of_image == number])
             for number in np.unique(of_image)
         }
+
+    def part(self, image_id: str) -> slice:
+        """The numbers of an image's keypoints."""
+        return slice(self.first[image_id], self.first[image_id] + len(self.indices[image_id]))
+
+
+def _places(context: Context) -> dict[str, FloatArray]:
+    """image_id -> stored pixels (K, 2) of the keypoints of images that have features."""
+    paths = {image.image_id: context.workspace.features(image.image_id) for image in context.block.images}
+    return {image_id: read_keypoints(path)[0] for image_id, path in paths.items() if path.is_file()}
 
 
 def _comparable(geometry: PairGeometry) -> bool:
@@ -208,19 +232,17 @@ def _comparable(geometry: PairGeometry) -> bool:
 
 
 def cut_patches(task: CutTask) -> int:
-    """Write the patches of an image, each stretched to 8 bits by itself; how many there are. Those near its edge, or
-    near what a mask hides, are empty: nothing is measured there."""
+    """Write the patches of an image; how many there are. Those near its edge, or near what a mask hides, are empty:
+    nothing is measured there."""
     pixels, valid = read_source(task.source, colour=False)
-    places = in_working_frame(task.points_px, task.source.scale)
+    places = in_working_frame(task.points_px.astype(np.float64), task.source.scale)
     side = 2 * PATCH_HALF_PX + 1
     padded = np.pad(pixels, PATCH_HALF_PX, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
     middles = np.clip(np.rint(places).astype(np.int64), 0, np.array(pixels.shape[1::-1]) - 1)
-    patches = windows[middles[:, 1], middles[:, 0]].astype(np.float32)
-    low, high = patches.min(axis=(1, 2), keepdims=True), patches.max(axis=(1, 2), keepdims=True)
-    scaled = patches if pixels.dtype == np.uint8 else (patches - low) * (255.0 / np.maximum(high - low, 1e-9))
-    scaled[~_far_inside(pixels.shape, valid, middles)] = 0.0
-    write_atomically(task.path, lambda stream: np.save(stream, np.rint(scaled).astype(np.uint8)))
+    patches = windows[middles[:, 1], middles[:, 0]]
+    patches[~_far_inside(pixels.shape, valid, middles)] = 0
+    write_atomically(task.path, lambda stream: np.save(stream, patches))
     return len(patches)
 
 
@@ -244,25 +266,27 @@ def _measured(context: Context, table: _Table, recipe: LeastSquares, report: Sta
     """Of all keypoints of the block. Patches are there as long as they are needed: those of 10,000 images would fill a
     disk."""
     folder = context.workspace.refined_files.parent
-    by = {image_id: table.measured_by(image_id) for image_id in table.wanted}
+    by = {image_id: table.measured_by(image_id) for image_id in table.names}
     batches = [list(by)[at : at + _IMAGES_AT_ONCE] for at in range(0, len(by), _IMAGES_AT_ONCE)]
     needed = [sorted({*batch, *(other for image_id in batch for other in by[image_id])}) for batch in batches]
     last = {image_id: number for number, names in enumerate(needed) for image_id in names}
     found, cut = Measured.nothing(len(table.trees.parent)), set[str]()
     for number, batch in enumerate(batches):
         new = [image_id for image_id in needed[number] if image_id not in cut]
-        cuts = [CutTask(table.sources[i], table.places_px[i][table.wanted[i]], _patches(folder, i)) for i in new]
+        cuts = [CutTask(table.sources[i], table.places_px[i], _patches(folder, i)) for i in new]
+        part = f"{number + 1} of {len(batches)} parts: " if len(batches) > 1 else ""
+        context = replace(context, part=part)
         run_stage(context, report, cut_patches, cuts, new)
         cut.update(new)
         tasks = [_task(context, table, recipe, image_id, by[image_id]) for image_id in batch]
         tasks = [task for task in tasks if task.by]
-        outcomes = context.executor.run(measure, tasks, report.stage)
+        outcomes = context.executor.run(measure, tasks, part + report.stage)
         for task, outcome in zip(tasks, outcomes, strict=True):
             if outcome.value is None:
                 report.failures.append((task.image_id, outcome.error))
                 continue
             own = np.concatenate([one.own_patches for one in task.by])
-            found.set(table.first[task.image_id] + table.wanted[task.image_id][own], outcome.value)
+            found.set(table.first[task.image_id] + own, outcome.value)
         for image_id in needed[number]:
             if last[image_id] == number:
                 _patches(folder, image_id).unlink(missing_ok=True)
@@ -279,13 +303,8 @@ def _task(
         if not (_patches(folder, other).is_file() and _patches(folder, image_id).is_file()):
             continue  # its picture could not be read
         scales |= {i: table.sources[i].scale for i in (other, image_id)}
-        parts.append(
-            ByImage(
-                other, np.searchsorted(table.wanted[other], numbers),
-                np.searchsorted(table.wanted[image_id], own_numbers), table.places_px[other][numbers],
-                table.places_px[image_id][own_numbers], _geometry(context, other, image_id),
-            )
-        )  # fmt: skip
+        places = table.places_px[other][numbers], table.places_px[image_id][own_numbers]
+        parts.append(ByImage(other, numbers, own_numbers, *places, _geometry(context, other, image_id)))
     return MeasureTask(image_id, tuple(parts), recipe, folder, scales)
 
 
@@ -302,9 +321,10 @@ def measure(task: MeasureTask) -> Measured:
     for one in task.by:
         other = np.load(_patches(task.folder, one.image_id), mmap_mode="r")
         scale, own_scale = task.scales[one.image_id], task.scales[task.image_id]
-        matrices = level_affinities(one.geometry, one.places_px, one.own_places_px)
-        first = _with_places(other[one.patches], in_working_frame(one.places_px, scale))
-        second = _with_places(own[one.own_patches], in_working_frame(one.own_places_px, own_scale))
+        places, own_places = one.places_px.astype(np.float64), one.own_places_px.astype(np.float64)
+        matrices = level_affinities(one.geometry, places, own_places)
+        first = _with_places(other[one.patches], in_working_frame(places, scale))
+        second = _with_places(own[one.own_patches], in_working_frame(own_places, own_scale))
         shifts, held = task.recipe(first, second, matrices * (own_scale / scale))
         parts.append((shifts / own_scale, held, matrices))
     return Measured(*(np.concatenate(values) for values in zip(*parts, strict=True)))
@@ -320,16 +340,18 @@ def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquare
     trees = replace(table.trees, depth=_depths(table.trees, found.held))
     moved = shifts_through(trees, found.matrices, found.shifts_px)
     scales = np.ones(len(moved))
-    for image_id, places in table.places_px.items():
-        at = table.first[image_id]
-        scales[at : at + len(places)] = table.sources[image_id].scale
+    for image_id in table.names:
+        scales[table.part(image_id)] = table.sources[image_id].scale
     held = found.held & (np.linalg.norm(moved, axis=1) * scales <= recipe.max_shift_px)
     moved[~held] = 0.0
-    for image_id, places in table.places_px.items():
-        part = slice(table.first[image_id], table.first[image_id] + len(places))
+    for image_id, detected in _places(context).items():
+        places, measured = detected.astype(np.float64), np.zeros(len(detected), dtype=bool)
+        if image_id in table.first:
+            part, indices = table.part(image_id), table.indices[image_id]
+            places[indices] += moved[part]
+            measured[indices] = held[part] | (table.trees.depth[part] == 0)
         features = known_fingerprint(context.workspace.features(image_id)) or ""
-        values = places + moved[part], held[part] | (table.trees.depth[part] == 0), features
-        write_atomically(context.workspace.refined(image_id), partial(_written, values))
+        write_atomically(context.workspace.refined(image_id), partial(_written, (places, measured, features)))
     lengths = np.linalg.norm(moved[held], axis=1)
     return {
         "keypoints": int((table.trees.depth > 0).sum()),
