@@ -8,8 +8,10 @@ from typing import BinaryIO
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.archives import load_arrays, save_arrays
-from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
+from aeromatch_cli.formats.features import checked_keypoints, known_fingerprint, read_keypoints
+from aeromatch_cli.formats.reading import say_damaged
 
 
 def write_refined(stream: BinaryIO, keypoints_px: FloatArray, measured: BoolArray, fingerprint: str) -> None:
@@ -24,8 +26,25 @@ def read_final_keypoints(features: Path, refined: Path) -> FloatArray:
     an image without features. Raises BrokenFileError where a file is broken."""
     if not features.is_file():
         return np.zeros((0, 2), np.float32)
-    if refined.is_file():
-        found = load_arrays(refined, ("keypoints_px", "fingerprint"))
-        if str(found["fingerprint"]) == known_fingerprint(features):
-            return found["keypoints_px"]
-    return read_keypoints(features)[0]
+    places = _measured(refined, known_fingerprint(features))
+    return read_keypoints(features)[0] if places is None else places
+
+
+def checked_final_keypoints(features: Path, refined: Path) -> tuple[str, FloatArray | None]:
+    """Fingerprint of the features and the same places; "" and None, and a word, where the features are broken. Where
+    the other file is, a word, and where the detector put the keypoints."""
+    fingerprint, detected = checked_keypoints(features)
+    try:
+        places = None if detected is None else _measured(refined, fingerprint)
+    except BrokenFileError as error:
+        say_damaged(refined, error)
+        return fingerprint, detected
+    return fingerprint, detected if places is None else places
+
+
+def _measured(refined: Path, fingerprint: str | None) -> FloatArray | None:
+    """None where none are there of the features with this fingerprint."""
+    if not refined.is_file():
+        return None
+    found = load_arrays(refined, ("keypoints_px", "fingerprint"))
+    return found["keypoints_px"] if str(found["fingerprint"]) == fingerprint else None

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats.features import checked_keypoints, read_keypoints
+from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.coverage import cells_of
@@ -139,7 +139,7 @@ def _found(stretch: Stretch) -> _Found:
 
     @lru_cache(maxsize=_IMAGES_AT_HAND)
     def features(image_id: str) -> tuple[str, FloatArray | None]:
-        return checked_keypoints(context.workspace.features(image_id))
+        return checked_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
     candidates = DrawnMatches(context.workspace, features)
     for pair, entry in final_pairs(context, lambda image_id: features(image_id)[0]):
@@ -165,8 +165,9 @@ def _found(stretch: Stretch) -> _Found:
 
 def _keypoints(context: Context, image_id: str) -> FloatArray | None:
     """(K, 2), or None where the image has no readable features."""
+    path = context.workspace.features(image_id)
     try:
-        return read_keypoints(context.workspace.features(image_id))[0]
+        return read_final_keypoints(path, context.workspace.refined(image_id)) if path.is_file() else None
     except WorkspaceError:
         return None
 

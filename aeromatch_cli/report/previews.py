@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ItemError, WorkspaceError
-from aeromatch_cli.formats.features import checked_keypoints, read_keypoints
+from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import read_pixels
@@ -75,7 +75,9 @@ class DrawnMatches:
     def __init__(self, workspace: Workspace, features: Features | None = None) -> None:
         """features: of an image, by default from its file."""
         self._workspace = workspace
-        self._features = features or lru_cache(_KEPT)(lambda i: checked_keypoints(workspace.features(i)))
+        self._features = features or lru_cache(_KEPT)(
+            lambda i: checked_final_keypoints(workspace.features(i), workspace.refined(i))
+        )
         self._verified = lru_cache(_KEPT)(lambda image_id: read_verified_row(workspace.verified(image_id)))
         self._matched = lru_cache(_KEPT)(lambda image_id: read_match_row(workspace.matches(image_id)))
 
@@ -102,7 +104,8 @@ class DrawnMatches:
     def _keypoints(self, image_id: str) -> FloatArray:
         known = self._features(image_id)[1]
         # What cannot be read says so itself.
-        return read_keypoints(self._workspace.features(image_id))[0] if known is None else known
+        paths = self._workspace.features(image_id), self._workspace.refined(image_id)
+        return read_final_keypoints(*paths) if known is None else known
 
 
 def error_classes(errors_px: FloatArray | None, count: int) -> IntArray:

@@ -18,8 +18,8 @@ from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, P
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
-from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.reading import readable
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
@@ -105,8 +105,7 @@ class _Work:
         return (exact or fitting)[0]
 
     def keypoints_px(self, image_id: str) -> FloatArray:
-        path = self.workspace.features(image_id)
-        return read_keypoints(path)[0] if path.is_file() else np.zeros((0, 2), np.float32)
+        return read_final_keypoints(self.workspace.features(image_id), self.workspace.refined(image_id))
 
     def final(self, pair: Pair) -> VerifiedEntry | None:
         found = read_verified_row(self.workspace.verified(pair.image_id0)).get(pair.image_id1)
