@@ -374,6 +374,18 @@ def test_the_time_to_the_end_is_estimated_from_the_stages_that_did_something(mon
     assert capsys.readouterr().err.endswith("10 s left; about 3 min to the end\n")
 
 
+def test_the_end_does_not_come_before_that_of_the_present_part(monkeypatch, capsys):
+    """Matching of 1 s, then 100 s for half of a report: 100 s are left of it alone."""
+    times = iter([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 101.0, 101.0])
+    monkeypatch.setattr("aeromatch_cli.cli.progress.time.monotonic", lambda: next(times))
+    progress = LineProgress(RUN_STAGES)
+    progress.start("match", 1)
+    progress.advance()
+    progress.start("step learned: report", 2)
+    progress.advance()
+    assert capsys.readouterr().err.endswith("2 min left; about 2 min to the end\n")
+
+
 def test_options_are_taken_from_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("AEROMATCH_IMAGES", str(tmp_path / "nothing"))
     monkeypatch.setenv("AEROMATCH_QUIET", "1")

@@ -45,10 +45,12 @@ class _Course:
         self._reached = 0.0  # of the present stage, 0-1
         self._known = 0.0  # shares of the stages that have done something before
         self._first: float | None = None
+        self._part_begun = 0.0
 
     def begin(self, label: str) -> str:
         """`match` as `4/9 match`. Parts of a stage begin with its name or end with it."""
-        self._first = self._first or time.monotonic()
+        self._part_begun = time.monotonic()
+        self._first = self._first or self._part_begun
         words = label.replace(":", " ").split()
         first_pass = words[:2] == ["first", "pass"]
         own = "orient" if first_pass else next((w for w in (words[-1], words[0]) if w in self._stages), "")
@@ -71,7 +73,12 @@ class _Course:
         done = self._known + own * self._reached
         later = sum(_SHARES[name] for name in self._stages[self._place + 1 :])
         rest = own * (1.0 - self._reached) + later
-        return (time.monotonic() - self._first) / done * rest if done > 0.0 else None
+        if done <= 0.0:
+            return None
+        now = time.monotonic()
+        # Shares are those of other blocks: what is left of the present part alone may already be more.
+        part_s = (now - self._part_begun) * (1.0 - fraction) / fraction if fraction > 0.0 else 0.0
+        return max((now - self._first) / done * rest, part_s)
 
 
 def _words(seconds: float) -> str:
