@@ -27,7 +27,7 @@ _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (4.527, 2.308, 0.987, -0.269, -1.323, -2.362)
+WEIGHTS = (4.387, 2.393, 0.989, -0.211, -1.295, -2.525)
 
 
 @dataclass(frozen=True, eq=False)

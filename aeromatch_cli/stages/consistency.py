@@ -31,7 +31,7 @@ from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
 
-VERSION = 6
+VERSION = 7
 _NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 
