@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Verdict
 from aeromatch_cli.geometry.cameras import normalise
 
 # Camera axes (x right, y down, z forward) of a camera that looks straight down, where no attitude is known.
 _NADIR = np.diag([1.0, -1.0, -1.0])
+
+
+def placed_alone(
+    verdict: Verdict,
+    image_ids: tuple[str, str],
+    cameras: tuple[Camera, Camera],
+    points_px: tuple[FloatArray, FloatArray],
+    attitude0: FloatArray | None,
+) -> AdjustedBlock | None:
+    """`block_of_pair` by what verified the pair; None where that is no relative orientation."""
+    if verdict.model_kind != "E" or verdict.relative_rotation is None:
+        return None
+    return block_of_pair(image_ids, cameras, points_px, verdict.model, verdict.relative_rotation, attitude0)
 
 
 def block_of_pair(

@@ -91,18 +91,15 @@ def contradicting(
     its own geometry, as the block lacks one of its images, the matches are judged by that.
     """
     settled = Settled.of(block, cameras, keypoints_px, pairs, limits)
-    found = [
-        np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
-        for pair, mask in zip(pairs, settled.masks, strict=True)
-    ]
+    masks: list[BoolArray | None] = settled.masks
     left: list[FloatArray] = [np.zeros(0)]
     if limits.min_probability > 0.0:
-        known = settled.evidence()
-        for n, pair in enumerate(pairs):
-            if settled.masks[n] is None and pair.alone is not None and len(pair.indices):
-                own = Settled.of(pair.alone, cameras, keypoints_px, [pair], replace(limits, epipolar_px=np.inf))
-                known[n] = own.evidence()[0]
-                found[n] = found[n] if own.masks[0] is None else own.masks[0].copy()
+        masks, known = settled.with_lone_pairs(cameras, keypoints_px, limits)
+    found = [
+        np.zeros(len(pair.indices), dtype=bool) if mask is None else mask.copy()
+        for pair, mask in zip(pairs, masks, strict=True)
+    ]
+    if limits.min_probability > 0.0:
         usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
         likely = [None if evidence is None else probabilities(evidence, usual_px) for evidence in known]
         ends = [(pair.image_id0, pair.image_id1) for pair in pairs]
@@ -148,6 +145,17 @@ class Settled:
             group = {image_id: number for image_id, number in group.items() if image_id not in worse}
         # So many images in wrong places: the block itself is no judge.
         return cls(view, pairs, [None] * len(pairs), doubtful)
+
+    def with_lone_pairs(
+        self, cameras: Mapping[str, Camera], keypoints_px: Callable[[str], FloatArray], limits: Limits
+    ) -> tuple[list[BoolArray | None], list[MatchEvidence | None]]:
+        """masks and `evidence` of all pairs; those that the block lacks are judged by their own geometry."""
+        masks, known = list(self.masks), self.evidence()
+        for n, pair in enumerate(self.pairs):
+            if masks[n] is None and pair.alone is not None and len(pair.indices):
+                own = Settled.of(pair.alone, cameras, keypoints_px, [pair], replace(limits, epipolar_px=np.inf))
+                masks[n], known[n] = own.masks[0], own.evidence()[0]
+        return masks, known
 
     def evidence(self) -> list[MatchEvidence | None]:
         """Of every pair, what tells how probable the matches that do not contradict the block are, by each other alone;

@@ -27,7 +27,7 @@ _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (4.387, 2.393, 0.989, -0.211, -1.295, -2.525)
+WEIGHTS = (4.387, 2.393, 0.989, 0.0, -0.211, -1.295, -2.525)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +88,20 @@ def off_neighbours_px(
 
 
 def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
-    """(M, 6) what the model is linear in: one, score, confirmations by third images, angle between the rays, distance
-    from the neighbours' heights, and how loose the whole pair is. usual_px: `usual_off_px` of the block."""
+    """(M, 7) what the model is linear in: one, score, confirmations by third images, those of the whole pair, angle
+    between the rays, distance from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the
+    block. What no third image confirms is doubtful where third images confirm most others, not where none could."""
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
     off = evidence.off_px / unit_px
     tight_px = max(_LOOSE * usual_px, _LEAST_LOOSE_PX)
     loose = float(np.log2(max(float(np.median(evidence.off_px)), tight_px) / tight_px))
+    confirmed = np.sqrt(np.minimum(evidence.confirming, _MOST_CONFIRMING))
     return np.column_stack(
         [
             np.ones(len(off)),
             evidence.scores,
-            np.sqrt(np.minimum(evidence.confirming, _MOST_CONFIRMING)),
+            confirmed,
+            np.full(len(off), confirmed.mean()),
             np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
             np.log2(1.0 + np.minimum(off, _MOST_OFF)),
             np.full(len(off), loose),
@@ -107,7 +110,7 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities of matches with such `columns` (M, 6)."""
+    """(M,) probabilities of matches with such `columns` (M, 7)."""
     return _logistic(values @ np.array(WEIGHTS))
 
 
@@ -117,7 +120,7 @@ def probabilities(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Weights of `columns` (M, 7) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = _logistic(values @ weights)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
-from aeromatch_cli.orientation.alone import block_of_pair
+from aeromatch_cli.orientation.alone import placed_alone
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.remaining import without_dropped
 from aeromatch_cli.stages import adjust, orient
@@ -108,16 +108,14 @@ def _matched(
     entry: VerifiedEntry,
 ) -> MatchedKeypoints:
     """The matches of a verified pair; with its own geometry where the adjusted block lacks one of its images."""
-    ids, indices = (pair.image_id0, pair.image_id1), entry.matches.indices
-    verdict, alone = entry.verdict, None
-    calibrated = verdict.model_kind == "E" and verdict.relative_rotation is not None
-    if calibrated and not set(ids) <= adjusted.poses.keys() and _judges_pairs(context):
+    ids, indices, alone = (pair.image_id0, pair.image_id1), entry.matches.indices, None
+    if not set(ids) <= adjusted.poses.keys() and _judges_pairs(context):
         pose = context.block.poses.get(ids[0])
         cameras = [context.block.cameras[context.image_by_id[i].camera_id] for i in ids]
         points = [keypoints_px(i)[indices[:, side]] for side, i in enumerate(ids)]
-        alone = block_of_pair(
-            ids, (cameras[0], cameras[1]), (points[0], points[1]), verdict.model,
-            cast("FloatArray", verdict.relative_rotation), None if pose is None else pose.world_rotation,
+        alone = placed_alone(
+            entry.verdict, ids, (cameras[0], cameras[1]), (points[0], points[1]),
+            None if pose is None else pose.world_rotation,
         )  # fmt: skip
     return MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
 

@@ -1,7 +1,8 @@
 """How far the probability that a match is right can be relied on, on rendered blocks, by exact truth.
 
 Every block is one `aeromatch run auto` with its noisy poses. Of the verified matches, before any is dropped, that do
-not contradict the adjusted block, `aeromatch_cli.orientation.probability` says how likely each is to be right:
+not contradict the adjusted block (or, of images that it lacks, the geometry of their pair),
+`aeromatch_cli.orientation.probability` says how likely each is to be right:
 within 3 px of the exact place, which both images see. Stated: the mean of what it says; right: the share that is.
 Left: of the right ones, those that are stated to be at least as likely as asked (--least), and the share of right ones
 among all that are left.
@@ -15,21 +16,22 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.formats.adjusted import read_adjusted
-from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
-from aeromatch_cli.formats.tables import read_images
+from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
+from aeromatch_cli.orientation.alone import placed_alone
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
-from aeromatch_cli.orientation.probability import columns, fitted_weights, stated, usual_off_px
+from aeromatch_cli.orientation.probability import WEIGHTS, columns, fitted_weights, stated, usual_off_px
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import Workspace
@@ -42,6 +44,7 @@ from benchmarks.whole import whole_run
 
 _EDGES = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
 _SIZE_IN = (5.0, 4.6)
+_NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 Block = tuple[str, FloatArray, BoolArray]
 
@@ -51,7 +54,7 @@ def block_of(args: argparse.Namespace, scene: str, flight: str, seed: int) -> Bl
     name = f"{scene}:{flight}, seed {seed}"
     work = args.out / "runs" / f"{scene}-{flight}-{seed}"
     block = render_asked(args, scene, flight=flight, seed=seed)
-    if not (work / "orientation" / "adjusted.npz").is_file():
+    if not (work / "finished.json").is_file():
         given = ["--poses", str(block / NOISY_POSES), "--cameras", str(block / "block.json"), "--crs", "local"]
         settings = [f"extract.keypoints={args.keypoints}", f"cascade.learned.keypoints={args.keypoints}"]
         run = whole_run("run", "auto", block / "images", work, extra=given, jobs=args.jobs, settings=settings)
@@ -64,23 +67,20 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
     """`columns` of all matches of a workspace that do not contradict its adjusted block, and which are right."""
     truth = open_truth(truth_folder)
     images = {image.image_id: image for image in read_images(workspace.images)}
-    block = read_adjusted(workspace.adjusted)
-    cameras = {image_id: block.cameras[image.camera_id] for image_id, image in images.items()}
-    keypoints = {image_id: np.asarray(read_keypoints(workspace.features(image_id))[0], float) for image_id in images}
-    pairs = [
-        MatchedKeypoints(image_id, entry.image_id1, entry.matches.indices, entry.matches.scores)
-        for image_id in sorted(images)
-        if workspace.verified(image_id).is_file()
-        for entry in read_verified_row(workspace.verified(image_id)).values()
-        if entry.verdict.state == "verified"
-    ]
+    block = read_adjusted(workspace.adjusted) if workspace.adjusted.is_file() else _NO_BLOCK
+    of_ids = {**read_cameras(workspace.cameras), **block.cameras}
+    cameras = {image_id: of_ids[image.camera_id] for image_id, image in images.items()}
+    keypoints = {
+        i: np.asarray(read_final_keypoints(workspace.features(i), workspace.refined(i)), float) for i in images
+    }
+    pairs = list(_pairs(workspace, block, cameras, keypoints))
     recipe = BlockConsistency()
     limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
-    parts, right = [], []
+    parts, right = [np.zeros((0, len(WEIGHTS)))], [np.zeros(0, dtype=bool)]
     settled = Settled.of(block, cameras, keypoints.__getitem__, pairs, limits)
-    known = settled.evidence()
+    masks, known = settled.with_lone_pairs(cameras, keypoints.__getitem__, limits)
     usual_px = usual_off_px(evidence for evidence in known if evidence is not None)
-    for pair, mask, evidence in zip(pairs, settled.masks, known, strict=True):
+    for pair, mask, evidence in zip(pairs, masks, known, strict=True):
         if mask is None or evidence is None:
             continue
         ends = pair.image_id0, pair.image_id1
@@ -89,6 +89,25 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
         parts.append(columns(evidence, usual_px))
         right.append((np.nan_to_num(errors_px, nan=np.inf) <= CORRECT_PX) & ~hidden)
     return np.concatenate(parts), np.concatenate(right)
+
+
+def _pairs(
+    workspace: Workspace, block: AdjustedBlock, cameras: Mapping[str, Camera], keypoints: Mapping[str, FloatArray]
+) -> Iterator[MatchedKeypoints]:
+    """All verified ones, those that the block lacks with their own geometry."""
+    poses = read_poses(workspace.poses)
+    for image_id in sorted(cameras):
+        path = workspace.verified(image_id)
+        for entry in read_verified_row(path).values() if path.is_file() else ():
+            if entry.verdict.state != "verified":
+                continue
+            ids, indices, alone = (image_id, entry.image_id1), entry.matches.indices, None
+            if not set(ids) <= block.poses.keys():
+                both = cameras[ids[0]], cameras[ids[1]]
+                points = keypoints[ids[0]][indices[:, 0]], keypoints[ids[1]][indices[:, 1]]
+                attitude = poses[image_id].world_rotation if image_id in poses else None
+                alone = placed_alone(entry.verdict, ids, both, points, attitude)
+            yield MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
 
 
 def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]:

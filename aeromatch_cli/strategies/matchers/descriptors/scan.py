@@ -137,7 +137,8 @@ def _outside(limits: Limits) -> Callable[[int, int], BoolArray]:
     def outside(start: int, stop: int) -> BoolArray:
         values, mask, second = value[: stop - start], flags[: stop - start], other[: stop - start]
         for (of_queries, of_targets), answer in zip(factors, (mask, second), strict=True):
-            np.matmul(of_queries[start:stop], of_targets, out=values)
+            with np.errstate(invalid="ignore", over="ignore"):
+                np.matmul(of_queries[start:stop], of_targets, out=values)
             np.abs(values, out=values)
             np.less_equal(values, 1.0, out=answer)
         np.logical_and(mask, second, out=mask)
