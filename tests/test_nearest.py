@@ -214,6 +214,7 @@ def test_places_that_are_unknown_lie_outside_every_limit():
     for forms, places in (
         (anywhere, [[np.nan, 0.0], [0.0, 0.0]]),
         (np.where([[[True]], [[False]]], np.nan, anywhere), [[0.0, 0.0], [0.0, 0.0]]),
+        (np.where([[[True]], [[False]]], np.inf, anywhere), [[0.0, 0.0], [0.0, 0.0]]),
     ):
         rows, columns, _ = mutual_nearest(d0, d1, np.arange(2), ratio=0.9, limits=Limits(forms, np.array(places)))
         assert list(zip(rows, columns, strict=True)) == [(1, 1)]

@@ -51,6 +51,12 @@ def test_a_doubtful_match_without_support_falls_below_the_least_probability_of_a
     assert probability(scores=0.05, confirming=0.0, off0_px=6.0, off1_px=6.0) < 0.5
 
 
+def test_what_no_third_image_confirms_is_doubtful_only_where_others_are_confirmed() -> None:
+    """Two images whose ground no third one shows: nothing can confirm any of their matches."""
+    lone = replace(USUAL, confirming=np.zeros(11))
+    assert probabilities(lone, USUAL_PX)[0] > probability(confirming=0.0) + 0.01
+
+
 def test_distances_count_by_what_is_usual_in_the_pair() -> None:
     rough = replace(USUAL, off0_px=np.full(11, 2.0), error_px=np.full(11, 1.2))
     np.testing.assert_allclose(probabilities(rough, 2.0), probabilities(USUAL, USUAL_PX), atol=1e-3)
