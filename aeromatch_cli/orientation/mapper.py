@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,6 +25,7 @@ from aeromatch_cli.orientation.adjusting import (
     drop_weak_images,
     reset_lenses,
 )
+from aeromatch_cli.orientation.flips import turned_back
 from aeromatch_cli.orientation.process import quiet_pycolmap
 from aeromatch_cli.orientation.results import arrays, figures
 
@@ -64,7 +66,11 @@ def solve(folder: Path) -> None:
             continue
         observed = priors["positions_m"], priors["sigmas_m"]
         ups = believed_tilts(pycolmap, model, *observed, priors["ups"], priors["rotations"])
-        placement = adjusted(pycolmap, model, task["cameras"], *observed, ups, _COST_TOLERANCE)
+        adjust = partial(
+            adjusted, pycolmap, cameras=task["cameras"], positions_m=observed[0], sigmas_m=observed[1], ups=ups,
+            tolerance=_COST_TOLERANCE,
+        )  # fmt: skip
+        model, placement = turned_back(pycolmap, model, adjust(model), *observed, adjust)
         reset_lenses(model, task["cameras"])  # few points determine no lens
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
