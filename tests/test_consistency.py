@@ -115,12 +115,12 @@ def test_improbable_matches_are_dropped_where_that_is_asked(truth: Truth) -> Non
     scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
     changed = [replace(pairs[0], indices=wrong, scores=scores)]
     block = held_together(truth, [set(truth.block.poses)])
-    for limits, least, most in ((LIMITS, 0.0, 0.1), (replace(LIMITS, min_probability=0.12), 0.7, 1.0)):
+    for limits, least, most in ((LIMITS, 0.0, 0.1), (replace(LIMITS, min_probability=0.35), 0.7, 1.0)):
         found = contradicting(block, cameras(truth), keypoints.__getitem__, changed, limits)
         assert least <= found.masks[0][:WRONG].mean() <= most
         assert found.masks[0][WRONG:].mean() < 0.15
     assert found.expected_right is not None
-    assert 0.12 < found.expected_right < 0.8
+    assert 0.35 < found.expected_right < 0.9
 
 
 def test_pairs_that_the_block_does_not_hold_together_are_not_judged(truth: Truth) -> None:
@@ -227,7 +227,7 @@ def test_improbable_matches_of_a_pair_that_no_block_holds_are_dropped(truth: Tru
     scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
     pair = replace(pairs[0], indices=wrong, scores=scores, alone=alone(truth, keypoints, wrong))
     nothing = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
-    limits = replace(LIMITS, min_probability=0.12)
+    limits = replace(LIMITS, min_probability=0.35)
     found = contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], limits)
     held = contradicting(
         held_together(truth, [set(truth.block.poses)]), cameras(truth), keypoints.__getitem__, [pair], limits

@@ -349,7 +349,6 @@ def _of_pair(view: _Rays, ties: _Ties, ends0: IntArray, ends1: IntArray, scores:
         confirming=confirming,
         off0_px=off_neighbours_px(*side0, *side1, heights_m, float(view.focal_px[image1])),
         off1_px=off_neighbours_px(*side1, *side0, heights_m, float(view.focal_px[image0])),
-        angle_deg=np.rad2deg(meeting.angle_rad),
     )
 
 

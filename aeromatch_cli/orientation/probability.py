@@ -16,8 +16,8 @@ from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 # Distances count in multiples of the pair's median distance from epipolar lines, which is at least so many pixels: some
 # images are held less exactly than others.
 _LEAST_UNIT_PX = 0.3
-# Beyond these, more says nothing more: images, units, degrees.
-_MOST_CONFIRMING, _MOST_OFF, _MOST_ANGLE_DEG = 4, 50.0, 60.0
+# Beyond these, more says nothing more: images, units.
+_MOST_CONFIRMING, _MOST_OFF = 4, 50.0
 # A pair whose median distance from the neighbours' heights is more than so many times that of the block's matches, and
 # more than so many pixels, is loose: where the light on relief has moved with the sun, keypoints of either image lie on
 # what moved, and agree with their neighbours and with third images all the same.
@@ -27,7 +27,7 @@ _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (4.387, 2.393, 0.989, 0.0, -0.211, -1.295, -2.525)
+WEIGHTS = (5.086, 2.229, 1.158, -0.801, -1.279, -1.821)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class MatchEvidence:
     scores: the matcher's, 0-1. error_px: distance from the epipolar line of the adjusted block. confirming: in how many
     third images their keypoints are matched within a pixel of the point's place. off0_px, off1_px: how far the match
     lies from where it would be at the height of its neighbours (the second nearest of these heights), with the
-    neighbours in either image. angle_deg: between both rays.
+    neighbours in either image.
     """
 
     scores: FloatArray
@@ -45,7 +45,6 @@ class MatchEvidence:
     confirming: IntArray
     off0_px: FloatArray
     off1_px: FloatArray
-    angle_deg: FloatArray
 
     @property
     def off_px(self) -> FloatArray:
@@ -88,9 +87,10 @@ def off_neighbours_px(
 
 
 def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
-    """(M, 7) what the model is linear in: one, score, confirmations by third images, those of the whole pair, angle
-    between the rays, distance from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the
-    block. What no third image confirms is doubtful where third images confirm most others, not where none could."""
+    """(M, 6) what the model is linear in: one, score, confirmations by third images, those of the whole pair, distance
+    from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the block.
+
+    What no third image confirms is doubtful where third images confirm most others, not where none could."""
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
     off = evidence.off_px / unit_px
     tight_px = max(_LOOSE * usual_px, _LEAST_LOOSE_PX)
@@ -102,7 +102,6 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
             evidence.scores,
             confirmed,
             np.full(len(off), confirmed.mean()),
-            np.minimum(evidence.angle_deg, _MOST_ANGLE_DEG) / _MOST_ANGLE_DEG,
             np.log2(1.0 + np.minimum(off, _MOST_OFF)),
             np.full(len(off), loose),
         ]
@@ -110,7 +109,7 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def stated(values: FloatArray) -> FloatArray:
-    """(M,) probabilities of matches with such `columns` (M, 7)."""
+    """(M,) probabilities of matches with such `columns` (M, 6)."""
     return _logistic(values @ np.array(WEIGHTS))
 
 
@@ -120,7 +119,7 @@ def probabilities(evidence: MatchEvidence, usual_px: float) -> FloatArray:
 
 
 def fitted_weights(values: FloatArray, right: BoolArray) -> FloatArray:
-    """Weights of `columns` (M, 7) by maximum likelihood (Newton's method), given which matches (M,) are right."""
+    """Weights of `columns` (M, 6) by maximum likelihood (Newton's method), given which matches (M,) are right."""
     weights = np.zeros(values.shape[1])
     for _ in range(50):
         p = _logistic(values @ weights)
