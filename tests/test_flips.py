@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
 from aeromatch_cli.orientation.adjusting import adjusted
 from aeromatch_cli.orientation.flips import _Other, other_pose, turned_back
 from aeromatch_cli.orientation.placing import Placement
@@ -94,8 +94,7 @@ def test_an_image_that_is_turned_over_is_turned_back(exact: pycolmap.Reconstruct
     )  # fmt: skip
     relative = exact.images[AFAR].cam_from_world() * exact.images[2].cam_from_world().inverse()
     again = found.images[AFAR].cam_from_world() * found.images[2].cam_from_world().inverse()
-    turn = relative.rotation.matrix().T @ again.rotation.matrix()
-    assert np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))) < 1.0
+    assert angle_between_deg(relative.rotation.matrix(), again.rotation.matrix()) < 1.0
 
 
 @pytest.mark.parametrize("positions_m", [CENTERS_M, NOWHERE], ids=["positions", "nothing"])

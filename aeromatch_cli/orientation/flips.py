@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.orientation.placing import Placement
 from aeromatch_cli.orientation.results import centers_of, image_numbers
 
@@ -128,12 +129,11 @@ class _Other:
         pixels, points_m = (np.array(values, dtype=np.float64) for values in zip(*seen, strict=True))
         camera, present = model.cameras[image.camera_id], image.cam_from_world()
         start = pycolmap.Rigid3d(other_pose(present.matrix(), points_m))
-        found = pycolmap.refine_absolute_pose(start, pixels, points_m, np.ones(len(pixels), dtype=bool), camera)
-        if found is None:
+        if _apart_deg(start, present) < _DIFFERENT_DEG:  # it looks straight down
             return None
-        pose = found["cam_from_world"]
-        turn = pose.rotation.matrix() @ present.rotation.matrix().T
-        if np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))) < _DIFFERENT_DEG:
+        found = pycolmap.refine_absolute_pose(start, pixels, points_m, np.ones(len(pixels), dtype=bool), camera)
+        pose = None if found is None else found["cam_from_world"]
+        if pose is None or _apart_deg(pose, present) < _DIFFERENT_DEG:
             return None
         errors_px = [np.linalg.norm(camera.img_from_cam(one * points_m) - pixels, axis=1) for one in (pose, present)]
         return cls(number, pose, float(np.median(errors_px[0])), float(np.median(errors_px[1])))
@@ -142,6 +142,10 @@ class _Other:
         """Give the image of a model this pose."""
         image = model.images[self.number]
         image.frame.set_cam_from_world(image.camera_id, self.pose)
+
+
+def _apart_deg(pose: Any, other: Any) -> float:
+    return angle_between_deg(pose.rotation.matrix(), other.rotation.matrix())
 
 
 def other_pose(pose: FloatArray, points_m: FloatArray) -> FloatArray:
