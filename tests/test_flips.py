@@ -13,64 +13,92 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
 from aeromatch_cli.orientation.adjusting import adjusted
-from aeromatch_cli.orientation.flips import _Other, other_pose, turned_back
+from aeromatch_cli.orientation.flips import Upright, _Other, other_pose, turned_back
 from aeromatch_cli.orientation.placing import Placement
 
-# Straight down from 100 m; the last one, with a long lens, from 400 m away and 25 degrees off the vertical.
-CENTERS_M = np.array([[-30, 0, 100], [0, 5, 105], [30, -5, 95], [-15, 20, 100], [15, -25, 102], [175, 0, 370]], float)
-PHI_DEG = (0.0, 0.0, 0.0, 0.0, 0.0, 25.3)
-AFAR = len(CENTERS_M)
-SIGMAS_M = np.full(AFAR, 5.0)
+# Straight down from 100 m; the last two, with a long lens, from 400 m away and 25 degrees off the vertical.
+NEAR_M = np.array([[-30, 0, 100], [0, 5, 105], [30, -5, 95], [-15, 20, 100], [15, -25, 102]], float)
+AFAR_M = np.array([[175, 0, 370], [-175, 10, 370]], float)
+AFAR_DEG = (25.3, -25.3)
 FOCAL_PX = (600.0, 3000.0)
-NOWHERE = np.full((AFAR, 3), np.nan)
 
 
-@pytest.fixture(scope="module")
-def exact() -> pycolmap.Reconstruction:
-    """Ground with 4 m of relief, places in images to 0.3 px; all images see all points."""
+def built(near: int = 5, seen_from_afar: int = 150, relief_m: float = 2.0) -> pycolmap.Reconstruction:
+    """Ground with some relief, places in images to 0.3 px. The last two images see only the first points."""
     rng = np.random.default_rng(5)
     x, y = rng.uniform(-25, 25, (2, 150))
-    points_m = np.column_stack([x, y, 2.0 * np.sin(x / 7.0) + 2.0 * np.cos(y / 9.0)])
+    points_m = np.column_stack([x, y, relief_m * (np.sin(x / 7.0) + np.cos(y / 9.0))])
+    more_m = np.column_stack([rng.uniform(-30, 30, (max(near - 5, 0), 2)), rng.uniform(95, 105, max(near - 5, 0))])
+    centers_m = np.concatenate([NEAR_M[:near], more_m, AFAR_M])
     model = pycolmap.Reconstruction()
     for number, focal_px in enumerate(FOCAL_PX, 1):
         camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=800, height=600)
         camera.params = [focal_px, 400.0, 300.0]
         model.add_camera_with_trivial_rig(camera)
-    for number, (center_m, phi_deg) in enumerate(zip(CENTERS_M, PHI_DEG, strict=True), 1):
-        rotation = from_omega_phi_kappa(0.0, phi_deg, 0.0)
+    for number, center_m in enumerate(centers_m, 1):
+        afar = number - near - 1
+        rotation = from_omega_phi_kappa(0.0, 0.0 if afar < 0 else AFAR_DEG[afar], 0.0)
         pose = pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ center_m]))
-        camera = model.cameras[2 if number == AFAR else 1]
-        pixels = camera.img_from_cam(pose * points_m) + rng.normal(0.0, 0.3, (len(points_m), 2))
+        camera = model.cameras[1 if afar < 0 else 2]
+        seen_m = points_m if afar < 0 else points_m[:seen_from_afar]
+        pixels = camera.img_from_cam(pose * seen_m) + rng.normal(0.0, 0.3, (len(seen_m), 2))
         image = pycolmap.Image(f"{number}.jpg", pixels, camera_id=camera.camera_id, image_id=number)
         model.add_image_with_trivial_frame(image, pose)
     for row, point_m in enumerate(points_m):
-        elements = [pycolmap.TrackElement(number, row) for number in range(1, AFAR + 1)]
-        model.add_point3D(point_m, pycolmap.Track(elements))
+        images = range(1, near + (3 if row < seen_from_afar else 1))
+        model.add_point3D(point_m, pycolmap.Track([pycolmap.TrackElement(number, row) for number in images]))
     return model
 
 
-def center_m(model: pycolmap.Reconstruction, number: int = AFAR) -> NDArray[np.float64]:
-    return np.asarray(model.images[number].projection_center())
+@pytest.fixture(scope="module")
+def exact() -> pycolmap.Reconstruction:
+    return built()
 
 
-def adjust_with(positions_m: FloatArray, model: pycolmap.Reconstruction) -> Placement:
+def centers_of(model: pycolmap.Reconstruction) -> FloatArray:
+    return np.array([model.images[number].projection_center() for number in sorted(model.images)])
+
+
+def adjust_with(positions_m: FloatArray, sigmas_m: FloatArray, model: pycolmap.Reconstruction) -> Placement:
     cameras = {
         str(number): {"params": [focal_px, 400.0, 300.0], "focal_px": focal_px, "sigma": 0.01}
         for number, focal_px in enumerate(FOCAL_PX, 1)
     }
-    return adjusted(pycolmap, model, cameras, positions_m, SIGMAS_M, np.full((AFAR, 3), np.nan), 1e-6)
+    nothing = np.full((len(positions_m), 3), np.nan)
+    return adjusted(pycolmap, model, cameras, positions_m, sigmas_m, nothing, 1e-6)
 
 
-def turned_over(exact: pycolmap.Reconstruction, positions_m: FloatArray) -> tuple[pycolmap.Reconstruction, Placement]:
+def turned(exact: pycolmap.Reconstruction, over: tuple[int, ...], positions_m: FloatArray) -> Upright:
+    """What becomes of a model some of whose images are turned over."""
     model = copy.deepcopy(exact)
-    other = _Other.of(pycolmap, model, AFAR)
-    assert other is not None
-    other.take(model)
-    return model, adjust_with(positions_m, model)
+    for number in over:
+        other = _Other.of(pycolmap, model, number)
+        assert other is not None
+        other.take(model)
+    sigmas_m = np.where(np.isfinite(positions_m[:, 0]), 5.0, np.nan)
+    adjust = partial(adjust_with, positions_m, sigmas_m)
+    placement = adjust(model)
+    assert all(off_deg(exact, model, number) > 40.0 for number in over)
+    return turned_back(pycolmap, model, placement, positions_m, sigmas_m, adjust)
+
+
+def off_deg(exact: pycolmap.Reconstruction, model: pycolmap.Reconstruction, number: int) -> float:
+    """Error of an image's attitude, as the second image sees it."""
+    first, second = (one.images[number].cam_from_world() * one.images[2].cam_from_world().inverse()
+                     for one in (exact, model))  # fmt: skip
+    return angle_between_deg(first.rotation.matrix(), second.rotation.matrix())
+
+
+def given(exact: pycolmap.Reconstruction, case: str) -> NDArray[np.float64]:
+    """Positions of all images, off by two metres; of none; of all but the last two."""
+    positions_m = centers_of(exact) + np.array([1.0, -2.0, 1.5])
+    unknown = {"positions": 0, "some": 2, "nothing": len(positions_m)}[case]
+    positions_m[len(positions_m) - unknown :] = np.nan
+    return positions_m
 
 
 def test_level_ground_looks_nearly_the_same_from_the_other_pose(exact: pycolmap.Reconstruction) -> None:
-    image, camera = exact.images[AFAR], exact.cameras[2]
+    image, camera = exact.images[6], exact.cameras[2]
     points_m = np.array([exact.points3D[number].xyz for number in sorted(exact.points3D)])
     level_m = np.column_stack([points_m[:, :2], np.zeros(len(points_m))])
     pose = image.cam_from_world()
@@ -84,29 +112,45 @@ def test_level_ground_looks_nearly_the_same_from_the_other_pose(exact: pycolmap.
     np.testing.assert_allclose(back, pose.matrix(), atol=1e-6)
 
 
-@pytest.mark.parametrize("positions_m", [CENTERS_M + np.array([1.0, -2.0, 1.5]), NOWHERE], ids=["positions", "nothing"])
-def test_an_image_that_is_turned_over_is_turned_back(exact: pycolmap.Reconstruction, positions_m: FloatArray) -> None:
-    model, placement = turned_over(exact, positions_m)
-    seen_m = center_m(model) - center_m(model, 2)
-    assert seen_m[0] < 0.0
-    found, _ = turned_back(
-        pycolmap, model, placement, positions_m, SIGMAS_M, partial(adjust_with, positions_m)
-    )  # fmt: skip
-    relative = exact.images[AFAR].cam_from_world() * exact.images[2].cam_from_world().inverse()
-    again = found.images[AFAR].cam_from_world() * found.images[2].cam_from_world().inverse()
-    assert angle_between_deg(relative.rotation.matrix(), again.rotation.matrix()) < 1.0
+@pytest.mark.parametrize("case", ["positions", "some", "nothing"])
+@pytest.mark.parametrize("over", [(6,), (6, 7)])
+def test_images_that_are_turned_over_are_turned_back(
+    exact: pycolmap.Reconstruction, case: str, over: tuple[int, ...]
+) -> None:
+    found = turned(exact, over, given(exact, case))
+    assert sorted(found.turned) == list(over)
+    assert max(off_deg(exact, found.model, number) for number in (6, 7)) < 1.0
 
 
-@pytest.mark.parametrize("positions_m", [CENTERS_M, NOWHERE], ids=["positions", "nothing"])
-def test_images_in_their_places_stay(exact: pycolmap.Reconstruction, positions_m: FloatArray) -> None:
-    """Also one whose given position is on the other side: its pictures are better."""
-    wrong_m = positions_m.copy()
-    wrong_m[-1, 0] = -175.0
-    for given_m in (positions_m, wrong_m):
-        model = copy.deepcopy(exact)
-        placement = adjust_with(given_m, model)
-        found, same = turned_back(
-            pycolmap, model, placement, given_m, SIGMAS_M, partial(adjust_with, given_m)
-        )  # fmt: skip
-        assert found is model
-        assert same is placement
+@pytest.mark.parametrize("case", ["positions", "nothing"])
+def test_a_point_behind_the_camera_does_not_keep_an_image_turned_over(
+    exact: pycolmap.Reconstruction, case: str
+) -> None:
+    model = copy.deepcopy(exact)
+    model.points3D[min(model.points3D)].xyz = AFAR_M[0] + [40.0, 0.0, 80.0]
+    found = turned(model, (6,), given(exact, case))
+    assert off_deg(exact, found.model, 6) < 1.0
+
+
+@pytest.mark.parametrize("case", ["positions", "nothing"])
+def test_images_in_their_places_stay(exact: pycolmap.Reconstruction, case: str) -> None:
+    assert turned(exact, (), given(exact, case)).turned == ()
+
+
+@pytest.mark.parametrize(("near", "seen", "relief_m"), [(5, 150, 2.0), (60, 40, 1.0), (100, 40, 2.0)])
+def test_an_image_whose_position_lies_on_the_other_side_stays(near: int, seen: int, relief_m: float) -> None:
+    """What its own keypoints say counts, however many other images there are."""
+    exact = built(near, seen, relief_m)
+    positions_m = given(exact, "positions")
+    positions_m[-1, 0] *= -1.0
+    found = turned(exact, (), positions_m)
+    assert found.turned == ()
+    assert off_deg(exact, found.model, near + 2) < 1.0
+
+
+def test_of_two_far_images_only_the_one_that_is_turned_over_is_turned_back(exact: pycolmap.Reconstruction) -> None:
+    positions_m = given(exact, "positions")
+    positions_m[-1, 0] *= -1.0
+    found = turned(exact, (6,), positions_m)
+    assert found.turned == (6,)
+    assert max(off_deg(exact, found.model, number) for number in (6, 7)) < 1.0

@@ -10,7 +10,7 @@ from a planar target, PAMI 2006); under weak perspective both fit alike.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -20,22 +20,30 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.orientation.placing import Placement
-from aeromatch_cli.orientation.results import centers_of, image_numbers
+from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, image_numbers
 
-# An image so many standard deviations from its position may be turned over, and is where its other pose brings it
-# nearer than this share of the distance.
+# An image farther than so many standard deviations from its position is tried with its other pose, and turned back if
+# that brings it nearer than this share of the distance.
 _FAR_SIGMAS, _NEARER = 5.0, 0.5
-# The other pose fits the image's points to so many pixels by the median: they lie where the wrong one has put them.
-_FITS_PX = 8.0
-# The model may fit so much worse with images turned back by positions: wrong poses are found because they fit.
-_WORSE = 1.2
-# Without positions images are tried whose other pose fits so many times as well, and which differs by so many degrees;
-# so many at most, those first that fit worst as they are. Turned back they have to fit to this share of the errors.
-_ALIKE, _DIFFERENT_DEG, _MOST_TRIED, _BETTER = 2.0, 10.0, 10, 0.8
-# Fewer points leave a pose open.
-_LEAST_POINTS = 6
+# The other pose leaves at most so many times the median error of the present one, to which points and poses are
+# adjusted; once they are adjusted to the other one, at most so many times.
+_FITS, _WORSE = 10.0, 1.2
+# Images whose position does not tell are tried if the other pose leaves at most so many times the error, so many images
+# at most, those first that fit worst; they are turned back if this share of the error is left after an adjustment.
+_ALIKE, _MOST_TRIED, _BETTER = 2.0, 10, 0.8
+# Poses nearer to each other are one and the same.
+_DIFFERENT_DEG = 10.0
 
 Adjust = Callable[[Any], Placement]
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """A model with its placement, and the numbers of the images that were turned back."""
+
+    model: Any
+    placement: Placement
+    turned: tuple[int, ...] = ()
 
 
 def turned_back(
@@ -45,74 +53,92 @@ def turned_back(
     positions_m: FloatArray,
     sigmas_m: FloatArray,
     adjust: Adjust,
-) -> tuple[Any, Placement]:
-    """The model and its placement without images that are turned over, by their positions or by their errors.
+) -> Upright:
+    """The model with images turned back that are turned over, by their positions or by their errors.
 
-    positions_m (N, 3), sigmas_m (N,): one row per image number. adjust: adjusts and places a model.
+    positions_m (N, 3), sigmas_m (N,): one row per image number, NaN where there is none. adjust: adjusts and places a
+    model.
     """
-    if placement.kind != "level":
-        model, placement = _by_positions(pycolmap, model, placement, positions_m, sigmas_m, adjust)
-    return _by_errors(pycolmap, model, placement, adjust)
+    found, ids = Upright(model, placement), image_numbers(model)
+    if placement.kind == "level":
+        return _by_errors(pycolmap, found, ids, adjust)
+    off = {i: _off_m(model, i, positions_m) / sigmas_m[i - 1] for i in ids}
+    found = _by_positions(pycolmap, found, [i for i in ids if off[i] > _FAR_SIGMAS], positions_m, adjust)
+    open_ = [i for i in ids if not off[i] <= _FAR_SIGMAS and i not in found.turned]
+    return _by_errors(pycolmap, found, open_, adjust)
 
 
 def _by_positions(
-    pycolmap: ModuleType,
-    model: Any,
-    placement: Placement,
-    positions_m: FloatArray,
-    sigmas_m: FloatArray,
-    adjust: Adjust,
-) -> tuple[Any, Placement]:
-    far = [i for i in image_numbers(model) if _off_m(model, i, positions_m) > _FAR_SIGMAS * sigmas_m[i - 1]]
-    trial, turned = copy.deepcopy(model) if far else model, []
-    for number in far:
-        before_m, before = _off_m(trial, number, positions_m), trial.images[number].cam_from_world()
-        other = _Other.of(pycolmap, trial, number)
-        if other is not None and other.error_px < _FITS_PX:
-            other.take(trial)
-            if _off_m(trial, number, positions_m) < _NEARER * before_m:
+    pycolmap: ModuleType, before: Upright, far: Collection[int], positions_m: FloatArray, adjust: Adjust
+) -> Upright:
+    """far: images far from their positions. Once more without those for which that was no good, if others are left."""
+    for _ in range(2):
+        trial, turned = (copy.deepcopy(before.model) if far else None), []
+        for number in far:
+            other = _Other.of(pycolmap, trial, number)
+            nearer_m = _NEARER * _off_m(trial, number, positions_m)
+            if other is None or other.error_px > _FITS * other.present_px:
+                continue
+            if float(np.linalg.norm(other.center_m - positions_m[number - 1])) < nearer_m:
+                other.take(trial)
                 turned.append(number)
-            else:
-                trial.images[number].frame.set_cam_from_world(trial.images[number].camera_id, before)
-    if not turned:
-        return model, placement
-    found = adjust(trial)
-    for one in (model, trial):
-        one.update_point_3d_errors()
-    worse = trial.compute_mean_reprojection_error() > _WORSE * model.compute_mean_reprojection_error()
-    nearer = all(_off_m(trial, i, positions_m) < _NEARER * _off_m(model, i, positions_m) for i in turned)
-    return (trial, found) if nearer and not worse and found.kind != "level" else (model, placement)
+        if not turned:
+            return before
+        placement = adjust(trial)
+        far = [
+            i
+            for i in turned
+            if _off_m(trial, i, positions_m) < _NEARER * _off_m(before.model, i, positions_m)
+            and _error_px(trial, i) <= _WORSE * _error_px(before.model, i)
+        ]
+        if far == turned and placement.kind == before.placement.kind:
+            return Upright(trial, placement, tuple(turned))
+    return before
 
 
-def _by_errors(pycolmap: ModuleType, model: Any, placement: Placement, adjust: Adjust) -> tuple[Any, Placement]:
-    others = [_Other.of(pycolmap, model, number) for number in image_numbers(model)]
-    doubtful = [o for o in others if o is not None and o.error_px < _ALIKE * o.present_px]
-    for number in [o.number for o in sorted(doubtful, key=lambda o: -o.present_px)[:_MOST_TRIED]]:
-        trial = copy.deepcopy(model)
-        other = _Other.of(pycolmap, trial, number)
-        if other is None:
+def _by_errors(pycolmap: ModuleType, found: Upright, ids: Collection[int], adjust: Adjust) -> Upright:
+    others = [_Other.of(pycolmap, found.model, number) for number in ids]
+    doubtful = [other for other in others if other is not None and other.error_px < _ALIKE * other.present_px]
+    for other in sorted(doubtful, key=lambda other: -other.present_px)[:_MOST_TRIED]:
+        trial, number = copy.deepcopy(found.model), other.number
+        # Where another image was turned back since, poses and points are others.
+        now = _Other.of(pycolmap, trial, number) if found.turned else other
+        if now is None:
             continue
-        other.take(trial)
-        found = adjust(trial)
-        if found.kind == placement.kind and _error_px(trial, number) < _BETTER * _error_px(model, number):
-            model, placement = trial, found
-    return model, placement
+        now.take(trial)
+        placement = adjust(trial)
+        better = _error_px(trial, number) < _BETTER * _error_px(found.model, number)
+        if better and placement.kind == found.placement.kind:
+            found = Upright(trial, placement, (*found.turned, number))
+    return found
 
 
 def _off_m(model: Any, number: int, positions_m: FloatArray) -> float:
     return float(np.linalg.norm(centers_of(model, [number])[0] - positions_m[number - 1]))
 
 
+def _observed(model: Any, number: int) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of an image's keypoints that see points, and these points (N, 3)."""
+    seen = model.images[number].get_observation_points2D()
+    points_m = [model.points3D[point.point3D_id].xyz for point in seen]
+    return np.array([point.xy for point in seen]).reshape(-1, 2), np.array(points_m).reshape(-1, 3)
+
+
 def _error_px(model: Any, number: int) -> float:
-    """Mean error, in all their images, of the points that an image sees."""
-    model.update_point_3d_errors()
-    seen = [model.points3D[p.point3D_id].error for p in model.images[number].points2D if p.has_point3D()]
-    return float(np.mean(seen)) if seen else np.inf
+    """Median error of an image's own keypoints."""
+    image = model.images[number]
+    return _median_px(model.cameras[image.camera_id], image.cam_from_world(), *_observed(model, number))
+
+
+def _median_px(camera: Any, pose: Any, pixels: FloatArray, points_m: FloatArray) -> float:
+    """Median error of keypoints; a point behind the camera has no place, and is as far off as can be."""
+    off_px = np.linalg.norm(camera.img_from_cam(pose * points_m) - pixels, axis=1)
+    return float(np.median(np.nan_to_num(off_px, nan=BEHIND_PX))) if len(off_px) else BEHIND_PX
 
 
 @dataclass(frozen=True, eq=False)
 class _Other:
-    """The other pose of an image, and the median errors of its points by that and by the present one."""
+    """The other pose of an image, and the median errors of its keypoints by that and by the present one."""
 
     number: int
     pose: Any
@@ -122,11 +148,7 @@ class _Other:
     @classmethod
     def of(cls, pycolmap: ModuleType, model: Any, number: int) -> _Other | None:
         """None where an image has no other pose that its points lead to."""
-        image = model.images[number]
-        seen = [(p.xy, model.points3D[p.point3D_id].xyz) for p in image.points2D if p.has_point3D()]
-        if len(seen) < _LEAST_POINTS:
-            return None
-        pixels, points_m = (np.array(values, dtype=np.float64) for values in zip(*seen, strict=True))
+        image, (pixels, points_m) = model.images[number], _observed(model, number)
         camera, present = model.cameras[image.camera_id], image.cam_from_world()
         start = pycolmap.Rigid3d(other_pose(present.matrix(), points_m))
         if _apart_deg(start, present) < _DIFFERENT_DEG:  # it looks straight down
@@ -135,8 +157,12 @@ class _Other:
         pose = None if found is None else found["cam_from_world"]
         if pose is None or _apart_deg(pose, present) < _DIFFERENT_DEG:
             return None
-        errors_px = [np.linalg.norm(camera.img_from_cam(one * points_m) - pixels, axis=1) for one in (pose, present)]
-        return cls(number, pose, float(np.median(errors_px[0])), float(np.median(errors_px[1])))
+        return cls(number, pose, *(_median_px(camera, one, pixels, points_m) for one in (pose, present)))
+
+    @property
+    def center_m(self) -> FloatArray:
+        """(3,) projection centre in the world."""
+        return np.asarray(-self.pose.rotation.matrix().T @ self.pose.translation)
 
     def take(self, model: Any) -> None:
         """Give the image of a model this pose."""

@@ -70,14 +70,16 @@ def solve(folder: Path) -> None:
             adjusted, pycolmap, cameras=task["cameras"], positions_m=observed[0], sigmas_m=observed[1], ups=ups,
             tolerance=_COST_TOLERANCE,
         )  # fmt: skip
-        model, placement = turned_back(pycolmap, model, adjust(model), *observed, adjust)
+        upright = turned_back(pycolmap, model, adjust(model), *observed, adjust)
+        model, placement = upright.model, upright.placement
         reset_lenses(model, task["cameras"])  # few points determine no lens
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
         name = f"model{number}.npz"
         np.savez(folder / name, **arrays(model))
-        facts.append({"file": name, "kind": placement.kind, "contradiction": placement.contradiction, **figures(model)})
+        known = {"contradiction": placement.contradiction, "turned_back": upright.turned, **figures(model)}
+        facts.append({"file": name, "kind": placement.kind, **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 
 

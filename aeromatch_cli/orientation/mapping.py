@@ -179,6 +179,7 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
     arrays = np.load(folder / facts.pop("file"))
     image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
     names = [image_ids[number - 1] for number in arrays["images"]]
+    facts["turned_back"] = [image_ids[number - 1] for number in facts["turned_back"]]
     given = block.cameras
     cameras = {camera_ids[n - 1]: _camera(given[camera_ids[n - 1]], arrays[f"params{n}"]) for n in arrays["cameras"]}
     return Model(

@@ -48,7 +48,7 @@ from aeromatch_cli.workspace import read_json, translated_os_errors, whole_recor
 log = logging.getLogger("aeromatch")
 
 # The second counts for blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 16, 1
+VERSION, _LARGE_BLOCK_VERSION = 17, 1
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
