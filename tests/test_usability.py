@@ -256,8 +256,10 @@ def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
     assert estimate["seconds_per_image"] < 1.5
     work = len(site.names()) * estimate["seconds_per_image"] + estimate["pairs"] * estimate["seconds_per_pair"]
     assert 0.0 < estimate["seconds_to_orient"] < 10.0
-    before = estimate["seconds_to_start"] + estimate["seconds_to_orient"]
-    assert estimate["seconds"] == pytest.approx(before + work, abs=0.1)
+    work += estimate["seconds_to_orient"]
+    assert 0.2 * work < estimate["seconds_after_matching"] < 0.3 * work + 0.1
+    whole = estimate["seconds_to_start"] + work + estimate["seconds_after_matching"]
+    assert estimate["seconds"] == pytest.approx(whole, abs=0.2)
 
 
 def test_the_orientation_costs_nothing_where_it_is_there_or_not_wanted(done_site):

@@ -65,7 +65,8 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   rest. `files`: SHA-256 of the other files.
 - `facts`: `method` (`given`: the given poses explain the matches; `pictures`: a mapper oriented the block),
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
-  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`), `by_one_pair`
+  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`,
+  `turned_back`: images that the mapper had turned over), `by_one_pair`
   (images placed by one pair and their position), `wrong_attitudes`
   (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
   (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
@@ -122,8 +123,8 @@ where that is all. `export` and `report` show these.
 ### refined/<id>.npz
 
 Where keypoints were measured anew by least-squares matching (`refine`); absent with `refine=none`. What is adjusted,
-judged, exported and evaluated has these places; features, matches, two-view models and the report's pictures keep those
-of the detector.
+judged, exported, drawn and evaluated has these places; features, matches and two-view models keep those of the
+detector, by which the errors that colours show were found.
 
 - `keypoints_px` (K, 2) float32: of all keypoints of features/<id>.npz; `measured` (K,) bool: those that stand for their
   points, or were brought onto one that does. `fingerprint`: that of the features. `files.json` is the record of all.

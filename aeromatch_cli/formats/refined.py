@@ -31,8 +31,8 @@ def read_final_keypoints(features: Path, refined: Path) -> FloatArray:
 
 
 def checked_final_keypoints(features: Path, refined: Path) -> tuple[str, FloatArray | None]:
-    """Fingerprint of the features and the same places; "" and None, and a word, where the features are broken. Where
-    the other file is, a word, and where the detector put the keypoints."""
+    """Fingerprint of the features and the same places; "" and None, with a warning, where the features are broken.
+    Where the other file is broken, a warning and the places where the detector put the keypoints."""
     fingerprint, detected = checked_keypoints(features)
     try:
         places = None if detected is None else _measured(refined, fingerprint)

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.refined import checked_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.geometry.coverage import cells_of
@@ -165,9 +166,8 @@ def _found(stretch: Stretch) -> _Found:
 
 def _keypoints(context: Context, image_id: str) -> FloatArray | None:
     """(K, 2), or None where the image has no readable features."""
-    path = context.workspace.features(image_id)
     try:
-        return read_final_keypoints(path, context.workspace.refined(image_id)) if path.is_file() else None
+        return read_keypoints(context.workspace.features(image_id))[0]
     except WorkspaceError:
         return None
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.errors import ItemError, WorkspaceError
-from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
+from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.refined import checked_final_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import read_pixels
@@ -104,8 +105,7 @@ class DrawnMatches:
     def _keypoints(self, image_id: str) -> FloatArray:
         known = self._features(image_id)[1]
         # What cannot be read says so itself.
-        paths = self._workspace.features(image_id), self._workspace.refined(image_id)
-        return read_final_keypoints(*paths) if known is None else known
+        return read_keypoints(self._workspace.features(image_id))[0] if known is None else known
 
 
 def error_classes(errors_px: FloatArray | None, count: int) -> IntArray:

@@ -30,8 +30,8 @@ _SAMPLED_PAIRS = 3
 _WARM_UP_SCALE = 0.25
 # Seconds of mapping per image: measured 0.04 (300 images of 480 x 360) to 0.4 (ochota).
 _MAPPING_S = 0.2
-# Seconds of measuring, adjustment, consistency, export and report, of all seconds before: 0.20 to 0.30 in blocks of 7
-# to 13 images, lewis, ochota, seneca and rendered ones.
+# Seconds of measuring, adjustment, consistency, export and report for one of orientation, features and matching: 0.20
+# to 0.30 in blocks of 7 to 13 images, lewis, ochota, seneca and rendered ones.
 _LATER = 0.26
 
 
@@ -135,10 +135,16 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     estimate["seconds_to_orient"] = 0.0 if oriented else _orientation_s(context, sampled)
     estimate["seconds_of_further_steps"] = _further_s(context, sampled)
     if estimate["seconds"] is not None:
-        before_s = estimate["seconds"] + (estimate["seconds_to_orient"] or 0.0)
-        later = _LATER if isinstance(context.settings.orient, FirstPass) else 0.0
-        estimate["seconds"] = round(before_s * (1.0 + later), 1)
+        own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
+        estimate["seconds_after_matching"] = round(own_s * _later(context), 1)
+        estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
+
+
+def _later(context: Context) -> float:
+    """Seconds of what follows matching for one of what leads to it."""
+    adjusts = isinstance(context.settings.orient, FirstPass) and not context.settings.match.reads_pixels
+    return _LATER if adjusts else 0.0
 
 
 def _orientation_s(context: Context, sampled: Sequence[Pair]) -> float | None:

@@ -114,7 +114,8 @@ def run(context: Context) -> StageReport:
     found = _measured(context, table, recipe, report)
     report.facts = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
-    # What is made of places that lack some must not count as made of all.
+    # What is made of places that lack some must not count as made of all. Measurements that failed are tried again as
+    # soon as their pictures can be read, that is with the next command.
     lacking = sorted({item for item, _ in report.failures})
     made = fingerprint(report.fingerprint, lacking) if lacking else report.fingerprint
     names = sorted(path.name for path in folder.glob("*.npz"))
@@ -124,7 +125,7 @@ def run(context: Context) -> StageReport:
 
 
 def _nothing_is_back(context: Context, lacking: Sequence[str], report: StageReport) -> bool:
-    """Whether images whose pictures could not be read still cannot be; then they are the failures of this run too."""
+    """Whether pictures of images that failed still cannot be read; then these are the failures of this run, too."""
     sources = [source_of(context, context.image_by_id[image_id]) for image_id in lacking]
     run_stage(context, report, _read, sources, lacking)
     report.done = 0
@@ -187,7 +188,9 @@ class _Table:
             if entry.verdict.state == "verified" and _comparable(context.geometry(pair)):
                 ids = pair.image_id0, pair.image_id1
                 for image_id, indices in zip(ids, entry.matches.indices.T, strict=True):
-                    used.setdefault(image_id, np.zeros(len(places[image_id]), dtype=bool))[indices] = True
+                    if image_id not in used:
+                        used[image_id] = np.zeros(len(places[image_id]), dtype=bool)
+                    used[image_id][indices] = True
                 matches.append((ids, entry.matches.indices.astype(np.int32)))
                 scores.append(entry.matches.scores.astype(np.float32))
         indices = {i: np.flatnonzero(used[i]).astype(np.int32) for i in places if i in used}

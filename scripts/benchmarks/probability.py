@@ -54,26 +54,30 @@ def block_of(args: argparse.Namespace, scene: str, flight: str, seed: int) -> Bl
     name = f"{scene}:{flight}, seed {seed}"
     work = args.out / "runs" / f"{scene}-{flight}-{seed}"
     block = render_asked(args, scene, flight=flight, seed=seed)
-    if not (work / "finished.json").is_file():
+    made = work.with_name(f"{work.name}.made")
+    if not made.is_file():
         given = ["--poses", str(block / NOISY_POSES), "--cameras", str(block / "block.json"), "--crs", "local"]
         settings = [f"extract.keypoints={args.keypoints}", f"cascade.learned.keypoints={args.keypoints}"]
         run = whole_run("run", "auto", block / "images", work, extra=given, jobs=args.jobs, settings=settings)
         if not run.answer:
             raise SystemExit(f"aeromatch run on {name} failed with exit code {run.code}:\n{run.said}")
+        made.touch()
     return name, *_judged(Workspace(work), block)
 
 
 def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolArray]:
-    """`columns` of all matches of a workspace that do not contradict its adjusted block, and which are right."""
+    """`columns` of all matches of a workspace that do not contradict its adjusted block, or the geometry of a pair that
+    the block lacks, and which are right."""
     truth = open_truth(truth_folder)
     images = {image.image_id: image for image in read_images(workspace.images)}
     block = read_adjusted(workspace.adjusted) if workspace.adjusted.is_file() else _NO_BLOCK
-    of_ids = {**read_cameras(workspace.cameras), **block.cameras}
-    cameras = {image_id: of_ids[image.camera_id] for image_id, image in images.items()}
+    before = read_cameras(workspace.cameras)
+    cameras = {i: {**before, **block.cameras}[image.camera_id] for i, image in images.items()}
     keypoints = {
         i: np.asarray(read_final_keypoints(workspace.features(i), workspace.refined(i)), float) for i in images
     }
-    pairs = list(_pairs(workspace, block, cameras, keypoints))
+    lenses = {i: before[image.camera_id] for i, image in images.items()}
+    pairs = list(_pairs(workspace, block, lenses, keypoints))
     recipe = BlockConsistency()
     limits = Limits(recipe.epipolar_px, recipe.medians, recipe.third_image_px)
     parts, right = [np.zeros((0, len(WEIGHTS)))], [np.zeros(0, dtype=bool)]
@@ -94,7 +98,7 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
 def _pairs(
     workspace: Workspace, block: AdjustedBlock, cameras: Mapping[str, Camera], keypoints: Mapping[str, FloatArray]
 ) -> Iterator[MatchedKeypoints]:
-    """All verified ones, those that the block lacks with their own geometry."""
+    """All verified ones, those that the block lacks with their own geometry. cameras: those of the verification."""
     poses = read_poses(workspace.poses)
     for image_id in sorted(cameras):
         path = workspace.verified(image_id)
