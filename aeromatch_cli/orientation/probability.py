@@ -90,7 +90,8 @@ def columns(evidence: MatchEvidence, usual_px: float) -> FloatArray:
     """(M, 6) what the model is linear in: one, score, confirmations by third images, those of the whole pair, distance
     from the neighbours' heights, and how loose the pair is. usual_px: `usual_off_px` of the block.
 
-    What no third image confirms is doubtful where third images confirm most others, not where none could."""
+    Confirmations of the pair are their mean: what no third image confirms is doubtful where third images confirm most
+    others, not where none shows the ground. Means over the nearest 8 to 32 matches tell no more."""
     unit_px = max(float(np.median(evidence.error_px)), _LEAST_UNIT_PX)
     off = evidence.off_px / unit_px
     tight_px = max(_LOOSE * usual_px, _LEAST_LOOSE_PX)
