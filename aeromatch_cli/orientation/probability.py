@@ -21,13 +21,13 @@ _MOST_CONFIRMING, _MOST_OFF = 4, 50.0
 # A pair whose median distance from the neighbours' heights is more than so many times that of the block's matches, and
 # more than so many pixels, is loose: where the light on relief has moved with the sun, keypoints of either image lie on
 # what moved, and agree with their neighbours and with third images all the same.
-_LOOSE, _LEAST_LOOSE_PX = 1.5, 0.5
+_LOOSE, _LEAST_LOOSE_PX = 1.5, 1.0
 # A match that has no neighbours, or lies where their heights are not seen, is as far off as this, pixels.
 _NOWHERE_PX = 16.0
 # Of as many nearest matches of the pair the one with the second smallest distance counts.
 NEIGHBOURS, SUPPORTING = 8, 2
 # One for every column of `columns`, as `scripts/bench probability` has found them.
-WEIGHTS = (5.086, 2.229, 1.158, -0.801, -1.279, -1.821)
+WEIGHTS = (4.818, 2.247, 1.148, -0.732, -1.268, -3.094)
 
 
 @dataclass(frozen=True, eq=False)
