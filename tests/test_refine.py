@@ -19,7 +19,7 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.level import level_affinities
@@ -198,6 +198,28 @@ def test_a_damaged_file_is_made_again(done_site: Site) -> None:
     path.write_bytes(before[:-30])
     assert done_site("run").code == 0
     assert path.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_what_is_drawn_lies_where_it_was_measured_or_where_it_was_detected(
+    done_site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
+    work = Workspace(done_site.work)
+    image_id = read_images(work.images)[0].image_id
+    features, refined = work.features(image_id), work.refined(image_id)
+    detected = read_keypoints(features)[0]
+    fingerprint, drawn = checked_final_keypoints(features, refined)
+    assert drawn is not None
+    np.testing.assert_array_equal(drawn, final(work)(image_id))
+    assert 0.0 < np.abs(drawn - detected).max() < 10.0
+    assert not caplog.records
+    refined.write_bytes(refined.read_bytes()[:-30])
+    same, drawn = checked_final_keypoints(features, refined)
+    assert same == fingerprint
+    np.testing.assert_array_equal(drawn, detected)
+    assert str(refined) in caplog.text
+    features.unlink()
+    assert checked_final_keypoints(features, refined) == ("", None)
 
 
 def test_near_the_edge_of_a_picture_or_of_a_mask_nothing_is_measured() -> None:
