@@ -36,6 +36,7 @@ PAGES: Mapping[str, str] = {
     "bench_refine": "auto.md",
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
+    "bench_auto_unknown": "auto.md",
     "bench_growth_blocks": "large.md",
     "bench_device": "large.md",
     "bench_memory": "large.md",
