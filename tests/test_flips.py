@@ -137,6 +137,13 @@ def test_images_in_their_places_stay(exact: pycolmap.Reconstruction, case: str) 
     assert turned(exact, (), given(exact, case)).turned == ()
 
 
+def test_an_image_without_points_is_left_alone(exact: pycolmap.Reconstruction) -> None:
+    model = copy.deepcopy(exact)
+    for number in sorted(model.points3D):
+        model.delete_observation(6, number - 1)
+    assert _Other.of(pycolmap, model, 6) is None
+
+
 @pytest.mark.parametrize(("near", "seen", "relief_m"), [(5, 150, 2.0), (60, 40, 1.0), (100, 40, 2.0)])
 def test_an_image_whose_position_lies_on_the_other_side_stays(near: int, seen: int, relief_m: float) -> None:
     """What its own keypoints say counts, however many other images there are."""

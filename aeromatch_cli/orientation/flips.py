@@ -19,6 +19,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg
+from aeromatch_cli.orientation.adjusting import MIN_OBSERVATIONS
 from aeromatch_cli.orientation.placing import Placement
 from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, image_numbers
 
@@ -149,6 +150,8 @@ class _Other:
     def of(cls, pycolmap: ModuleType, model: Any, number: int) -> _Other | None:
         """None where an image has no other pose that its points lead to."""
         image, (pixels, points_m) = model.images[number], _observed(model, number)
+        if len(pixels) < MIN_OBSERVATIONS:  # weak images leave the model in any case
+            return None
         camera, present = model.cameras[image.camera_id], image.cam_from_world()
         start = pycolmap.Rigid3d(other_pose(present.matrix(), points_m))
         if _apart_deg(start, present) < _DIFFERENT_DEG:  # it looks straight down
