@@ -79,6 +79,11 @@ class AdjustedBlock:
     tracks: Mapping[str, IntArray]
     frames: Mapping[str, int] = field(default_factory=dict)
 
+    @classmethod
+    def empty(cls) -> AdjustedBlock:
+        """Of no image, where none could be adjusted."""
+        return cls({}, {}, np.zeros((0, 3)), np.zeros(0), {})
+
     @property
     def observations(self) -> int:
         """Of points by images."""

@@ -226,7 +226,7 @@ def test_improbable_matches_of_a_pair_that_no_block_holds_are_dropped(truth: Tru
     keypoints["img1"], wrong = along_the_line(truth, keypoints, pairs[0].indices)
     scores = np.where(np.arange(len(wrong)) < WRONG, 0.05, 0.6)
     pair = replace(pairs[0], indices=wrong, scores=scores, alone=alone(truth, keypoints, wrong))
-    nothing = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
+    nothing = AdjustedBlock.empty()
     limits = replace(LIMITS, min_probability=0.35)
     found = contradicting(nothing, cameras(truth), keypoints.__getitem__, [pair], limits)
     held = contradicting(

@@ -21,7 +21,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.orientation.adjusting import MIN_OBSERVATIONS
 from aeromatch_cli.orientation.placing import Placement
-from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, image_numbers
+from aeromatch_cli.orientation.results import BEHIND_PX, image_numbers
 
 # An image farther than so many standard deviations from its position is tried with its other pose, and turned back if
 # that brings it nearer than this share of the distance.
@@ -74,7 +74,9 @@ def _by_positions(
 ) -> Upright:
     """far: images far from their positions. Once more without those for which that was no good, if others are left."""
     for _ in range(2):
-        trial, turned = (copy.deepcopy(before.model) if far else None), []
+        if not far:
+            return before
+        trial, turned = copy.deepcopy(before.model), []
         for number in far:
             other = _Other.of(pycolmap, trial, number)
             nearer_m = _NEARER * _off_m(trial, number, positions_m)
@@ -115,7 +117,7 @@ def _by_errors(pycolmap: ModuleType, found: Upright, ids: Collection[int], adjus
 
 
 def _off_m(model: Any, number: int, positions_m: FloatArray) -> float:
-    return float(np.linalg.norm(centers_of(model, [number])[0] - positions_m[number - 1]))
+    return float(np.linalg.norm(model.images[number].projection_center() - positions_m[number - 1]))
 
 
 def _observed(model: Any, number: int) -> tuple[FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from aeromatch_cli.data import Camera, FloatArray, Ground, IntArray, Pose
 from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
+from aeromatch_cli.geometry.rotations import angle_between_deg
 
 # An image by its id or number, or a pair of images.
 N = TypeVar("N", str, tuple[str, str], int)
@@ -137,8 +138,7 @@ def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) ->
         before = given.get(image_id)
         if before is None or before.world_rotation is None or pose.world_rotation is None:
             continue
-        cosine = (np.trace(before.world_rotation @ pose.world_rotation.T) - 1.0) / 2.0
-        errors[image_id] = float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        errors[image_id] = angle_between_deg(before.world_rotation, pose.world_rotation)
     return errors
 
 

@@ -32,7 +32,6 @@ from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
 
 VERSION = 7
-_NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 
 def run(context: Context) -> StageReport:
@@ -45,7 +44,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None and _judges_pairs(context):
-        adjusted = _NO_BLOCK
+        adjusted = AdjustedBlock.empty()
     if adjusted is None or not isinstance(recipe, BlockConsistency):
         report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}
         if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:

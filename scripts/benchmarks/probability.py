@@ -44,7 +44,6 @@ from benchmarks.whole import whole_run
 
 _EDGES = (0.0, 0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 1.0)
 _SIZE_IN = (5.0, 4.6)
-_NO_BLOCK = AdjustedBlock({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
 Block = tuple[str, FloatArray, BoolArray]
 
@@ -70,7 +69,7 @@ def _judged(workspace: Workspace, truth_folder: Path) -> tuple[FloatArray, BoolA
     the block lacks, and which are right."""
     truth = open_truth(truth_folder)
     images = {image.image_id: image for image in read_images(workspace.images)}
-    block = read_adjusted(workspace.adjusted) if workspace.adjusted.is_file() else _NO_BLOCK
+    block = read_adjusted(workspace.adjusted) if workspace.adjusted.is_file() else AdjustedBlock.empty()
     before = read_cameras(workspace.cameras)
     cameras = {i: {**before, **block.cameras}[image.camera_id] for i, image in images.items()}
     keypoints = {
