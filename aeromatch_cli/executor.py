@@ -6,12 +6,8 @@ failing task never stops the others, except when the disk or the workspace itsel
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import multiprocessing
 import os
-import signal
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -19,29 +15,27 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessP
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, Protocol, TypeVar
 
 from aeromatch_cli.dask_client import connected, has_workers, offers_gpu
 from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError, lacks_memory
+from aeromatch_cli.workers import (
+    WorkerContext,
+    available_cores,
+    interrupts_held,
+    one_thread,
+    single_threaded,
+    start_worker,
+    worker_environment,
+)
 
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger("aeromatch")
 # For the log file only: the screen shows progress in its own way.
 record = logging.getLogger("aeromatch.record")
-
-# One thread inside each worker: the processes are the parallelism, and results do not depend on thread counts.
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-# glibc gives the large arrays of every image back to the system and faults them in again for the next one: 40 % of
-# the time of SIFT. Workers keep them instead; their peak grows by a tenth (measured on 12 megapixels).
-_KEPT_BYTES = str(4_000_000_000)
 # How often a task is given to another dask worker.
 _DASK_RETRIES = 3
-_WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {
-    "MALLOC_MMAP_THRESHOLD_": _KEPT_BYTES,
-    "MALLOC_TRIM_THRESHOLD_": _KEPT_BYTES,
-}
 
 
 class Progress(Protocol):
@@ -77,87 +71,6 @@ class Outcome(Generic[R]):
     value: R | None
     error: str = ""
     lost: bool = False
-
-
-def single_threaded() -> None:
-    """Make this process's libraries use one thread. Runs at the start of every worker."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    for name in _THREAD_VARIABLES:
-        os.environ[name] = "1"
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """The same for as long as serial work takes. A BLAS of two threads, loaded long ago, sums in another order."""
-    import cv2
-    import threadpoolctl
-
-    before = cv2.getNumThreads()
-    single_threaded()
-    try:
-        with threadpoolctl.threadpool_limits(1):
-            yield
-    finally:
-        cv2.setNumThreads(before)
-
-
-class _WorkerProcess(SpawnProcess):
-    """Ends without a traceback where it has no memory to read its next task: the parent sees that it is gone."""
-
-    def run(self) -> None:
-        try:
-            super().run()
-        except MemoryError:
-            os._exit(1)
-
-
-class _WorkerContext(SpawnContext):
-    Process = _WorkerProcess
-
-
-def _worker_start() -> None:
-    # Ctrl-C is the parent's to handle: workers would only print tracebacks.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A parent that is killed can tell no one: its workers would wait for tasks for ever.
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    single_threaded()
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextlib.contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Workers inherit these settings; BLAS and glibc read them when they are loaded, before any initializer runs."""
-    before = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
-    os.environ.update(_WORKER_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """SIGINT waits until the block ends; processes started inside never see it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def guarded(function: Callable[[T], R], task: T) -> Outcome[R]:
@@ -273,7 +186,7 @@ class Executor:
 
     def _run_serial(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Outcome[R]]:
         outcomes = []
-        with _one_thread():
+        with one_thread():
             for index, task in enumerate(tasks):
                 outcomes.append(guarded(function, task))
                 self._advance(index)
@@ -327,12 +240,12 @@ class Executor:
         if self._pool is not None and self._workers >= workers:
             return self._pool
         self.close()
-        with _worker_environment():
-            self._pool = ProcessPoolExecutor(workers, mp_context=_WorkerContext(), initializer=_worker_start)
+        with worker_environment():
+            self._pool = ProcessPoolExecutor(workers, mp_context=WorkerContext(), initializer=start_worker)
             self._workers = workers
             # Spawning is lazy: make every worker now, while the environment says one thread. They are born deaf
             # to Ctrl-C: before their initializer has run they would print tracebacks.
-            with _interrupts_held():
+            with interrupts_held():
                 first = [self._pool.submit(os.getpid) for _ in range(workers)]
             try:
                 for future in first:
@@ -406,8 +319,3 @@ class Executor:
 def _lost_scheduler(client: Any) -> WorkspaceError:
     lost = f"the dask scheduler {client.scheduler.address} is lost"
     return WorkspaceError(f"{lost}: start it again, and run the same command, which goes on")
-
-
-def available_cores() -> int:
-    """Cores that this process may use (cgroups and affinity respected)."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

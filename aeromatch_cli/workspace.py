@@ -1,33 +1,30 @@
-"""Where everything lies in a workspace, how it is written, and how it is known to be up to date.
+"""Where everything lies in a workspace, and who may use it.
 
 Resume rests on evidence: a result counts as done when it is present and its fingerprint equals the one that the
-current settings and inputs give. Files appear under their final name complete or not at all.
+current settings and inputs give.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
-import json
-import logging
 import os
 import socket
-import uuid
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
 
 from aeromatch_cli.errors import InputError, WorkspaceError
-from aeromatch_cli.fingerprints import file_digest
+from aeromatch_cli.files import (
+    changed_files,
+    json_object,
+    read_json,
+    remove_stale_temporaries,
+    temporary_name,
+    translated_os_errors,
+)
 from aeromatch_cli.formats.reading import readable
 
-log = logging.getLogger("aeromatch")
-
 FORMAT_VERSION = 1
-# What precedes the checksum of a JSON file.
-_CHECKSUM = ',\n "checksum": "'
 
 
 @dataclass(frozen=True)
@@ -194,7 +191,7 @@ class Workspace:
             self.root.mkdir(parents=True, exist_ok=True)
         self.check_links()
         self.check_version()
-        probe = _temporary_name(self.root / "writable")
+        probe = temporary_name(self.root / "writable")
         with translated_os_errors(self.root):
             probe.touch()
             probe.unlink()
@@ -216,7 +213,7 @@ class Workspace:
         if not self.block.exists():
             return
         with readable(self.block, ValueError):  # of other versions it may have no checksum
-            found = _object(self.block.read_text(encoding="utf-8")).get("format_version")
+            found = json_object(self.block.read_text(encoding="utf-8")).get("format_version")
         if found != FORMAT_VERSION:
             raise WorkspaceError(
                 f"workspace {self.root} has format version {found}, this program writes {FORMAT_VERSION}; "
@@ -278,146 +275,3 @@ def locked(workspace: Workspace, command: str, *, shared: bool) -> Iterator[None
             yield
         finally:
             stream.truncate(0)
-
-
-def _host() -> str:
-    """This machine in a file name; no dots, which separate the parts of a temporary name."""
-    return socket.gethostname().replace(".", "-")
-
-
-def _temporary_name(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{_host()}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp")
-
-
-@contextlib.contextmanager
-def translated_os_errors(path: Path) -> Iterator[None]:
-    """Turn failures of the disk into WorkspaceError: what, where, what to do."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise WorkspaceError(
-                f"disk full while writing {path}; free space and run the same command again, it resumes"
-            ) from error
-        if error.errno in (errno.EISDIR, errno.ENOTEMPTY):
-            raise WorkspaceError(
-                f"cannot write {path}: a folder stands where the file belongs; move it away"
-            ) from error
-        if error.errno in (errno.EEXIST, errno.ENOTDIR):
-            raise WorkspaceError(
-                f"cannot write {path}: a file stands where a folder is needed; choose another --workspace"
-            ) from error
-        if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
-            raise WorkspaceError(f"cannot write {path} ({error.strerror}); choose another --workspace") from error
-        raise WorkspaceError(f"cannot write {path}: {error}") from error
-
-
-def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write beside `path` and rename: a reader or a killed run never sees half a file.
-
-    No fsync: after a power cut a file may be empty, which the readers treat as absent.
-    """
-    with translated_os_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = _temporary_name(path)
-        try:
-            with temporary.open("wb") as stream:
-                write(stream)
-            temporary.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise
-
-
-def write_text(path: Path, text: str) -> None:
-    """Atomic, UTF-8; a file that already holds the text is left untouched."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Atomic; a file that already holds the bytes is left untouched."""
-    with translated_os_errors(path):
-        if path.is_file() and path.read_bytes() == data:
-            return
-    write_atomically(path, lambda stream: stream.write(data))
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """An object that is not empty; its last key is the checksum of what stands before."""
-    text = json.dumps(value, indent=1, sort_keys=False, allow_nan=False)
-    write_text(path, _with_checksum(text.removesuffix("\n}")))
-
-
-def _with_checksum(head: str) -> str:
-    return f'{head}{_CHECKSUM}{zlib.crc32(head.encode("utf-8")):08x}"\n}}\n'
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The object that `write_json` wrote. Raises BrokenFileError on anything else."""
-    with readable(path, ValueError):
-        text = path.read_text(encoding="utf-8")
-        value = _object(text)
-        if text != _with_checksum(text.rpartition(_CHECKSUM)[0]):
-            raise ValueError("its contents contradict its checksum")
-        del value["checksum"]
-    return value
-
-
-def _object(text: str) -> dict[str, Any]:
-    value = json.loads(text)
-    if not isinstance(value, dict):
-        raise ValueError("it holds no JSON object")
-    return value
-
-
-def write_record(path: Path, head: Mapping[str, Any], names: Iterable[str]) -> None:
-    """A JSON record with the digests of files below its folder, for which it vouches: it is written last."""
-    write_json(path, {**head, "files": {name: file_digest(path.parent / name) for name in sorted(names)}})
-
-
-def whole_record(path: Path, *, say: bool = False) -> dict[str, Any]:
-    """A record whose files are as they were written; else nothing. say: which is not."""
-    if not path.is_file():
-        return {}
-    record = read_json(path)
-    changed = changed_files(path.parent, record)
-    if changed and say:
-        log.warning(
-            "warning: %s was changed or removed since it was written, and counts as absent", path.parent / changed[0]
-        )
-    return {} if changed else record
-
-
-def changed_files(folder: Path, record: Mapping[str, Any]) -> list[str]:
-    """Those of a record's files that are no longer as they were written, or gone."""
-    paths = {name: folder / name for name in record["files"]}
-    return [n for n, path in paths.items() if not path.is_file() or file_digest(path) != record["files"][n]]
-
-
-def remove_stale_temporaries(root: Path) -> None:
-    """Delete what a killed process of this machine left behind; files of live processes stay."""
-    # os.walk passes over folders that another process removes meanwhile; Path.rglob raises.
-    names = (Path(parent) / name for parent, _, files in os.walk(root) for name in files if name.endswith(".tmp"))
-    for path in names:
-        parts = path.name.rsplit(".", 4)
-        # In a container a restarted run has the process id of the killed one: no file of its own exists yet.
-        ours = len(parts) == 5 and path.name.startswith(".") and parts[1] == _host() and parts[2].isdigit()
-        if ours and (int(parts[2]) == os.getpid() or not _alive(int(parts[2]))):
-            with contextlib.suppress(OSError):
-                path.unlink()
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    try:
-        facts = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return True  # no Linux
-    # A zombie was killed and its parent has not asked for it yet: it writes nothing any more.
-    return facts.rpartition(")")[2].split()[0] != "Z"

@@ -33,6 +33,7 @@ from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.config import load
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
 from aeromatch_cli.formats.dropped import read_dropped, write_dropped
 from aeromatch_cli.formats.features import read_features, write_features
@@ -55,7 +56,6 @@ from aeromatch_cli.formats.tables import (
     read_poses,
 )
 from aeromatch_cli.images.files import read_mask, read_pixels
-from aeromatch_cli.workspace import read_json
 
 CAMERA = Camera("PINHOLE", 40, 30, (9.0, 9.0, 19.5, 14.5))
 # A case that takes longer is a fault, seconds.

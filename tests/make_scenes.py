@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.paint import Painted, Samples, shades
 from aeromatch_cli.synthetic.raycast import RayCaster
@@ -15,6 +14,7 @@ from aeromatch_cli.synthetic.render import View
 from aeromatch_cli.synthetic.scene import Scene, assemble
 from aeromatch_cli.synthetic.scenes import Plan
 from aeromatch_cli.synthetic.solids import Footprint, Material, Surface, box
+from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.terrain import Area, Flat, Terrain
 from aeromatch_cli.synthetic.truth import Truth
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import IMAGES, UNORIENTED, Site, contents
 
 from aeromatch_cli import workspace as workspace_module
-from aeromatch_cli.workspace import read_json
+from aeromatch_cli.files import read_json
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED
@@ -51,7 +51,7 @@ def test_full_disk_stops_and_resumes(done_site, monkeypatch):
 
         write(path, filled)
 
-    for module in ("workspace", "stages.extract", "stages.match", "stages.filter", "stages.enhance", "stages.simulate"):
+    for module in ("files", "stages.extract", "stages.match", "stages.filter", "stages.enhance", "stages.simulate"):
         monkeypatch.setattr(f"aeromatch_cli.{module}.write_atomically", limited)
     outcome = done_site("run", "--workspace", work)
     assert outcome.code == 3

@@ -17,6 +17,7 @@ from make_lightglue import SIFT, features, seeded_tensors, write
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Features, Pair, PairGeometry
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import read_match_row
@@ -29,7 +30,7 @@ from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.matchers.lightglue import inference
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
-from aeromatch_cli.workspace import Workspace, write_atomically
+from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 

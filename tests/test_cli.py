@@ -338,7 +338,7 @@ def test_every_other_command_as_a_process(done_site: Site, tmp_path: Path):
 def test_help_of_synth_names_every_scene_and_flight() -> None:
     from aeromatch_cli.cli import commands
     from aeromatch_cli.synthetic import PRESETS
-    from aeromatch_cli.synthetic.flights import FLIGHTS
+    from aeromatch_cli.synthetic.flight_plans import FLIGHTS
 
     assert commands._SCENES.split(", ") == list(PRESETS)
     assert commands._FLIGHTS.split(", ") == list(FLIGHTS)

@@ -18,7 +18,7 @@ from aeromatch_cli.cli.stage_commands import STAGES
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.synthetic.flights import FLIGHTS
+from aeromatch_cli.synthetic.flight_plans import FLIGHTS
 from aeromatch_cli.synthetic.scenes.table import SCENES
 
 # What may stand for a preset or a file of the reader's own.

@@ -13,9 +13,9 @@ from make_scenes import PLAIN, make_scene, make_truth, one_box
 from aeromatch_cli.data import Camera
 from aeromatch_cli.evaluate.rendered import RenderedTruth
 from aeromatch_cli.evaluate.surfaces import surfaces
-from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.scene import Scene
 from aeromatch_cli.synthetic.solids import Footprint, box
+from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.truth import Truth
 
 CAMERA = Camera("SIMPLE_PINHOLE", 201, 201, (100.0, 100.0, 100.0))

@@ -19,9 +19,9 @@ from aeromatch_cli.evaluate.mapping import map_database
 from aeromatch_cli.evaluate.output import condition_rows, facts, lines, summary_rows, write_evaluation
 from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.evaluate.work import Evaluation
+from aeromatch_cli.files import read_json, write_record
 from aeromatch_cli.formats.features import features_fingerprint, read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
-from aeromatch_cli.workspace import read_json, write_record
 
 pytestmark = pytest.mark.slow
 

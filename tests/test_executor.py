@@ -19,8 +19,9 @@ from make_slow import slow_square
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.cli.progress import TerminalProgress
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
-from aeromatch_cli.executor import Executor, Outcome, available_cores, guarded
+from aeromatch_cli.executor import Executor, Outcome, guarded
 from aeromatch_cli.fingerprints import stable_hash
+from aeromatch_cli.workers import available_cores
 
 
 @dataclass(frozen=True)

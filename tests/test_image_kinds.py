@@ -11,7 +11,8 @@ import pytest
 from conftest import HEIGHT, IMAGES, WIDTH
 from make_images import write_bands, write_jpeg_2000
 
-from aeromatch_cli.workspace import Workspace, read_json
+from aeromatch_cli.files import read_json
+from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,8 @@ from conftest import PAGE, QUICK, UNORIENTED, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config.text import default_yaml
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.features import read_features
-from aeromatch_cli.workspace import read_json
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED

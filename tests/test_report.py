@@ -18,6 +18,7 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.files import write_atomically, write_json
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
 from aeromatch_cli.report import gathering
@@ -28,7 +29,7 @@ from aeromatch_cli.report.previews import chosen_previews
 from aeromatch_cli.report.rows import ImageRow, PairRow, stage_rows
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.workspace import Workspace, write_atomically, write_json
+from aeromatch_cli.workspace import Workspace
 
 NASTY = '<img src=x onerror=alert(1)> & "ü b".png'
 WIDTH, HEIGHT = 160, 128

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from conftest import IMAGES, UNORIENTED, Site, invoke
 
+from aeromatch_cli.files import read_json
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.stages import context
-from aeromatch_cli.workspace import Workspace, read_json
+from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED

@@ -16,12 +16,12 @@ from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.cameras import MODELS, colmap_params
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.synthetic import Truth, load_truth, noise, render_block, transfer
-from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.render import render_image
 from aeromatch_cli.synthetic.sensor import Development
 from aeromatch_cli.synthetic.shade import Stage
 from aeromatch_cli.synthetic.solids import Material
+from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.terrain import Area, Flat, sample_terrain
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 from conftest import PAGE, UNORIENTED, Site, invoke
 
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.files import read_json
 from aeromatch_cli.stages import export, pairs, unchanged
-from aeromatch_cli.workspace import read_json
 
 SETTINGS = UNORIENTED
 

@@ -20,18 +20,11 @@ from pydantic import Field
 from aeromatch_cli.config import FAMILIES
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import BrokenFileError, ConfigError, WorkspaceError
+from aeromatch_cli.files import read_json, remove_stale_temporaries, write_atomically, write_json, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint, image_fingerprint, stable_hash
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.workspace import (
-    FORMAT_VERSION,
-    Workspace,
-    read_json,
-    remove_stale_temporaries,
-    write_atomically,
-    write_json,
-    write_text,
-)
+from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
 
 class Recipe(Strategy):

@@ -153,9 +153,9 @@ def init(
 
     def call() -> Result:
         from aeromatch_cli.config.overview import first_settings
+        from aeromatch_cli.files import write_text
         from aeromatch_cli.images.remote import is_remote
         from aeromatch_cli.stages.run import Result
-        from aeromatch_cli.workspace import write_text
 
         if images is None:
             raise ConfigError("no images: give --images DIR")

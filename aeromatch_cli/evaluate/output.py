@@ -18,9 +18,10 @@ from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.evaluate.plots import PLOTS
 from aeromatch_cli.evaluate.totals import ENOUGH_CORRECT, PairRow, by_condition, total
 from aeromatch_cli.evaluate.work import MIN_OVERLAP, Evaluation
+from aeromatch_cli.files import write_atomically, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.stages.run import execute
-from aeromatch_cli.workspace import Workspace, write_atomically, write_json, write_text
+from aeromatch_cli.workspace import Workspace
 
 FORMAT_VERSION = 1
 _SHOWN = ("pairs", "possible", "kept", "correct", "correctness", "recall", "median_error_px", "coverage", "auc_5deg")

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import differing, load
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
-from aeromatch_cli.workspace import opened_workspace, read_json
+from aeromatch_cli.workspace import opened_workspace
 
 _LISTED = 10
 # Settings that change no result.

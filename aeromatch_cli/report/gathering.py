@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import FloatArray, Image, Pair
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import checked_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry
@@ -34,7 +35,6 @@ from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.workspace import read_json
 
 T = TypeVar("T")
 # Coverage counts the cells of a grid of this many rows and columns that hold a verified match.

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
 from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.files import read_json, write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.geometry.footprints import block_footprints
@@ -41,7 +42,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.workspace import Workspace, read_json, write_record, write_text
+from aeromatch_cli.workspace import Workspace
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
 MAX_TABLE_ROWS = 2000
@@ -90,15 +91,7 @@ def told_digests(workspace: Workspace) -> dict[str, str]:
 
 def render(context: Context, found: Gathered) -> str:
     """The page as text."""
-    import jinja2
-
     pairs, images = found.pairs, found.images
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["number"] = number
-    source = resources.files("aeromatch_cli.report") / "page.html.jinja"
-    template = environment.from_string(source.read_text(encoding="utf-8"))
     judged = (row for row in pairs if row.state != NOT_JUDGED)
     facts = summarise(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
     wrong = {i: float(angle) for i, angle in _facts(context, "orient").get("wrong_attitudes", {}).items()}
@@ -111,7 +104,7 @@ def render(context: Context, found: Gathered) -> str:
     pictures = thumbnails(context)
     drawn, keys = pair_data(context, pairs, pictures, found.drawn)
     drawn.write_beside(context.workspace.report.parent / "pairs")
-    return template.render(
+    return _template().render(
         version=__version__,
         colours=COLOURS,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -325,6 +318,17 @@ def _adjusted_facts(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _metres(errors_m: Sequence[float]) -> str:
     return " / ".join(f"{error:.3f}" for error in errors_m) + " m (x / y / z)"
+
+
+def _template() -> Any:
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["number"] = number
+    source = resources.files("aeromatch_cli.report") / "page.html.jinja"
+    return environment.from_string(source.read_text(encoding="utf-8"))
 
 
 def _settings_text(context: Context) -> str:

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, Image
+from aeromatch_cli.files import write_text
 from aeromatch_cli.report.figures import evenly_chosen
 from aeromatch_cli.report.previews import error_classes, turned_points
 from aeromatch_cli.report.rows import PairRow
 from aeromatch_cli.report.thumbnails import Thumbnails
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.workspace import write_text
 
 MAX_MATCHES = 80
 # Places are stored as so many steps of a picture's width and height.

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import to_colour8
-from aeromatch_cli.workspace import write_atomically
 
 # Longer side of an image in a picture, pixels.
 _SIDE_PX = 1400

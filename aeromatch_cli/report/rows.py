@@ -12,9 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.workspace import Workspace, read_json
+from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
 STAGE_ORDER = (

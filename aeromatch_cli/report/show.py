@@ -16,6 +16,7 @@ import numpy as np
 from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS
 from aeromatch_cli.formats.reading import readable
@@ -32,7 +33,7 @@ from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
-from aeromatch_cli.workspace import Workspace, opened_workspace, read_json
+from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Partners that are listed one by one.
 _LISTED = 30

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
 from aeromatch_cli.report.stretches import made_of, stretches
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.workspace import write_atomically
 
 # The page holds the pictures of at most so many images; those of a larger block are files beside it.
 MAX_IMAGES = 300

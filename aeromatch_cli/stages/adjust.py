@@ -15,6 +15,7 @@ import numpy as np
 from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.files import translated_os_errors, whole_record, write_atomically, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
@@ -28,7 +29,6 @@ from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
-from aeromatch_cli.workspace import translated_os_errors, whole_record, write_atomically, write_record, write_text
 
 VERSION = 18
 # A focal length that the adjustment changed by more than this share is said.

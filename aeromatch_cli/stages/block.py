@@ -23,13 +23,14 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.files import read_json
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
-from aeromatch_cli.workspace import FORMAT_VERSION, Workspace, read_json
+from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
 log = logging.getLogger("aeromatch")
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, Pair, Verdict
+from aeromatch_cli.files import read_json, translated_os_errors, write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import read_adjusted, write_adjusted
 from aeromatch_cli.formats.archives import load_checked
@@ -29,7 +30,7 @@ from aeromatch_cli.stages.filter import Judged, select, summarise, verified_pair
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
-from aeromatch_cli.workspace import Workspace, read_json, translated_os_errors, write_atomically
+from aeromatch_cli.workspace import Workspace
 
 VERSION = 7
 

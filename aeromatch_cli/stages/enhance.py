@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Image
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.files import whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
@@ -18,7 +19,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import PIPELINE_VERSION, library_version
 from aeromatch_cli.strategies import Enhanced, Enhancer
-from aeromatch_cli.workspace import Workspace, whole_record, write_atomically, write_record
+from aeromatch_cli.workspace import Workspace
 
 # Among a stage's facts: how many images are not enhanced because they and those they are paired with were taken under
 # the same illumination.

@@ -9,6 +9,7 @@ from typing import Any
 
 from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.files import changed_files, read_json, translated_os_errors, write_record
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.stages import refine
 from aeromatch_cli.stages.consistency import final_block, final_pairs
@@ -17,7 +18,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint
 from aeromatch_cli.stages.stage_report import StageReport, run_stage, unexplained
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.workspace import Workspace, changed_files, read_json, translated_os_errors, write_record
+from aeromatch_cli.workspace import Workspace
 
 log = logging.getLogger("aeromatch")
 

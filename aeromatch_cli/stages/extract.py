@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Features, Image
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
@@ -17,7 +18,6 @@ from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Extractor
-from aeromatch_cli.workspace import write_atomically
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Candidates, FloatArray, Matches, Pair
+from aeromatch_cli.files import read_json, write_atomically
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.rows import (
@@ -31,7 +32,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import VERSION as CHAIN_VERSION
 from aeromatch_cli.strategies.filters.chain import Filter
-from aeromatch_cli.workspace import Workspace, read_json, write_atomically
+from aeromatch_cli.workspace import Workspace
 
 # Keypoints (K, 2) of an image, stored pixels, and their colours (K, 3) where the extractor kept them.
 Side = tuple[FloatArray, NDArray[np.uint8] | None]

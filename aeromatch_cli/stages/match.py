@@ -9,6 +9,7 @@ from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
@@ -23,7 +24,7 @@ from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
-from aeromatch_cli.workspace import Workspace, write_atomically
+from aeromatch_cli.workspace import Workspace
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
 from aeromatch_cli.errors import InputError
+from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
@@ -43,7 +44,6 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
-from aeromatch_cli.workspace import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
 
 log = logging.getLogger("aeromatch")
 

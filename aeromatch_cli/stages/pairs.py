@@ -13,6 +13,7 @@ from aeromatch_cli.config import Settings, dump
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
+from aeromatch_cli.files import read_json, write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
 from aeromatch_cli.stages import orient
@@ -25,7 +26,7 @@ from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
-from aeromatch_cli.workspace import Workspace, read_json, write_record, write_text
+from aeromatch_cli.workspace import Workspace
 
 log = logging.getLogger("aeromatch")
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
+from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
 from aeromatch_cli.formats.refined import write_refined
@@ -32,7 +33,6 @@ from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, REACH_PX, LeastSquares, Patches
-from aeromatch_cli.workspace import read_json, translated_os_errors, whole_record, write_atomically, write_record
 
 VERSION = 1
 _PATCHES = "patches"

@@ -14,6 +14,7 @@ from aeromatch_cli import report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
+from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_os_errors, whole_record
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages import (
@@ -39,14 +40,7 @@ from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.workspace import (
-    Workspace,
-    locked,
-    read_json,
-    remove_stale_temporaries,
-    translated_os_errors,
-    whole_record,
-)
+from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Image, Neighbour, Pose, View
+from aeromatch_cli.files import whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import write_png
@@ -20,7 +21,6 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
-from aeromatch_cli.workspace import whole_record, write_atomically, write_record
 
 # Name of the source view that images get besides their simulated ones where other images have no attitude.
 _ADDED = "as-taken"

@@ -12,10 +12,11 @@ from typing import Any, TypeVar
 
 from aeromatch_cli.data import Pair
 from aeromatch_cli.executor import Outcome
+from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.workspace import Workspace, read_json, write_json, write_text
+from aeromatch_cli.workspace import Workspace
 
 T = TypeVar("T")
 

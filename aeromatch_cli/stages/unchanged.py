@@ -15,11 +15,12 @@ from typing import Any
 
 from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
+from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages.pairs import chosen_strategies
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.workspace import Workspace, read_json, write_json
+from aeromatch_cli.workspace import Workspace
 
 # Their arithmetic decides results.
 _LIBRARIES = ("numpy", "opencv-python-headless", "poselib", "pycolmap", "torch")

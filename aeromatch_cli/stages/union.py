@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
+from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
@@ -33,7 +34,7 @@ from aeromatch_cli.stages.context import Context, Union
 from aeromatch_cli.stages.rows import features_of
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, run_stage
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
-from aeromatch_cli.workspace import Workspace, write_atomically, write_text
+from aeromatch_cli.workspace import Workspace
 
 VERSION = 1
 # Keypoints of two steps that are nearer than this are one.

@@ -17,7 +17,7 @@ from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.geometry.cameras import resized
 from aeromatch_cli.synthetic import flights, presets, write
-from aeromatch_cli.synthetic.flights import Flight, Station
+from aeromatch_cli.synthetic.flights import Flight
 from aeromatch_cli.synthetic.imagery import GroundImagery, load_imagery
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.presets import PRESETS
@@ -26,6 +26,7 @@ from aeromatch_cli.synthetic.render import View, look_at, render_image
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
 from aeromatch_cli.synthetic.sensor import Development, meter
 from aeromatch_cli.synthetic.shade import Stage
+from aeromatch_cli.synthetic.stations import Station
 from aeromatch_cli.synthetic.terrain import Area
 from aeromatch_cli.synthetic.write import read_raster
 
@@ -98,7 +99,7 @@ def render_block(
 ) -> SynthSummary:
     """Render a block into the folder `out`; equal arguments give equal files, byte for byte, whatever the jobs.
 
-    flight: one of flights.FLIGHTS. lens: one of geometry.cameras.MODELS. height_m: flying height above the datum
+    flight: one of flight_plans.FLIGHTS. lens: one of geometry.cameras.MODELS. height_m: flying height above the datum
     instead of the preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture:
     folder of pictures to lay over the ground. An interrupted call goes on where it was. Raises ConfigError on an
     unknown name, an impossible size or number, or a folder that holds another block; WorkspaceError where `out` cannot

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.cameras import from_colmap, normalise, project
-from aeromatch_cli.synthetic.flights import Exterior
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
+from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.terrain import Area
 from aeromatch_cli.synthetic.write import POSE_COLUMNS, TRUTH_FORMAT, depth_path, read_raster, sun_path, surface_path
 

@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.geometry.cameras import colmap_params
-from aeromatch_cli.synthetic.flights import Exterior, Flight
+from aeromatch_cli.synthetic.flights import Flight
 from aeromatch_cli.synthetic.render import Rendered
+from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.terrain import GroundGrid
 
 TRUTH_FORMAT = "aeromatch rendered block"

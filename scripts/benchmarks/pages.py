@@ -23,7 +23,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from aeromatch_cli.workspace import write_text
+from aeromatch_cli.files import write_text
 from benchmarks.stamps import REPOSITORY, Stamp, Versions, changed, present_versions, said
 
 FOLDER = REPOSITORY / "docs" / "results"

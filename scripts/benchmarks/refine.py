@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from itertools import product
 
 from aeromatch_cli.config import load
+from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.synthetic import PRESETS
-from aeromatch_cli.workspace import read_json, write_json
 from benchmarks import options, stamps
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import NOISY_POSES, render_asked

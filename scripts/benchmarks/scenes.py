@@ -16,12 +16,12 @@ import numpy as np
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
+from aeromatch_cli.files import write_json
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
 from aeromatch_cli.geometry.cameras import colmap_params, from_colmap
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink, shrink_camera
 from aeromatch_cli.synthetic import render_block
-from aeromatch_cli.workspace import write_json
 from benchmarks.options import size_px
 from benchmarks.peers.base import Scene
 from benchmarks.sources import code_digest

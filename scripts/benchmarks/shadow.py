@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli.files import write_json
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path
-from aeromatch_cli.workspace import write_json
 from benchmarks import options, stamps
 from benchmarks.processes import fresh_process, limit_threads, peak_mb
 from benchmarks.scenes import render_once

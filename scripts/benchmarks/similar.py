@@ -15,9 +15,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.strategies.pairings.overlap import Overlap
-from aeromatch_cli.workspace import read_json
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import read_block
 from benchmarks.tables import Row, markdown, percent

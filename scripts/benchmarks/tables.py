@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from aeromatch_cli.workspace import write_text
+from aeromatch_cli.files import write_text
 
 Row = dict[str, Any]
 T = TypeVar("T")

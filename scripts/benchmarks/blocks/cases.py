@@ -21,9 +21,9 @@ from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.metrics import GRID_CELLS, thin
 from aeromatch_cli.evaluate.reference import load_reference
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX
+from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.strategies.pairings import PAIRINGS
-from aeromatch_cli.workspace import read_json, write_json, write_text
 from benchmarks.blocks import steps
 from benchmarks.blocks.steps import run_step
 from benchmarks.orient.cases import worsened

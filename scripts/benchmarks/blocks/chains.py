@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.evaluate.mapping import map_database
-from aeromatch_cli.workspace import read_json, write_json
+from aeromatch_cli.files import read_json, write_json
 from benchmarks import options, stamps
 from benchmarks.blocks import steps
 from benchmarks.blocks.cases import chosen_images

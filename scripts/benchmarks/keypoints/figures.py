@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.fingerprints import file_digest, fingerprint
-from aeromatch_cli.workspace import read_json, write_json
 from benchmarks.peers.base import Options
 from benchmarks.scenes import Judged, JudgedPair
 from benchmarks.sources import GROUND_CODE, OUR_CODE, code_digest, library_versions

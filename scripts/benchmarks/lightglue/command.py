@@ -31,11 +31,11 @@ from trainings.lightglue.validation import LIKE_DEG, LIKE_OCTAVES, Found, answer
 from trainings.runs import check_recipe
 
 from aeromatch_cli.config import load
+from aeromatch_cli.files import write_text
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue import LightGlue
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
 from aeromatch_cli.nets.precision import has_bfloat16
-from aeromatch_cli.workspace import write_text
 from benchmarks import options, stamps
 from benchmarks.lightglue.costs import BLOCK_PAIRS, MATCHERS, block_table, first_keypoints, forward_table, jobs_table
 from benchmarks.processes import limit_threads

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import load, parse_method
+from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
-from aeromatch_cli.workspace import write_atomically
 from benchmarks.peers.base import Found, Method, Options, Scene
 from benchmarks.peers.table import PEERS, method, reads_poses
 from benchmarks.processes import fresh_process, watched

@@ -40,8 +40,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.synthetic import render_block
-from aeromatch_cli.workspace import read_json, write_json
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.orient.cases import CASES, worsened

@@ -1,0 +1,77 @@
+"""One picture to take: its exterior orientation and its camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeromatch_cli.data import Camera, FloatArray, Pose
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import MODELS, from_colmap
+from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
+from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
+
+
+@dataclass(frozen=True)
+class Exterior:
+    """A pose as it is written: projection centre in metres and photogrammetric angles in degrees."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    omega_deg: float
+    phi_deg: float
+    kappa_deg: float
+
+    def pose(self) -> Pose:
+        center_m = np.array([self.x_m, self.y_m, self.z_m])
+        return Pose(center_m, from_omega_phi_kappa(self.omega_deg, self.phi_deg, self.kappa_deg), 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Station:
+    """One picture to take.
+
+    sortie: which flight of the day (0 or 1): light and season come from it. height_m: flying height above the datum
+    (z = 0) that was planned for this camera; the picture's own differs by the wobble.
+    """
+
+    exterior: Exterior
+    camera_id: str
+    sortie: int
+    height_m: float
+
+
+def make_camera(lens: str, width_px: int, height_px: int, focal_share: float) -> Camera:
+    """Camera of a lens model whose focal length is focal_share picture widths.
+
+    The principal point lies 0.4 % off the middle; 1.5 % of barrel distortion in the corners and a tenth of that
+    decentred, where the model has them; one-to-one over the picture. Raises ConfigError on an unknown lens.
+    """
+    if lens not in MODELS:
+        raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}")
+    focal = focal_share * width_px
+    r2 = (width_px**2 + height_px**2) / (4.0 * focal**2)
+    k2_share = 0.006 if "k2" in MODELS[lens] else 0.0
+    values = {
+        "f": focal,
+        "fx": focal,
+        "fy": 1.001 * focal,
+        "cx": 0.504 * width_px,
+        "cy": 0.4965 * height_px,
+        "k1": -(0.015 + k2_share) / r2,
+        "k2": k2_share / r2**2,
+        "p1": 0.0004 / float(np.sqrt(r2)),
+        "p2": -0.0003 / float(np.sqrt(r2)),
+    }
+    return from_colmap(lens, width_px, height_px, tuple(values[name] for name in MODELS[lens]))
+
+
+def rounded(position_m: FloatArray, angles_deg: FloatArray) -> Exterior:
+    wrapped = (np.asarray(angles_deg) + 180.0) % 360.0 - 180.0
+    return Exterior(*(round(float(v), 4) for v in position_m), *(round(float(v), 6) for v in wrapped))
+
+
+def exterior_of(position_m: FloatArray, world_from_photo: FloatArray) -> Exterior:
+    return rounded(position_m, np.array(to_omega_phi_kappa(CAM_FROM_PHOTO @ world_from_photo.T)))
