@@ -36,7 +36,7 @@ from typing import Any, Literal, cast
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats.reading import given_bytes
+from aeromatch_cli.formats.reading import given_bytes, text_encoding
 
 PositionKind = Literal["grid", "geographic"]
 AttitudeKind = Literal["omega_phi_kappa", "yaw_pitch_roll", "quaternion", "none"]
@@ -198,10 +198,11 @@ def _text(path: Path) -> str:
         raise ConfigError(
             f"pose list {path} cannot be read ({error.strerror}): give a CSV file, or exif, with --poses"
         ) from error
-    kind, encoding = ("UTF-16", "utf-16") if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else ("UTF-8", "utf-8-sig")
+    encoding = text_encoding(raw)
     try:
         text = raw.decode(encoding)
     except UnicodeDecodeError as error:
+        kind = "UTF-16" if encoding == "utf-16" else "UTF-8"
         raise ConfigError(f"pose list {path} is not {kind} text: save it as UTF-8 CSV") from error
     if "\0" in text:
         raise ConfigError(f"pose list {path} is a binary file: give a CSV or TXT file")

@@ -27,6 +27,11 @@ def check_given(path: Path) -> None:
         raise OSError(errno.EINVAL, "it is a pipe or a device")
 
 
+def text_encoding(raw: bytes) -> str:
+    """ "utf-16" where text begins with its mark, else "utf-8-sig", UTF-8 with or without one."""
+    return "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+
+
 def say_damaged(path: Path, error: BrokenFileError) -> None:
     """A word on a file that counts as absent because it is broken; none on one that is absent."""
     if path.is_file():

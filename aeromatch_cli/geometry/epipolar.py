@@ -71,13 +71,21 @@ def triangulate(center0_m: FloatArray, rays0: FloatArray, center1_m: FloatArray,
 
     NaN where the rays are parallel (angle below 0.1 degrees) or meet behind a camera.
     """
-    between = center1_m - center0_m
-    cosine = (rays0 * rays1).sum(axis=1)
-    determinant = 1.0 - cosine**2
-    safe = np.where(determinant > np.sin(np.deg2rad(0.1)) ** 2, determinant, np.nan)
-    along0, along1 = rays0 @ between, rays1 @ between
-    depth0 = (along0 - cosine * along1) / safe
-    depth1 = (cosine * along0 - along1) / safe
+    depth0, depth1, sine = ray_depths(center1_m - center0_m, rays0, rays1)
     points = 0.5 * (center0_m + depth0[:, None] * rays0 + center1_m + depth1[:, None] * rays1)
-    points[~((depth0 > 0) & (depth1 > 0))] = np.nan
+    points[~((depth0 > 0) & (depth1 > 0) & (sine > np.sin(np.deg2rad(0.1))))] = np.nan
     return points
+
+
+def ray_depths(
+    between_m: FloatArray, rays0: FloatArray, rays1: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Along two bundles of rays (N, 3 unit vectors each), where they come nearest to each other: (N,) distances from
+    either centre in metres, negative behind it, and the sine of the angle between them, at least 1e-9.
+
+    between_m: (3,) from the first centre to the second. Distances of parallel rays are finite and mean nothing.
+    """
+    cosine = (rays0 * rays1).sum(axis=1)
+    sine2 = np.maximum(1.0 - cosine**2, 1e-18)
+    along0, along1 = rays0 @ between_m, rays1 @ between_m
+    return (along0 - cosine * along1) / sine2, (cosine * along0 - along1) / sine2, np.sqrt(sine2)

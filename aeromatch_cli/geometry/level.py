@@ -6,6 +6,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray, PairGeometry
 from aeromatch_cli.geometry.cameras import project, world_rays
+from aeromatch_cli.geometry.epipolar import ray_depths
 
 # Rays that meet at a smaller angle do not tell where, degrees; then the point lies on the ground.
 _LEAST_ANGLE_DEG = 1.0
@@ -42,10 +43,6 @@ def _heights(geometry: PairGeometry, points0_px: FloatArray, points1_px: FloatAr
     assert ground_z_m is not None
     rays0 = world_rays(geometry.camera0, np.asarray(pose0.world_rotation), points0_px)
     rays1 = world_rays(geometry.camera1, np.asarray(pose1.world_rotation), points1_px)
-    between_m = pose1.center_m - pose0.center_m
-    cosine = (rays0 * rays1).sum(axis=1)
-    sine2 = np.maximum(1.0 - cosine**2, 1e-12)
-    along0, along1 = rays0 @ between_m, rays1 @ between_m
-    depth0, depth1 = (along0 - cosine * along1) / sine2, (cosine * along0 - along1) / sine2
-    meet = (depth0 > 0.0) & (depth1 > 0.0) & (np.sqrt(sine2) > np.sin(np.deg2rad(_LEAST_ANGLE_DEG)))
+    depth0, depth1, sine = ray_depths(pose1.center_m - pose0.center_m, rays0, rays1)
+    meet = (depth0 > 0.0) & (depth1 > 0.0) & (sine > np.sin(np.deg2rad(_LEAST_ANGLE_DEG)))
     return np.asarray(np.where(meet, pose0.center_m[2] + rays0[:, 2] * depth0, ground_z_m))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Verdict
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Pose
+from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.cameras import normalise
 
 # Camera axes (x right, y down, z forward) of a camera that looks straight down, where no attitude is known.
@@ -12,16 +15,26 @@ _NADIR = np.diag([1.0, -1.0, -1.0])
 
 
 def placed_alone(
-    verdict: Verdict,
-    image_ids: tuple[str, str],
-    cameras: tuple[Camera, Camera],
-    points_px: tuple[FloatArray, FloatArray],
-    attitude0: FloatArray | None,
+    block: AdjustedBlock,
+    image_id0: str,
+    entry: VerifiedEntry,
+    cameras: Mapping[str, Camera],
+    keypoints_px: Callable[[str], FloatArray],
+    pose0: Pose | None,
 ) -> AdjustedBlock | None:
-    """`block_of_pair` by what verified the pair; None where that is no relative orientation."""
-    if verdict.model_kind != "E" or verdict.relative_rotation is None:
+    """`block_of_pair` by what verified a pair; None where the block holds both images, or where that is no relative
+    orientation.
+
+    cameras: image_id -> camera of the verification. keypoints_px: (N, 2) of an image. pose0: as far as it is known.
+    """
+    ids, verdict = (image_id0, entry.image_id1), entry.verdict
+    if set(ids) <= block.poses.keys() or verdict.model_kind != "E" or verdict.relative_rotation is None:
         return None
-    return block_of_pair(image_ids, cameras, points_px, verdict.model, verdict.relative_rotation, attitude0)
+    points = [keypoints_px(image_id)[entry.matches.indices[:, side]] for side, image_id in enumerate(ids)]
+    return block_of_pair(
+        ids, (cameras[ids[0]], cameras[ids[1]]), (points[0], points[1]), verdict.model, verdict.relative_rotation,
+        None if pose0 is None else pose0.world_rotation,
+    )  # fmt: skip
 
 
 def block_of_pair(

@@ -15,6 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
+from aeromatch_cli.geometry.epipolar import ray_depths
 from aeromatch_cli.orientation.bridges import probable_enough
 from aeromatch_cli.orientation.probability import MatchEvidence, off_neighbours_px, probabilities, usual_off_px
 
@@ -365,11 +366,8 @@ def _epipolar_px(
 
 def _depths(between_m: FloatArray, rays0: FloatArray, rays1: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(M,) distance along rays0 to where the rays meet, negative behind either camera, and the angle between them."""
-    cosine = (rays0 * rays1).sum(axis=1)
-    sine2 = np.maximum(1.0 - cosine**2, 1e-18)
-    along0, along1 = rays0 @ between_m, rays1 @ between_m
-    depth0, depth1 = (along0 - cosine * along1) / sine2, (cosine * along0 - along1) / sine2
-    return np.where(depth1 > 0.0, depth0, -np.abs(depth0)), np.arcsin(np.minimum(np.sqrt(sine2), 1.0))
+    depth0, depth1, sine = ray_depths(between_m, rays0, rays1)
+    return np.where(depth1 > 0.0, depth0, -np.abs(depth0)), np.arcsin(np.minimum(sine, 1.0))
 
 
 def _away_px(view: _Rays, keypoints: IntArray, points_m: FloatArray) -> FloatArray:

@@ -71,7 +71,7 @@ def run(context: Context) -> StageReport:
         cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
         keypoints_px = contents_of(context).keypoints_px
-        pairs = [_matched(context, adjusted, keypoints_px, pair, entry) for pair, entry in entries]
+        pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]
         limits = Limits(
             recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
         )
@@ -104,20 +104,16 @@ def _matched(
     context: Context,
     adjusted: AdjustedBlock,
     keypoints_px: Callable[[str], FloatArray],
-    pair: Pair,
+    image_id0: str,
     entry: VerifiedEntry,
 ) -> MatchedKeypoints:
     """The matches of a verified pair; with its own geometry where the adjusted block lacks one of its images."""
-    ids, indices, alone = (pair.image_id0, pair.image_id1), entry.matches.indices, None
-    if not set(ids) <= adjusted.poses.keys() and _judges_pairs(context):
-        pose = context.block.poses.get(ids[0])
-        cameras = [context.block.cameras[context.image_by_id[i].camera_id] for i in ids]
-        points = [keypoints_px(i)[indices[:, side]] for side, i in enumerate(ids)]
-        alone = placed_alone(
-            entry.verdict, ids, (cameras[0], cameras[1]), (points[0], points[1]),
-            None if pose is None else pose.world_rotation,
-        )  # fmt: skip
-    return MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
+    alone = None
+    if _judges_pairs(context):
+        cameras = {i: context.block.cameras[context.image_by_id[i].camera_id] for i in (image_id0, entry.image_id1)}
+        pose0 = context.block.poses.get(image_id0)
+        alone = placed_alone(adjusted, image_id0, entry, cameras, keypoints_px, pose0)
+    return MatchedKeypoints(image_id0, entry.image_id1, entry.matches.indices, entry.matches.scores, alone)
 
 
 def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:

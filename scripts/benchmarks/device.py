@@ -42,16 +42,7 @@ KEYPOINTS, PATCHES, SIDE = 2048, 8192, 8192
 def limit_flops(repeats: int) -> float:
     """Multiplications and additions a second in a bfloat16 matrix product."""
     one, other = (torch.randn(SIDE, SIDE, device="cuda", dtype=torch.bfloat16) for _ in range(2))
-    return 2.0 * SIDE**3 / _seconds(lambda: one @ other, repeats)
-
-
-def _seconds(call: Callable[[], object], repeats: int) -> float:
-    def finished() -> None:
-        call()
-        torch.cuda.synchronize()
-
-    finished()
-    return median_seconds(finished, repeats)[0]
+    return 2.0 * SIDE**3 / median_seconds(lambda: one @ other, repeats, "cuda")[0]
 
 
 def _flops(call: Callable[[], object]) -> float:
@@ -101,7 +92,7 @@ def measured(args: Any) -> list[Row]:
     rows: list[Row] = [{"part": "limit", "device": device, "tflops": limit / 1e12}]
     with torch.inference_mode():
         for name, unit, count, call in network_calls(gray, args.batch):
-            seconds = _seconds(call, args.repeats)
+            seconds = median_seconds(call, args.repeats, "cuda")[0]
             rate = _flops(call) / seconds
             rows.append(
                 {"part": name, "device": device, "unit": unit, "rate": count / seconds, "tflops": rate / 1e12,
@@ -109,7 +100,7 @@ def measured(args: Any) -> list[Row]:
             )  # fmt: skip
             print(rows[-1], flush=True)
     for where in ("cuda", "cpu"):
-        seconds = _seconds(whole_call(gray, where), args.repeats if where == "cuda" else 1)
+        seconds = median_seconds(whole_call(gray, where), args.repeats if where == "cuda" else 1, "cuda")[0]
         rows.append({"part": "learned, whole", "device": where, "unit": "images", "rate": 1.0 / seconds})
         print(rows[-1], flush=True)
     return rows

@@ -102,15 +102,9 @@ def _pairs(
     for image_id in sorted(cameras):
         path = workspace.verified(image_id)
         for entry in read_verified_row(path).values() if path.is_file() else ():
-            if entry.verdict.state != "verified":
-                continue
-            ids, indices, alone = (image_id, entry.image_id1), entry.matches.indices, None
-            if not set(ids) <= block.poses.keys():
-                both = cameras[ids[0]], cameras[ids[1]]
-                points = keypoints[ids[0]][indices[:, 0]], keypoints[ids[1]][indices[:, 1]]
-                attitude = poses[image_id].world_rotation if image_id in poses else None
-                alone = placed_alone(entry.verdict, ids, both, points, attitude)
-            yield MatchedKeypoints(*ids, indices, entry.matches.scores, alone)
+            if entry.verdict.state == "verified":
+                alone = placed_alone(block, image_id, entry, cameras, keypoints.__getitem__, poses.get(image_id))
+                yield MatchedKeypoints(image_id, entry.image_id1, entry.matches.indices, entry.matches.scores, alone)
 
 
 def blocks_of(args: argparse.Namespace, seeds: Sequence[int]) -> Iterator[Block]:

@@ -69,12 +69,21 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def median_seconds(call: Callable[[], Any], runs: int) -> tuple[float, Any]:
-    """Median of some calls after the first, and what it returned."""
-    value, seconds = call(), []
+def median_seconds(call: Callable[[], Any], runs: int, device: str = "cpu") -> tuple[float, Any]:
+    """Median of some calls after the first, and what it returned. device: where they work; "cuda" is waited for."""
+
+    def finished() -> Any:
+        value = call()
+        if device == "cuda":
+            import torch
+
+            torch.cuda.synchronize()
+        return value
+
+    value, seconds = finished(), []
     for _ in range(runs):
         started = time.perf_counter()
-        call()
+        finished()
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds), value
 

@@ -16,14 +16,13 @@ from aeromatch_cli.blocks.lenses import Nearest
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats.reading import given_bytes
+from aeromatch_cli.formats.reading import given_bytes, text_encoding
 from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
 _LARGEST_BYTES = 2_000_000_000
 # A name that is an image's.
 IMAGE = re.compile(r".+\.(jpe?g|tiff?|jp2|j2k|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
-_UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,9 @@ class Source:
     @cached_property
     def text(self) -> str:
         """Empty where the file is no text (UTF-8, UTF-16 with its mark, else Latin-1)."""
-        if b"\0" in self.raw[:4096] and self.raw[:2] not in _UTF16:
+        encoding = text_encoding(self.raw)
+        if b"\0" in self.raw[:4096] and encoding != "utf-16":
             return ""
-        encoding = "utf-16" if self.raw[:2] in _UTF16 else "utf-8-sig"
         try:
             return self.raw.decode(encoding)
         except UnicodeDecodeError:

@@ -36,17 +36,6 @@ BLOCK_PAIRS = 16
 EVERYTHING = {"depth_confidence": -1.0, "width_confidence": -1.0}
 
 
-def _seconds(work: Callable[[], object], device: str) -> float:
-    """Median of REPEATS calls after one that does not count."""
-
-    def finished() -> None:
-        work()
-        if device == "cuda":
-            torch.cuda.synchronize()
-
-    return median_seconds(finished, REPEATS)[0]
-
-
 def forward_table(network: LightGlue, pair: Pair, device: str) -> str:
     """Every way on the same pair, all of whose keypoints enter."""
     ways = {
@@ -66,7 +55,7 @@ def forward_table(network: LightGlue, pair: Pair, device: str) -> str:
     lines: list[tuple[str, ...]] = []
     base = 0.0
     for name, way in ways.items():
-        seconds = _seconds(partial(way, pair), device) / (BATCH if "at once" in name else 1)
+        seconds = median_seconds(partial(way, pair), REPEATS, device)[0] / (BATCH if "at once" in name else 1)
         base = base or seconds
         lines.append((name, f"{seconds:.3f}", f"{1.0 / seconds:.1f}", f"{seconds / base:.2f}"))
         print(*lines[-1], file=sys.stderr, flush=True)
@@ -140,7 +129,7 @@ def _work(weights: Path, pair: Pair, threads: int) -> tuple[float, float]:
     torch.set_num_threads(threads)
     network = as_used(load_lightglue(weights), "cpu")
     before_mb = peak_mb()
-    seconds = _seconds(partial(_own(network, "cpu"), pair), "cpu")
+    seconds, _ = median_seconds(partial(_own(network, "cpu"), pair), REPEATS)
     return seconds, peak_mb() - before_mb
 
 
