@@ -12,7 +12,7 @@ import pytest
 from conftest import IMAGES, UNORIENTED, Site, contents
 
 from aeromatch_cli import workspace as workspace_module
-from aeromatch_cli.files import read_json
+from aeromatch_cli.files import read_json, write_atomically
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED
@@ -38,7 +38,7 @@ def test_read_only_workspace(site, monkeypatch):
 
 def test_full_disk_stops_and_resumes(done_site, monkeypatch):
     work = done_site.root / "full"
-    write = workspace_module.write_atomically
+    write = write_atomically
     left = [9]
 
     def limited(path, fill):

@@ -73,7 +73,7 @@ def test_a_killed_writer_leaves_no_half_file(tmp_path: Path) -> None:
     path = tmp_path / "row.npz"
     path.write_bytes(b"old")
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom aeromatch_cli.workspace import write_atomically\n"
+        "import sys, time\nfrom pathlib import Path\nfrom aeromatch_cli.files import write_atomically\n"
         "def slow(stream):\n    stream.write(b'x' * 100_000)\n    stream.flush()\n    print('half', flush=True)\n"
         "    time.sleep(60)\nwrite_atomically(Path(sys.argv[1]), slow)\n"
     )

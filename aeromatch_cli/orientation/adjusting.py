@@ -40,8 +40,8 @@ _SHARED_POINTS = 8
 _FAR = 20.0
 # Images with fewer points than this in their model are taken out of it.
 MIN_OBSERVATIONS = 12
-# Headings are wrong beyond this, degrees.
-_WRONG_HEADING_DEG = 20.0
+# Headings are wrong beyond this, degrees, and so many standard deviations of the north that positions tell.
+_WRONG_HEADING_DEG, _WRONG_HEADING_SIGMAS = 20.0, 3.0
 # Given attitudes have an error in common of up to this, degrees: that of the mounting, or of their north.
 _COMMON_DEG = 1.0
 # So many positions hold a model in the world frame.
@@ -104,7 +104,8 @@ def believed_tilts(
     found = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])[known]
     turns = found.transpose(0, 2, 1) @ rotations[rows][known]
     headings = np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])
-    wrong = float(np.median(np.abs(np.rad2deg(headings)))) > _WRONG_HEADING_DEG
+    most_deg = max(_WRONG_HEADING_DEG, _WRONG_HEADING_SIGMAS * placement.north_sigma_deg)
+    wrong = float(np.median(np.abs(np.rad2deg(headings)))) > most_deg
     return np.full_like(ups, np.nan) if wrong else ups
 
 

@@ -33,12 +33,17 @@ _DOUBTFUL = 5.0
 # A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
 _STATED_RESIDUALS = 3.0
 _UNKNOWNS = 7  # of a similarity
-# How far from level the plane of best fit of a terrain usually is.
+# How far from level the plane of best fit of a terrain usually is, and from how many independent heights it comes: a
+# roof or a hillside lifts many points together.
 _LEVEL_SIGMA_DEG = 3.0
+_HEIGHTS = 4.0
+# Planes that are tried through three points, over so many points at most; one counts where half of all points are
+# nearer to it by this factor.
+_PLANES, _PLANE_POINTS, _CLEARLY = 300, 2000, 0.7
 # The mean of measured tilts is no better than this, whatever their number; they count where they agree to so many
-# degrees with each other, and with the terrain to so many.
+# degrees with each other, and with the terrain to so many, or standard deviations of the terrain.
 _TILT_SIGMA_DEG = 1.0
-_TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG = 10.0, 30.0
+_TILTS_AGREE_DEG, _TILTS_PLAUSIBLE_DEG, _TILTS_PLAUSIBLE_SIGMAS = 10.0, 30.0, 3.0
 # Tilts that contradict positions and terrain together by so many standard deviations have a fault in common: an angle
 # of another convention, a camera mounted askew. There the terrain counts less: it may be a slope.
 _TILTS_WRONG_SIGMAS, _SLOPE_SIGMA_DEG = 4.0, 6.0
@@ -56,7 +61,8 @@ class Placement:
     trusted: whether nearly all positions agree with the pictures as well as their standard deviations say.
     contradiction: why given positions were not used: "mirrored" (they fit only with the ground above the cameras),
     "scattered" (they do not fit), else "". level_sigma_deg: how exactly tilts or terrain say where up is. sigma_factor:
-    standard deviations of the positions, as the pictures show them, over those stated.
+    standard deviations of the positions, as the pictures show them, over those stated. north_sigma_deg: how exactly
+    positions say where north is.
     """
 
     scale: float
@@ -68,6 +74,7 @@ class Placement:
     contradiction: str = ""
     level_sigma_deg: float = np.inf
     sigma_factor: float = 1.0
+    north_sigma_deg: float = np.inf
 
     def points(self, points: FloatArray) -> FloatArray:
         """World points (N, 3) of model points (N, 3)."""
@@ -91,7 +98,7 @@ def place(
     the world, NaN where there is none; sigmas_m: (N,) their standard deviations. ups: (N, 3) unit vectors upwards in
     the model by the tilt that each camera has measured, NaN where it has none.
     """
-    by_terrain = _Vertical(_up(centers, points), _LEVEL_SIGMA_DEG)
+    by_terrain = _terrain(centers, points)
     vertical = _vertical(by_terrain, ups)
     known: BoolArray = np.asarray(np.isfinite(positions_m).all(axis=1))
     found = _by_positions(centers[known], positions_m[known], sigmas_m[known]) if known.sum() >= 2 else None
@@ -109,10 +116,10 @@ def place(
     stated_m = float(np.median(sigmas_m[agreeing]))
     sigma_m = _sigma_m(found, found.points(centers[agreeing]) - used_m, used_m, stated_m)
     found = replace(found, sigma_factor=sigma_m / max(stated_m, 1e-9))
-    information = _information(used_m, sigma_m)
-    if _off_level(found, information, used_m, by_terrain, vertical):
+    measured = _Measured(centers[agreeing], used_m, max(sigma_m, 1e-9))
+    if _off_level(found, measured, by_terrain, vertical):
         vertical = by_terrain
-    return _levelled(found, information, used_m, vertical)
+    return _levelled(found, measured, vertical)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +128,27 @@ class _Vertical:
 
     up: FloatArray
     sigma_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Centres in the model (N, 3), their positions in the world (N, 3), and the standard deviation of these."""
+
+    centers: FloatArray
+    positions_m: FloatArray
+    sigma_m: float
+
+    def fit(self, rotation: FloatArray) -> tuple[float, FloatArray]:
+        """Scale and translation (3,) that go best with a rotation."""
+        turned = self.centers @ rotation.T
+        arms, arms_m = turned - turned.mean(axis=0), self.positions_m - self.positions_m.mean(axis=0)
+        scale = float((arms * arms_m).sum() / max(float((arms**2).sum()), 1e-300))
+        return scale, self.positions_m.mean(axis=0) - scale * turned.mean(axis=0)
+
+    def off(self, rotation: FloatArray) -> FloatArray:
+        """(N, 3) residuals with that rotation, in standard deviations."""
+        scale, translation_m = self.fit(rotation)
+        return np.asarray((scale * self.centers @ rotation.T + translation_m - self.positions_m) / self.sigma_m)
 
 
 def _vertical(by_terrain: _Vertical, ups: FloatArray | None) -> _Vertical:
@@ -134,7 +162,8 @@ def _vertical(by_terrain: _Vertical, ups: FloatArray | None) -> _Vertical:
         up = np.average(measured, axis=0, weights=1.0 / (1.0 + (apart_deg / _TILTS_NEAR_DEG) ** 2))
     up = up / np.linalg.norm(up)
     apart_deg = np.rad2deg(np.arccos(np.clip(measured @ up, -1.0, 1.0)))
-    plausible = up @ by_terrain.up > np.cos(np.deg2rad(_TILTS_PLAUSIBLE_DEG))
+    most_deg = min(max(_TILTS_PLAUSIBLE_DEG, _TILTS_PLAUSIBLE_SIGMAS * by_terrain.sigma_deg), 90.0)
+    plausible = up @ by_terrain.up > np.cos(np.deg2rad(most_deg))
     spread_deg = float(np.median(apart_deg))
     sigma_deg = float(np.hypot(_TILT_SIGMA_DEG, spread_deg / np.sqrt(len(measured))))
     return _Vertical(up, sigma_deg) if plausible and spread_deg < _TILTS_AGREE_DEG else by_terrain
@@ -217,10 +246,7 @@ def _errors(fit: tuple[float, FloatArray, FloatArray], centers: FloatArray, posi
 
 def _level(centers: FloatArray, points: FloatArray, known: BoolArray, vertical: _Vertical) -> Placement:
     """Level, the median flying height LOCAL_FLYING_HEIGHT, the middle of the cameras at x = y = 0."""
-    up = vertical.up
-    east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
-    east /= np.linalg.norm(east)
-    rotation = np.array([east, np.cross(up, east), up])
+    rotation = _level_axes(vertical.up)
     ground = float(np.median((points @ rotation.T)[:, 2]))
     flying = float(np.median((centers @ rotation.T)[:, 2])) - ground
     scale = LOCAL_FLYING_HEIGHT / max(flying, 1e-12)
@@ -237,17 +263,6 @@ def _sigma_m(found: Placement, errors_m: FloatArray, used_m: FloatArray, stated_
     return sigma_m * (_DOUBTFUL if shared else 1.0)
 
 
-def _information(used_m: FloatArray, sigma_m: float) -> FloatArray:
-    """What the positions used (N, 3) say of a small turn of the block: (3, 3), per square radian.
-
-    Positions with standard deviation s that lie at r_i from their middle determine a small turn w with the information
-    sum [r_i]x^T [r_i]x / s^2, along a line none about it.
-    """
-    arms = used_m - used_m.mean(axis=0)
-    spread = np.eye(3) * (arms**2).sum() - arms.T @ arms
-    return np.asarray(spread / max(sigma_m, 1e-9) ** 2)
-
-
 def _common(errors_m: FloatArray, places_m: FloatArray) -> float:
     """Correlation of errors (N, 3) with those of the nearest place (N, 3)."""
     from scipy.spatial import cKDTree
@@ -258,55 +273,111 @@ def _common(errors_m: FloatArray, places_m: FloatArray) -> float:
     return float((errors_m * nearest).sum() / max((errors_m**2).sum(), 1e-12))
 
 
-def _off_level(
-    found: Placement, information: FloatArray, used_m: FloatArray, by_terrain: _Vertical, by_tilts: _Vertical
-) -> bool:
+def _off_level(found: Placement, measured: _Measured, by_terrain: _Vertical, by_tilts: _Vertical) -> bool:
     """Whether the tilts contradict what positions and terrain say together of where up is."""
-    slope = replace(by_terrain, sigma_deg=_SLOPE_SIGMA_DEG)
-    without = _levelled(found, information, used_m, slope)
+    slope = replace(by_terrain, sigma_deg=max(_SLOPE_SIGMA_DEG, by_terrain.sigma_deg))
+    without, covariance = _levelled(found, measured, slope)
     off_deg = np.rad2deg(np.arccos(np.clip((without.rotation @ by_tilts.up)[2], -1.0, 1.0)))
-    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(_SLOPE_SIGMA_DEG) ** 2
-    covariance = np.linalg.inv(information + level + 1e-9 * np.eye(3))
     sigma_deg = float(np.hypot(np.rad2deg(np.sqrt(np.diag(covariance)[:2].mean())), by_tilts.sigma_deg))
     return bool(off_deg > _TILTS_WRONG_SIGMAS * sigma_deg)
 
 
-def _levelled(found: Placement, information: FloatArray, used_m: FloatArray, vertical: _Vertical) -> Placement:
-    """Turned about the middle of the positions used (N, 3) to the most probable attitude of the block.
+def _levelled(found: Placement, measured: _Measured, vertical: _Vertical) -> tuple[Placement, FloatArray]:
+    """The most probable attitude of the block, and the covariance (3, 3) of a small turn of it, square radian.
 
-    Positions, by their information (3, 3), and tilts or terrain, which say where up is with their own standard
-    deviation, are weighed against each other.
+    Positions, and tilts or terrain, which say where up is with their own standard deviation, are weighed against each
+    other by least squares. Positions along one line say nothing of the turn about it: what they fit best is chance
+    there, and no place to start from. So the search starts level, too.
     """
+    from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    middle_m = used_m.mean(axis=0)
-    level = np.diag([1.0, 1.0, 0.0]) / np.deg2rad(vertical.sigma_deg) ** 2
-    total = np.eye(3)
-    for _ in range(20):
-        up = total @ found.rotation @ vertical.up
-        to_level = np.cross(up, [0.0, 0.0, 1.0])
-        if up[2] < 0.0:
-            to_level = to_level / max(float(np.linalg.norm(to_level)), 1e-9)
-        turned = Rotation.from_matrix(total).as_rotvec()
-        step = np.linalg.solve(information + level + 1e-9 * np.eye(3), level @ to_level - information @ turned)
-        if float(np.linalg.norm(step)) < 1e-7:
-            break
-        total = Rotation.from_rotvec(step).as_matrix() @ total
-    moved = total @ (found.translation_m - middle_m) + middle_m
-    rotation = total @ found.rotation
-    return replace(found, rotation=rotation, translation_m=moved, level_sigma_deg=vertical.sigma_deg)
+    best = None
+    for start in (found.rotation, _level_start(measured, vertical.up)):
+
+        def off(turn: FloatArray, start: FloatArray = start) -> FloatArray:
+            rotation = Rotation.from_rotvec(turn).as_matrix() @ start
+            up = rotation @ vertical.up
+            away = np.cross(up, [0.0, 0.0, 1.0])[:2]
+            if up[2] < 0.0:  # beyond a right angle the sine falls again
+                away = away / max(float(np.linalg.norm(away)), 1e-9) * (1.0 - up[2])
+            return np.concatenate([measured.off(rotation).ravel(), away / np.deg2rad(vertical.sigma_deg)])
+
+        solved = least_squares(off, np.zeros(3), x_scale=0.1)
+        if best is None or solved.cost < best[0]:
+            best = solved.cost, Rotation.from_rotvec(solved.x).as_matrix() @ start, solved.jac
+    assert best is not None
+    _, rotation, slopes = best
+    covariance = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(3))
+    scale, translation_m = measured.fit(rotation)
+    placed = replace(
+        found, scale=scale, rotation=rotation, translation_m=translation_m, level_sigma_deg=vertical.sigma_deg,
+        north_sigma_deg=float(np.rad2deg(np.sqrt(covariance[2, 2]))),
+    )  # fmt: skip
+    return placed, covariance
 
 
-def _up(centers: FloatArray, points: FloatArray) -> FloatArray:
-    """Unit normal (3,) of the plane through most points, towards the cameras; far points and outliers weigh less."""
-    middle = np.median(points, axis=0)
-    weights = np.ones(len(points))
-    normal = np.array([0.0, 0.0, 1.0])
+def _level_start(measured: _Measured, up: FloatArray) -> FloatArray:
+    """The rotation (3, 3) that makes up vertical, with the heading that fits the positions best."""
+    level = _level_axes(up)
+    arms = (measured.centers - measured.centers.mean(axis=0)) @ level.T
+    arms_m = measured.positions_m - measured.positions_m.mean(axis=0)
+    across = float((arms[:, 0] * arms_m[:, 1] - arms[:, 1] * arms_m[:, 0]).sum())
+    heading = np.arctan2(across, float((arms[:, :2] * arms_m[:, :2]).sum()))
+    c, s = np.cos(heading), np.sin(heading)
+    return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ level)
+
+
+def _level_axes(up: FloatArray) -> FloatArray:
+    """A rotation (3, 3) that takes the unit vector up to (0, 0, 1)."""
+    east = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    east /= np.linalg.norm(east)
+    return np.array([east, np.cross(up, east), up])
+
+
+def _terrain(centers: FloatArray, points: FloatArray) -> _Vertical:
+    """The normal of the plane through most points, towards the cameras; far points and outliers weigh less.
+
+    A plane through a narrow strip of rough ground is known less exactly: by its roughness over its width. Where houses
+    stand at one side of it, what fits all points best is no place to start from: planes through three points are tried.
+    """
+    plane = _plane(points, np.ones(len(points)))
+    rng = np.random.default_rng(0)
+    some = points if len(points) <= _PLANE_POINTS else points[rng.choice(len(points), _PLANE_POINTS, replace=False)]
+    nearer = _plane(some, _near(some, *_median_plane(some, rng)))
+    if nearer[3] < _CLEARLY * plane[3]:
+        plane = nearer
+    middle, normal, rough_deg, _ = plane
+    side = float(np.median((centers - middle) @ normal))
+    return _Vertical(normal if side >= 0.0 else -normal, float(np.hypot(_LEVEL_SIGMA_DEG, rough_deg)))
+
+
+def _plane(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+    """A point (3,) and the normal (3,) of a plane through most points, how exactly those that it goes through determine
+    it, degrees, and by how much points are off it (median). weights: (P,) of the points in the first step."""
+    middle, sizes, normal = np.zeros(3), np.ones(3), np.zeros(3)
     for _ in range(10):
         middle = np.average(points, axis=0, weights=weights)
-        normal = np.linalg.svd((points - middle) * np.sqrt(weights)[:, None], full_matrices=False)[2][2]
-        off = (points - middle) @ normal
-        scale = 1.4826 * float(np.median(np.abs(off))) or 1e-12
-        weights = 1.0 / (1.0 + (off / (2.0 * scale)) ** 2) ** 2
-    side = float(np.median((centers - middle) @ normal))
-    return normal if side >= 0.0 else -normal
+        sizes, axes = np.linalg.svd((points - middle) * np.sqrt(weights)[:, None], full_matrices=False)[1:]
+        normal = axes[2]
+        weights = _near(points, middle, normal)
+    rough_deg = float(np.rad2deg(np.arctan2(sizes[2], np.sqrt(_HEIGHTS) * sizes[1])))
+    return middle, normal, rough_deg, float(np.median(np.abs((points - middle) @ normal)))
+
+
+def _near(points: FloatArray, middle: FloatArray, normal: FloatArray) -> FloatArray:
+    """(P,) weights of points, the smaller the farther they are off a plane."""
+    off = (points - middle) @ normal
+    scale = 1.4826 * float(np.median(np.abs(off))) or 1e-12
+    return np.asarray(1.0 / (1.0 + (off / (2.0 * scale)) ** 2) ** 2)
+
+
+def _median_plane(points: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """A point and the normal (3,) of the plane through three points that half of all points are nearest to."""
+    corners = points[rng.integers(len(points), size=(_PLANES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals /= np.maximum(lengths, 1e-300)[:, None]
+    off = np.median(np.abs((points[None] - corners[:, :1]) @ normals[:, :, None])[:, :, 0], axis=1)
+    best = int(np.argmin(np.where(lengths > 0.0, off, np.inf)))
+    return corners[best, 0], normals[best]

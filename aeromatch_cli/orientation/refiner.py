@@ -77,7 +77,9 @@ def refine(folder: Path) -> None:
         model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
-            keep_images(model, parts[0] if parts else [])
+            if not parts:
+                continue
+            keep_images(model, parts[0])
             waiting.extend({**group, "images": part} for part in parts[1:] if len(part) >= _FEWEST_IMAGES)
         attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
         registered: list[int] = []

@@ -31,6 +31,8 @@ from aeromatch_cli.strategies.simulators.none import SourceOnly
 # no less than so many pixels), share of the keypoints, neighbours.
 _LOOK_SIZE_PX, _LOOK_SHARE, _LOOK_LEAST_PX = 1200, 0.6, 400
 _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 0.5, 8
+# Where images are left outside, it is made once more with so many times the keypoints.
+_MORE_KEYPOINTS = 3
 # In large blocks each image takes fewer neighbours, and small pictures fewer keypoints (one for so
 # many pixels): 300 images of 480 x 360 are oriented in half the time, and as exactly.
 _LARGE_BLOCK_NEIGHBOURS, _PX_PER_KEYPOINT, _LEAST_KEYPOINTS = 12, 200, 500
@@ -68,6 +70,11 @@ def look(recipe: FirstPass, block: Block) -> FirstPass:
             "neighbours": min(recipe.neighbours, _LOOK_NEIGHBOURS),
         }
     )
+
+
+def thorough(recipe: FirstPass) -> FirstPass:
+    """The dearer first pass, for a block that falls into parts."""
+    return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 
 
 def prepared(context: Context, recipe: FirstPass) -> Context:

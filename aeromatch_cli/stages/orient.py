@@ -48,9 +48,11 @@ from aeromatch_cli.strategies.pairings.similar import Similar
 log = logging.getLogger("aeromatch")
 
 # The second counts for blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 17, 1
+VERSION, _LARGE_BLOCK_VERSION = 18, 1
 # Images that no model holds are mapped again by themselves so often.
 _MAX_ROUNDS = 4
+# A block falls into parts where the largest model holds fewer than this share of its images though so many are matched.
+_WHOLE = 0.8
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
@@ -187,8 +189,15 @@ def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -
 def _mapped(
     context: Context, recipe: FirstPass, first: Context, evidence: Evidence
 ) -> tuple[tuple[Model, ...], Context, Evidence]:
-    """Models of a first pass, and it; of another one whose pairs do not lean on positions, where these do not fit."""
+    """Models of a first pass, and it; of one with more keypoints, where the block falls into parts, and of one whose
+    pairs do not lean on positions, where these do not fit."""
     models = _sound_models(context, recipe, first, evidence)
+    if _oriented(models) < _WHOLE * len(context.block.images) <= len(evidence.matched):
+        dearer = first_pass.thorough(recipe)
+        other, more = _evidence(context, dearer)
+        again = _sound_models(context, dearer, other, more)
+        if _oriented(again) > _oriented(models):
+            recipe, models, first, evidence = dearer, again, other, more
     if not context.block.poses or (models and not models[0].figures["contradiction"]):
         return models, first, evidence
     other, more = _evidence(context, recipe, by_position=False)
