@@ -211,6 +211,15 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
 
 
+def test_a_group_whose_images_share_no_point_is_left_out(truth: Truth) -> None:
+    contents, groups = disturbed(truth, 0), [Group("positions", IMAGE_IDS[:4]), Group("positions", IMAGE_IDS[4:])]
+    within = [p for p in truth.pairs if {p.pair.image_id0, p.pair.image_id1} <= set(IMAGE_IDS[:4])]
+    observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
+    adjusted, figures = refine_block(replace(contents, pairs=within), observed, groups, fixed=False)
+    assert [one["images"] for one in figures] == [4]
+    assert sorted(adjusted.poses) == list(IMAGE_IDS[:4])
+
+
 def test_groups_share_their_cameras(truth: Truth) -> None:
     """A second flight whose lens is another by 0.5 %: stated errors are those of the cameras that are handed over."""
     contents = disturbed(truth, 0)

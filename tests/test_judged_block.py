@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -42,6 +43,22 @@ def test_kappas_off_by_180_degrees_are_named_and_replaced(site: Site, rendered: 
     assert max(errors) < 10.0  # five positions with 5 m errors level a block of 50 m no better
     page = (site.work / "report" / "index.html").read_text()
     assert "all kappas are off by 180 degrees" in page
+
+
+def test_a_block_that_falls_into_parts_is_searched_with_more_keypoints(
+    site: Site, rendered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy2(rendered / "poses_noisy.csv", site.poses)
+
+    def oriented() -> list[int]:
+        outcome = site("orient", "--set", "orient.keypoints=120", "--overwrite")
+        assert outcome.code == 0
+        return [model["images"] for model in read_json(site.work / "reports" / "orient.json")["facts"]["models"]]
+
+    monkeypatch.setattr("aeromatch_cli.stages.first_pass._MORE_KEYPOINTS", 1)
+    assert oriented() == [3]
+    monkeypatch.undo()
+    assert oriented() == [IMAGES]
 
 
 def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Site, rendered: Path) -> None:

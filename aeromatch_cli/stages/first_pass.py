@@ -31,8 +31,9 @@ from aeromatch_cli.strategies.simulators.none import SourceOnly
 # no less than so many pixels), share of the keypoints, neighbours.
 _LOOK_SIZE_PX, _LOOK_SHARE, _LOOK_LEAST_PX = 1200, 0.6, 400
 _LOOK_KEYPOINTS, _LOOK_NEIGHBOURS = 0.5, 8
-# Where images are left outside, it is made once more with so many times the keypoints.
-_MORE_KEYPOINTS = 3
+# A block that falls into parts is searched once more with so many times the keypoints, where it has so many pairs at
+# most: comparing them takes the square of that as long.
+_MORE_KEYPOINTS, _MOST_DEAR_PAIRS = 3, 2000
 # In large blocks each image takes fewer neighbours, and small pictures fewer keypoints (one for so
 # many pixels): 300 images of 480 x 360 are oriented in half the time, and as exactly.
 _LARGE_BLOCK_NEIGHBOURS, _PX_PER_KEYPOINT, _LEAST_KEYPOINTS = 12, 200, 500
@@ -72,8 +73,10 @@ def look(recipe: FirstPass, block: Block) -> FirstPass:
     )
 
 
-def thorough(recipe: FirstPass) -> FirstPass:
-    """The dearer first pass, for a block that falls into parts."""
+def thorough(context: Context, recipe: FirstPass) -> FirstPass | None:
+    """The dearer first pass, for a block that falls into parts; None where that would take too long."""
+    if count_pairs(context, recipe) > _MOST_DEAR_PAIRS:
+        return None
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 
 

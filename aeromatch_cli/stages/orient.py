@@ -192,8 +192,8 @@ def _mapped(
     """Models of a first pass, and it; of one with more keypoints, where the block falls into parts, and of one whose
     pairs do not lean on positions, where these do not fit."""
     models = _sound_models(context, recipe, first, evidence)
-    if _oriented(models) < _WHOLE * len(context.block.images) <= len(evidence.matched):
-        dearer = first_pass.thorough(recipe)
+    falls_apart = _oriented(models) < _WHOLE * len(context.block.images) <= len(evidence.matched)
+    if falls_apart and (dearer := first_pass.thorough(context, recipe)) is not None:
         other, more = _evidence(context, dearer)
         again = _sound_models(context, dearer, other, more)
         if _oriented(again) > _oriented(models):
