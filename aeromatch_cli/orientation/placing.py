@@ -292,7 +292,7 @@ def _levelled(found: Placement, measured: _Measured, vertical: _Vertical) -> tup
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    best = None
+    best = np.inf, found.rotation, np.zeros((1, 3))
     for start in (found.rotation, _level_start(measured, vertical.up)):
 
         def off(turn: FloatArray, start: FloatArray = start) -> FloatArray:
@@ -304,9 +304,9 @@ def _levelled(found: Placement, measured: _Measured, vertical: _Vertical) -> tup
             return np.concatenate([measured.off(rotation).ravel(), away / np.deg2rad(vertical.sigma_deg)])
 
         solved = least_squares(off, np.zeros(3), x_scale=0.1)
-        if best is None or solved.cost < best[0]:
-            best = solved.cost, Rotation.from_rotvec(solved.x).as_matrix() @ start, solved.jac
-    assert best is not None
+        rotation = Rotation.from_rotvec(solved.x).as_matrix() @ start
+        if solved.cost < best[0] and measured.fit(rotation)[0] > 0.0:  # a negative scale is a reflection
+            best = solved.cost, rotation, solved.jac
     _, rotation, slopes = best
     covariance = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(3))
     scale, translation_m = measured.fit(rotation)
