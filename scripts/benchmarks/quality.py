@@ -11,6 +11,8 @@ from benchmarks.tables import Row, grouped, ratio, total
 _SIZE_IN = (7.5, 5.0)
 _OURS, _PEERS = "#1f6f3f", "#8a8a8a"
 _WHOLE, _STEPS = "auto", "auto[cascade="
+# Where a label may stand beside its point: its end there, and points to the right and above.
+_PLACES = tuple((*end, above) for above in (5, -11, 17, -23) for end in (("left", 6), ("right", -6)))
 # Lines of as many correct matches a second.
 _RATES = (10, 30, 100, 300, 1000, 3000)
 
@@ -48,14 +50,15 @@ def _label(axis: Any, points: Sequence[tuple[str, float, float, float]], ours: C
     for _, seconds, correct, _ in points:
         x, y = axis.transData.transform((seconds, correct))
         taken.append(Bbox.from_bounds(x - 4, y - 4, 8, 8))
-    for method, seconds, correct, right in points:
-        for side, (right_of, above) in (("left", (6, 5)), ("left", (6, -11)), ("right", (-6, 5)), ("right", (-6, -11))):
+    for method, seconds, correct, right in sorted(points, key=lambda point: -point[1]):
+        for side, right_of, above in _PLACES:
             label = axis.annotate(
                 f"{_words(method)}, {100 * right:.1f} % right", (seconds, correct), xytext=(right_of, above),
                 textcoords="offset points", fontsize=8, color=_OURS if method in ours else _PEERS, ha=side, zorder=4,
             )  # fmt: skip
             box = label.get_window_extent()
-            if not any(box.overlaps(other) for other in taken) or (side, above) == ("right", -11):
+            free = box.x0 > axis.bbox.x0 and not any(box.overlaps(other) for other in taken)
+            if free or (side, right_of, above) == _PLACES[-1]:
                 taken.append(box)
                 break
             label.remove()
