@@ -28,8 +28,10 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def unseen(rendered: Path) -> list[Pair]:
-    """Pairs of pictures of a small block, ground views and pictures as taken."""
-    return pairs_of(sources.rendered(rendered), 150)
+    """Pairs of pictures of a small block, ground views and pictures as taken; keypoints in float32 on any machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("aeromatch_cli.nets.precision.has_bfloat16", lambda *_: False)
+        return pairs_of(sources.rendered(rendered), 150)
 
 
 def noise(count: int, seed: int = 0) -> np.ndarray:
