@@ -8,11 +8,13 @@ import json
 import shutil
 import signal
 import sqlite3
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from typer.testing import CliRunner
 
@@ -50,6 +52,14 @@ class Outcome:
     def done(self) -> dict[str, int]:
         """Stage -> what it made now, stages that made nothing left out."""
         return {name: stage["done"] for name, stage in self.facts["stages"].items() if stage["done"]}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread_each() -> None:
+    """Two processes run the tests, on two cores: what earlier tests set makes them wait for each other."""
+    cv2.setNumThreads(1)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 def invoke(*arguments: object) -> Outcome:
