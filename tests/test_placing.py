@@ -63,6 +63,7 @@ def test_north_is_known_as_exactly_as_positions_tell_it() -> None:
         errors.append(np.rad2deg(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
         said.append(found.north_sigma_deg)
     assert 0.6 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(said))) < 1.6
+    assert min(said) > 0.6 * np.median(said)
 
 
 def test_houses_at_one_side_of_a_narrow_overlap_do_not_tilt_the_ground() -> None:
@@ -73,6 +74,17 @@ def test_houses_at_one_side_of_a_narrow_overlap_do_not_tilt_the_ground() -> None
         sigmas_deg.append(terrain.sigma_deg)
     assert max(off_deg) < 3.0
     assert max(sigmas_deg) < 6.0
+
+
+@pytest.mark.parametrize("slope", [0.18, -0.18])
+def test_in_a_valley_and_on_a_ridge_both_sides_count(slope: float) -> None:
+    """Sides of ten degrees, one of which most planes through three points fit best."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        across, along = rng.uniform(-50, 50, (2, 800))
+        points_m = np.column_stack([across, along, slope * np.abs(across) + rng.normal(0.0, 0.3, 800)])
+        terrain = _terrain(in_model(CENTERS_M), in_model(points_m))
+        assert np.rad2deg(np.arccos(np.clip(terrain.up @ MODEL_FROM_WORLD[:, 2], -1.0, 1.0))) < 2.0
 
 
 def test_rough_ground_says_less_of_where_up_is_the_narrower_it_is() -> None:

@@ -37,9 +37,9 @@ _UNKNOWNS = 7  # of a similarity
 # roof or a hillside lifts many points together.
 _LEVEL_SIGMA_DEG = 3.0
 _HEIGHTS = 4.0
-# Planes that are tried through three points, over so many points at most; one counts where half of all points are
-# nearer to it by this factor.
-_PLANES, _PLANE_POINTS, _CLEARLY = 300, 2000, 0.7
+# Planes that are tried through three of so many points at least and at most; one counts where this share of all points
+# is nearer to it by this factor. In a valley each side has half of them, and what fits all of them best is right.
+_PLANES, _PLANE_POINTS, _NEAR_SHARE, _CLEARLY = 300, (30, 2000), 0.7, 0.7
 # The mean of measured tilts is no better than this, whatever their number; they count where they agree to so many
 # degrees with each other, and with the terrain to so many, or standard deviations of the terrain.
 _TILT_SIGMA_DEG = 1.0
@@ -292,22 +292,22 @@ def _levelled(found: Placement, measured: _Measured, vertical: _Vertical) -> tup
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    best = np.inf, found.rotation, np.zeros((1, 3))
-    for start in (found.rotation, _level_start(measured, vertical.up)):
+    def off(turn: FloatArray, start: FloatArray) -> FloatArray:
+        rotation = Rotation.from_rotvec(turn).as_matrix() @ start
+        up = rotation @ vertical.up
+        away = np.cross(up, [0.0, 0.0, 1.0])[:2]
+        if up[2] < 0.0:  # beyond a right angle the sine falls again
+            away = away / max(float(np.linalg.norm(away)), 1e-9) * (1.0 - up[2])
+        return np.concatenate([measured.off(rotation).ravel(), away / np.deg2rad(vertical.sigma_deg)])
 
-        def off(turn: FloatArray, start: FloatArray = start) -> FloatArray:
-            rotation = Rotation.from_rotvec(turn).as_matrix() @ start
-            up = rotation @ vertical.up
-            away = np.cross(up, [0.0, 0.0, 1.0])[:2]
-            if up[2] < 0.0:  # beyond a right angle the sine falls again
-                away = away / max(float(np.linalg.norm(away)), 1e-9) * (1.0 - up[2])
-            return np.concatenate([measured.off(rotation).ravel(), away / np.deg2rad(vertical.sigma_deg)])
-
-        solved = least_squares(off, np.zeros(3), x_scale=0.1)
+    best = np.inf, found.rotation
+    for start in (_level_start(measured, vertical.up), found.rotation):
+        solved = least_squares(off, np.zeros(3), x_scale=0.1, args=(start,))
         rotation = Rotation.from_rotvec(solved.x).as_matrix() @ start
         if solved.cost < best[0] and measured.fit(rotation)[0] > 0.0:  # a negative scale is a reflection
-            best = solved.cost, rotation, solved.jac
-    _, rotation, slopes = best
+            best = solved.cost, rotation
+    rotation = best[1]
+    slopes = least_squares(off, np.zeros(3), max_nfev=1, args=(rotation,)).jac  # of small turns from here
     covariance = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(3))
     scale, translation_m = measured.fit(rotation)
     placed = replace(
@@ -342,11 +342,12 @@ def _terrain(centers: FloatArray, points: FloatArray) -> _Vertical:
     stand at one side of it, what fits all points best is no place to start from: planes through three points are tried.
     """
     plane = _plane(points, np.ones(len(points)))
-    rng = np.random.default_rng(0)
-    some = points if len(points) <= _PLANE_POINTS else points[rng.choice(len(points), _PLANE_POINTS, replace=False)]
-    nearer = _plane(some, _near(some, *_median_plane(some, rng)))
-    if nearer[3] < _CLEARLY * plane[3]:
-        plane = nearer
+    least, most = _PLANE_POINTS
+    if len(points) >= least:
+        rng = np.random.default_rng(0)
+        some = points if len(points) <= most else points[rng.choice(len(points), most, replace=False)]
+        nearer = _plane(some, _near(some, *_plane_of_three(some, rng)))
+        plane = nearer if nearer[3] < _CLEARLY * plane[3] else plane
     middle, normal, rough_deg, _ = plane
     side = float(np.median((centers - middle) @ normal))
     return _Vertical(normal if side >= 0.0 else -normal, float(np.hypot(_LEVEL_SIGMA_DEG, rough_deg)))
@@ -354,7 +355,7 @@ def _terrain(centers: FloatArray, points: FloatArray) -> _Vertical:
 
 def _plane(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
     """A point (3,) and the normal (3,) of a plane through most points, how exactly those that it goes through determine
-    it, degrees, and by how much points are off it (median). weights: (P,) of the points in the first step."""
+    it, degrees, and by how much _NEAR_SHARE of the points are off it at most. weights: (P,), of the first step."""
     middle, sizes, normal = np.zeros(3), np.ones(3), np.zeros(3)
     for _ in range(10):
         middle = np.average(points, axis=0, weights=weights)
@@ -362,7 +363,7 @@ def _plane(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatAr
         normal = axes[2]
         weights = _near(points, middle, normal)
     rough_deg = float(np.rad2deg(np.arctan2(sizes[2], np.sqrt(_HEIGHTS) * sizes[1])))
-    return middle, normal, rough_deg, float(np.median(np.abs((points - middle) @ normal)))
+    return middle, normal, rough_deg, float(np.quantile(np.abs((points - middle) @ normal), _NEAR_SHARE))
 
 
 def _near(points: FloatArray, middle: FloatArray, normal: FloatArray) -> FloatArray:
@@ -372,12 +373,13 @@ def _near(points: FloatArray, middle: FloatArray, normal: FloatArray) -> FloatAr
     return np.asarray(1.0 / (1.0 + (off / (2.0 * scale)) ** 2) ** 2)
 
 
-def _median_plane(points: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """A point and the normal (3,) of the plane through three points that half of all points are nearest to."""
+def _plane_of_three(points: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """A point and the normal (3,) of that plane through three points from which _NEAR_SHARE of all points are least
+    off."""
     corners = points[rng.integers(len(points), size=(_PLANES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(lengths, 1e-300)[:, None]
-    off = np.median(np.abs((points[None] - corners[:, :1]) @ normals[:, :, None])[:, :, 0], axis=1)
+    off = np.quantile(np.abs((points[None] - corners[:, :1]) @ normals[:, :, None])[:, :, 0], _NEAR_SHARE, axis=1)
     best = int(np.argmin(np.where(lengths > 0.0, off, np.inf)))
     return corners[best, 0], normals[best]

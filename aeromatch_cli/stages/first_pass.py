@@ -73,9 +73,9 @@ def look(recipe: FirstPass, block: Block) -> FirstPass:
     )
 
 
-def thorough(context: Context, recipe: FirstPass) -> FirstPass | None:
-    """The dearer first pass, for a block that falls into parts; None where that would take too long."""
-    if count_pairs(context, recipe) > _MOST_DEAR_PAIRS:
+def thorough(recipe: FirstPass, first: Context) -> FirstPass | None:
+    """The dearer first pass of a block in parts; None where it would take too long. first: the one that was run."""
+    if max(len(first.pairs), count_pairs(first, recipe)) > _MOST_DEAR_PAIRS:
         return None
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 

@@ -193,10 +193,10 @@ def _mapped(
     pairs do not lean on positions, where these do not fit."""
     models = _sound_models(context, recipe, first, evidence)
     falls_apart = _oriented(models) < _WHOLE * len(context.block.images) <= len(evidence.matched)
-    if falls_apart and (dearer := first_pass.thorough(context, recipe)) is not None:
+    if falls_apart and recipe.replaces and (dearer := first_pass.thorough(recipe, first)) is not None:
         other, more = _evidence(context, dearer)
         again = _sound_models(context, dearer, other, more)
-        if _oriented(again) > _oriented(models):
+        if _oriented(again) > _oriented(models) and _images(again) >= _images(models):
             recipe, models, first, evidence = dearer, again, other, more
     if not context.block.poses or (models and not models[0].figures["contradiction"]):
         return models, first, evidence
