@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.geodesc import LENGTH, GeoDesc, Size, describe, load_geodesc
 from aeromatch_cli.nets.patches import SIDE_PX, fold, standardised
+from aeromatch_cli.strategies.extractors.learned import Learned
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,7 +32,7 @@ def one_thread() -> Iterator[None]:
 def unseen(rendered: Path) -> list[Pair]:
     """Pairs of pictures of a small block, ground views and pictures as taken; keypoints in float32 on any machine."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("aeromatch_cli.nets.precision.has_bfloat16", lambda *_: False)
+        patch.setattr("trainings.patches.sights.Learned", partial(Learned, precision="float32"))
         return pairs_of(sources.rendered(rendered), 150)
 
 
