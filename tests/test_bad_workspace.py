@@ -38,7 +38,6 @@ def test_read_only_workspace(site, monkeypatch):
 
 def test_full_disk_stops_and_resumes(done_site, monkeypatch):
     work = done_site.root / "full"
-    write = write_atomically
     left = [9]
 
     def limited(path, fill):
@@ -49,7 +48,7 @@ def test_full_disk_stops_and_resumes(done_site, monkeypatch):
                 raise OSError(errno.ENOSPC, "No space left on device")
             fill(stream)
 
-        write(path, filled)
+        write_atomically(path, filled)
 
     for module in ("files", "stages.extract", "stages.match", "stages.filter", "stages.enhance", "stages.simulate"):
         monkeypatch.setattr(f"aeromatch_cli.{module}.write_atomically", limited)

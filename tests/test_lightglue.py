@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +37,6 @@ class NetworkAlone(LightGlue):
 def recipe(weights: str, **settings: Any) -> LightGlue:
     """The network alone in full precision, so that tests can compare to the last digits."""
     return NetworkAlone(weights=weights, **{"precision": "float32", **settings})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small networks lose time to a second thread."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +17,6 @@ from aeromatch_cli.nets.files import shipped_path
 from aeromatch_cli.nets.orientation import OrientationNet, directions, load_orientation
 from aeromatch_cli.nets.patches import SIDE_PX, fold
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

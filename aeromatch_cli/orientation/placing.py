@@ -117,7 +117,7 @@ def place(
     sigma_m = _sigma_m(found, found.points(centers[agreeing]) - used_m, used_m, stated_m)
     found = replace(found, sigma_factor=sigma_m / max(stated_m, 1e-9))
     measured = _Measured(centers[agreeing], used_m, max(sigma_m, 1e-9))
-    if _off_level(found, measured, by_terrain, vertical):
+    if vertical is not by_terrain and _off_level(found, measured, by_terrain, vertical):
         vertical = by_terrain
     return _levelled(found, measured, vertical)[0]
 
