@@ -50,15 +50,31 @@ def test_a_block_that_falls_into_parts_is_searched_with_more_keypoints(
 ) -> None:
     shutil.copy2(rendered / "poses_noisy.csv", site.poses)
 
-    def oriented() -> list[int]:
+    def oriented() -> tuple[list[int], list[dict[str, object]], str]:
         outcome = site("orient", "--set", "orient.keypoints=120", "--overwrite")
         assert outcome.code == 0
-        return [model["images"] for model in read_json(site.work / "reports" / "orient.json")["facts"]["models"]]
+        facts = read_json(site.work / "reports" / "orient.json")["facts"]
+        return [model["images"] for model in facts["models"]], facts["further_first_passes"], outcome.stdout
 
+    more = {"with": "more keypoints", "images": 3}
     monkeypatch.setattr("aeromatch_cli.stages.first_pass._MORE_KEYPOINTS", 1)
-    assert oriented() == [3]
+    models, tried, said = oriented()
+    assert (models, tried) == ([3], [{**more, "images_then": 3, "used": False}])
+    assert "further first pass" not in said
     monkeypatch.undo()
-    assert oriented() == [IMAGES]
+    models, tried, said = oriented()
+    assert (models, tried) == ([IMAGES], [{**more, "images_then": IMAGES, "used": True}])
+    assert f"by a further first pass, with more keypoints: a group of {IMAGES} images, not 3" in said
+
+
+def test_a_block_of_many_pairs_is_not_searched_with_more_keypoints(
+    site: Site, rendered: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy2(rendered / "poses_noisy.csv", site.poses)
+    monkeypatch.setattr("aeromatch_cli.stages.first_pass._MOST_DEAR_PAIRS", IMAGES * (IMAGES - 1) // 2 - 1)
+    assert site("orient", "--set", "orient.keypoints=120").code == 0
+    facts = read_json(site.work / "reports" / "orient.json")["facts"]
+    assert ([model["images"] for model in facts["models"]], facts["further_first_passes"]) == ([3], [])
 
 
 def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Site, rendered: Path) -> None:

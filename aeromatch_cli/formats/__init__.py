@@ -67,7 +67,9 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`,
   `turned_back`: images that the mapper had turned over), `by_one_pair`
-  (images placed by one pair and their position), `wrong_attitudes`
+  (images placed by one pair and their position), `further_first_passes` (where the block fell into parts, or positions
+  did not fit: `with` what, images of the largest model before, `images`, and of the new one, `images_then`, and whether
+  that was `used`), `wrong_attitudes`
   (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
   (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
   and the one found, pixels, where they differ by more than 2 %), `stays` (whether wrong given poses were kept,

@@ -92,6 +92,11 @@ def orientation_lines(facts: Mapping[str, Any], given: Block, block: Block) -> l
         more = len(facts["by_one_pair"])
         also = f", {more} more by their positions and a pair each" if more else ""
         words = [f"from the pictures: {found} of {len(block.images)} images{also}", *([explains] if attitudes else [])]
+        words += [
+            f"by a further first pass, with {one['with']}: a group of {one['images_then']} images, not {one['images']}"
+            for one in facts["further_first_passes"]
+            if one["used"]
+        ]
         if facts["frame"] == "own" and given.crs != block.crs:
             words.append(f"in a local frame, not in {given.crs}")
         elif facts["frame"] == "own" and given.poses:

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
-from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.focal import better_cameras
-from aeromatch_cli.orientation.growth import grown
-from aeromatch_cli.orientation.mapping import MAPPERS, Group, Mapper, Model, map_block
+from aeromatch_cli.orientation.mapping import Group
 from aeromatch_cli.orientation.solution import (
     Before,
     Evidence,
@@ -33,13 +31,12 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
-from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
 from aeromatch_cli.stages import first_pass
-from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.exchanged import exchanged_columns
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
 from aeromatch_cli.stages.lines import frame_remarks
+from aeromatch_cli.stages.models import best_mapped, evidence_of
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -49,12 +46,6 @@ log = logging.getLogger("aeromatch")
 
 # The second counts for blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 18, 1
-# Images that no model holds are mapped again by themselves so often.
-_MAX_ROUNDS = 4
-# A block falls into parts where the largest model holds fewer than this share of its images though so many are matched.
-_WHOLE = 0.8
-# An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
-_EXACT_PX = 3.0
 # Standard deviation of a focal length that the pictures gave, as a share of it.
 _FOUND_FOCAL = 0.01
 
@@ -141,27 +132,29 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
     looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
-    first, evidence = _evidence(context, first_pass.look(recipe, block) if looks else recipe)
+    first, evidence = evidence_of(context, first_pass.look(recipe, block) if looks else recipe)
     if recipe.replaces:
         context, first, evidence = _with_better_cameras(context, first, evidence)
     good = evidence.explained()
+    tried: list[dict[str, Any]] = []
     if looks and recipe.replaces and not suffices(evidence, good):
-        first, evidence = _evidence(context, recipe)
+        first, evidence = evidence_of(context, recipe)
         good = evidence.explained()
     if not evidence.pairs or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
         if not evidence.pairs and not given:
             solution.facts["remarks"].append(unoriented_remark(evidence))
     else:
-        models, first, evidence = _mapped(context, recipe, first, evidence)
-        contradicted = bool(models) and bool(models[0].figures["contradiction"])
-        exchanged = exchanged_columns(block, models[0]) if contradicted else ""
+        mapped, tried = best_mapped(context, recipe, first, evidence)
+        models, first, evidence = mapped.models, mapped.first, mapped.evidence
+        exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
         solution = from_models(evidence, models, _before(context, kept), context.angles, exchanged)
         if not models:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
             solution = judged(from_given(evidence, good, correct=False), solution)
     facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
+    facts["further_first_passes"] = tried
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
     facts["failed"] = list(evidence.failed)
@@ -184,110 +177,6 @@ def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -
         replace(first, block=replace(first.block, cameras=cameras)),
         replace(evidence, block=replace(block, cameras=cameras)),
     )
-
-
-def _mapped(
-    context: Context, recipe: FirstPass, first: Context, evidence: Evidence
-) -> tuple[tuple[Model, ...], Context, Evidence]:
-    """Models of a first pass, and it; of one with more keypoints, where the block falls into parts, and of one whose
-    pairs do not lean on positions, where these do not fit."""
-    models = _sound_models(context, recipe, first, evidence)
-    falls_apart = _oriented(models) < _WHOLE * len(context.block.images) <= len(evidence.matched)
-    if falls_apart and recipe.replaces and (dearer := first_pass.thorough(recipe, first)) is not None:
-        other, more = _evidence(context, dearer)
-        again = _sound_models(context, dearer, other, more)
-        if _oriented(again) > _oriented(models) and _images(again) >= _images(models):
-            recipe, models, first, evidence = dearer, again, other, more
-    if not context.block.poses or (models and not models[0].figures["contradiction"]):
-        return models, first, evidence
-    other, more = _evidence(context, recipe, by_position=False)
-    if {(p.image_id0, p.image_id1) for p in other.pairs} <= {(p.image_id0, p.image_id1) for p in first.pairs}:
-        return models, first, evidence
-    again = _sound_models(context, recipe, other, more)
-    better = _oriented(again) > _oriented(models)
-    return (again, other, more) if better else (models, first, evidence)
-
-
-def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
-    """Models that explain their matches, the largest first. What is left after one is mapped again by itself."""
-    models: list[Model] = []
-    left = evidence.matched
-    for _ in range(_MAX_ROUNDS):
-        found = _one_round(context, recipe, first, evidence, left)
-        models += found
-        left = left - {i for model in found for i in model.rotations}
-        if not found or len(left) < FEWEST_IMAGES:
-            break
-    block = context.block
-    camera_ids = {image.image_id: image.camera_id for image in block.images}
-    return grown(models, evidence.pairs, camera_ids, block.cameras, evidence.thresholds_px, block.poses)
-
-
-def _one_round(
-    context: Context, recipe: FirstPass, first: Context, evidence: Evidence, image_ids: set[str]
-) -> list[Model]:
-    """Sound models of some images; by the other mapper where that finds more of them."""
-    best: list[Model] = []
-    for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
-        mapped = _mapped_images(context, first, mapper, image_ids)
-        found = _sound_parts(context, evidence, mapped)
-        whole = _images(found) == _images(mapped)
-        if not whole:  # what was cut off has bent the rest
-            again = [_mapped_images(context, first, mapper, set(part.rotations))[:1] for part in found]
-            found = _sound_parts(context, evidence, [model for models in again for model in models])
-        best = found if _images(found) > _images(best) else best
-        if found and whole:
-            break
-    return best
-
-
-def _sound_parts(context: Context, evidence: Evidence, models: Sequence[Model]) -> list[Model]:
-    """The models as far as they explain their matches, each image in the largest that has it."""
-    found: list[Model] = []
-    taken: set[str] = set()
-    for model in sorted(models, key=lambda model: -len(model.rotations)):
-        part = _sound(context, evidence, only(model, model.rotations.keys() - taken))
-        if part is not None:
-            found.append(part)
-            taken |= part.rotations.keys()
-    return found
-
-
-def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
-    cameras = {**context.block.cameras, **model.cameras}
-    of_images = {image.image_id: cameras[image.camera_id] for image in context.block.images}
-    return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px, context.block.poses)
-
-
-def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
-    """Models of the pairs of the first pass between some images."""
-    pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
-    with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
-        try:
-            return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
-        except InputError as error:  # the other mapper may do, and matches are found without orientation, too
-            log.warning("warning: %s", error)
-            return ()
-
-
-def _images(models: Sequence[Model]) -> int:
-    """Images of all models."""
-    return sum(len(model.rotations) for model in models)
-
-
-def _oriented(models: Sequence[Model]) -> int:
-    """Images of the largest model."""
-    return max((len(model.rotations) for model in models), default=0)
-
-
-def _evidence(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, Evidence]:
-    """The context of a first pass that has been run, and its verified matches."""
-    first, failed = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
-    limit = first.settings.block.max_size_px
-    sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
-    pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
-    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras, failed)
 
 
 def _before(context: Context, kept: set[str]) -> Before:

@@ -1,0 +1,169 @@
+"""Models of a block from the matches of its first pass, or of a further one where that has better ones."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from aeromatch_cli.errors import InputError
+from aeromatch_cli.orientation.growth import grown
+from aeromatch_cli.orientation.mapping import MAPPERS, Mapper, Model, map_block
+from aeromatch_cli.orientation.solution import Evidence
+from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
+from aeromatch_cli.stages import first_pass
+from aeromatch_cli.stages.contents import contents_of
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.strategies.orienters import FirstPass
+
+log = logging.getLogger("aeromatch")
+
+# Images that no model holds are mapped again by themselves so often.
+_MAX_ROUNDS = 4
+# A block falls into parts where the largest model holds fewer than this share of its images though so many are matched.
+_WHOLE = 0.8
+# An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
+_EXACT_PX = 3.0
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A first pass with its verified matches, and the models of these, the largest first."""
+
+    recipe: FirstPass
+    first: Context
+    evidence: Evidence
+    models: tuple[Model, ...]
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the given positions do not fit: the largest model contradicts them, or nothing was mapped."""
+        return not self.models or bool(self.models[0].figures["contradiction"])
+
+    def beats(self, other: Mapped) -> bool:
+        """Whether its largest model has more images, and none that a model at its right place holds is lost for it."""
+        larger = _largest(self.models) > _largest(other.models)
+        loses = self.contradicted or _images(self.models) < _images(other.models)
+        return larger and (other.contradicted or not loses)
+
+
+def best_mapped(
+    context: Context, recipe: FirstPass, first: Context, evidence: Evidence
+) -> tuple[Mapped, list[dict[str, Any]]]:
+    """Models of a first pass, or of a further one where that has better ones, and what further ones were tried."""
+    best = Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
+    tried: list[dict[str, Any]] = []
+    for words, further in (
+        ("more keypoints", _with_more_keypoints),
+        ("pairs chosen without positions", _without_positions),
+    ):
+        found = further(context, best)
+        if found is None:
+            continue
+        counts = {"images": _largest(best.models), "images_then": _largest(found.models)}
+        tried.append({"with": words, **counts, "used": found.beats(best)})
+        best = found if found.beats(best) else best
+    return best, tried
+
+
+def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
+    """Of a block that falls into parts."""
+    falls_apart = _largest(best.models) < _WHOLE * len(context.block.images) <= len(best.evidence.matched)
+    dearer = first_pass.thorough(best.recipe, best.first) if falls_apart and best.recipe.replaces else None
+    if dearer is None:
+        return None
+    first, evidence = evidence_of(context, dearer)
+    return Mapped(dearer, first, evidence, _sound_models(context, dearer, first, evidence))
+
+
+def _without_positions(context: Context, best: Mapped) -> Mapped | None:
+    """Where positions do not fit the pictures, pairs chosen by them are not those of neighbours."""
+    if not context.block.poses or not best.contradicted:
+        return None
+    first, evidence = evidence_of(context, best.recipe, by_position=False)
+    if {(p.image_id0, p.image_id1) for p in first.pairs} <= {(p.image_id0, p.image_id1) for p in best.first.pairs}:
+        return None
+    return Mapped(best.recipe, first, evidence, _sound_models(context, best.recipe, first, evidence))
+
+
+def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
+    """Models that explain their matches, the largest first. What is left after one is mapped again by itself."""
+    models: list[Model] = []
+    left = evidence.matched
+    for _ in range(_MAX_ROUNDS):
+        found = _one_round(context, recipe, first, evidence, left)
+        models += found
+        left = left - {i for model in found for i in model.rotations}
+        if not found or len(left) < FEWEST_IMAGES:
+            break
+    block = context.block
+    camera_ids = {image.image_id: image.camera_id for image in block.images}
+    return grown(models, evidence.pairs, camera_ids, block.cameras, evidence.thresholds_px, block.poses)
+
+
+def _one_round(
+    context: Context, recipe: FirstPass, first: Context, evidence: Evidence, image_ids: set[str]
+) -> list[Model]:
+    """Sound models of some images; by the other mapper where that finds more of them."""
+    best: list[Model] = []
+    for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
+        mapped = _mapped_images(context, first, mapper, image_ids)
+        found = _sound_parts(context, evidence, mapped)
+        whole = _images(found) == _images(mapped)
+        if not whole:  # what was cut off has bent the rest
+            again = [_mapped_images(context, first, mapper, set(part.rotations))[:1] for part in found]
+            found = _sound_parts(context, evidence, [model for models in again for model in models])
+        best = found if _images(found) > _images(best) else best
+        if found and whole:
+            break
+    return best
+
+
+def _sound_parts(context: Context, evidence: Evidence, models: Sequence[Model]) -> list[Model]:
+    """The models as far as they explain their matches, each image in the largest that has it."""
+    found: list[Model] = []
+    taken: set[str] = set()
+    for model in sorted(models, key=lambda model: -len(model.rotations)):
+        part = _sound(context, evidence, only(model, model.rotations.keys() - taken))
+        if part is not None:
+            found.append(part)
+            taken |= part.rotations.keys()
+    return found
+
+
+def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
+    cameras = {**context.block.cameras, **model.cameras}
+    of_images = {image.image_id: cameras[image.camera_id] for image in context.block.images}
+    return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px, context.block.poses)
+
+
+def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
+    """Models of the pairs of the first pass between some images."""
+    pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
+    with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
+        try:
+            return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
+        except InputError as error:  # the other mapper may do, and matches are found without orientation, too
+            log.warning("warning: %s", error)
+            return ()
+
+
+def _images(models: Sequence[Model]) -> int:
+    """Images of all models."""
+    return sum(len(model.rotations) for model in models)
+
+
+def _largest(models: Sequence[Model]) -> int:
+    """Images of the largest model."""
+    return max((len(model.rotations) for model in models), default=0)
+
+
+def evidence_of(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, Evidence]:
+    """The context of a first pass that has been run, and its verified matches."""
+    first, failed = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
+    limit = first.settings.block.max_size_px
+    sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
+    pairs = list(first_pass.verified_points(first)) if first.pairs else []
+    thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
+    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras, failed)
