@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
+from test_flips import built, centers_of
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.orientation.placing import Placement, _terrain, place
+from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z
+from aeromatch_cli.orientation.adjusting import believed_tilts
+from aeromatch_cli.orientation.placing import (
+    Placement,
+    _levelled,
+    _Measured,
+    _off_level,
+    _terrain,
+    _Vertical,
+    _vertical,
+    place,
+    similarity,
+)
 
 # Three images in a row, 200 m above the ground.
 CENTERS_M = np.array([[-46.0, -11.0, 200.0], [0.0, -2.0, 201.0], [47.0, 10.0, 198.0]])
@@ -96,3 +109,80 @@ def test_rough_ground_says_less_of_where_up_is_the_narrower_it_is() -> None:
         sigmas_deg.append(_terrain(in_model(CENTERS_M), in_model(points_m)).sigma_deg)
     assert sigmas_deg[0] > 15.0 > sigmas_deg[1] > sigmas_deg[2]
     assert sigmas_deg[2] < 4.0
+
+
+def in_space(seed: int, noise_m: float) -> tuple[_Measured, Placement]:
+    """Eight positions spread in all directions, and the similarity that fits them best."""
+    rng = np.random.default_rng(seed)
+    centers_m = rng.uniform(-50.0, 50.0, (8, 3))
+    positions_m = centers_m + rng.normal(0.0, noise_m, (8, 3))
+    fit = similarity(in_model(centers_m), positions_m)
+    found = Placement(*fit, "positions", np.ones(8, dtype=bool), trusted=True)
+    return _Measured(in_model(centers_m), positions_m, noise_m), found
+
+
+def test_positions_in_space_outweigh_a_ground_that_lies_overhead() -> None:
+    """From a level start alone the search ends upside down there."""
+    askew = Rotation.from_rotvec([150.0, 0.0, 0.0], degrees=True).apply([0.0, 0.0, 1.0])
+    for seed in range(10):
+        measured, found = in_space(seed, noise_m=1.0)
+        levelled, _ = _levelled(found, measured, _Vertical(MODEL_FROM_WORLD @ askew, 3.0))
+        assert angle_between_deg(levelled.rotation @ MODEL_FROM_WORLD, np.eye(3)) < 10.0
+
+
+def test_a_strip_is_not_mirrored_where_that_fits_its_heights() -> None:
+    """A negative scale and half a turn put a level strip where it was, but with its heights upside down."""
+    positions_m = CENTERS_M * [1.0, 1.0, -1.0] + [0.0, 0.0, 400.0]
+    measured = _Measured(in_model(CENTERS_M), positions_m, 2.0)
+    half_turn = Rotation.from_rotvec([0.0, 0.0, 180.0], degrees=True).as_matrix()
+    mirrored = Placement(-20.0, half_turn @ MODEL_FROM_WORLD.T, np.zeros(3), "positions", np.ones(3, dtype=bool), True)
+    levelled, _ = _levelled(mirrored, measured, _Vertical(MODEL_FROM_WORLD[:, 2], 3.0))
+    assert levelled.scale == pytest.approx(20.0, rel=0.01)
+    assert angle_between_deg(levelled.rotation @ MODEL_FROM_WORLD, np.eye(3)) < 5.0
+
+
+@pytest.mark.parametrize(("off_deg", "ground_sigma_deg", "used"), [
+    (25.0, 3.0, True),  # a hillside may be as steep
+    (40.0, 3.0, False),
+    (40.0, 15.0, True),  # a narrow strip of rough ground tells no better
+    (80.0, 40.0, True),
+    (100.0, 40.0, False),  # the ground lies below in any case
+])  # fmt: skip
+def test_tilts_count_as_far_as_the_ground_can_be_off(off_deg: float, ground_sigma_deg: float, used: bool) -> None:
+    by_terrain = _Vertical(Rotation.from_rotvec([off_deg, 0.0, 0.0], degrees=True).as_matrix()[:, 2], ground_sigma_deg)
+    ups = Rotation.from_rotvec(np.random.default_rng(0).normal(0.0, 1.0, (5, 3)), degrees=True).as_matrix()[:, :, 2]
+    chosen = _vertical(by_terrain, ups)
+    assert (chosen is not by_terrain) == used
+    assert not used or np.rad2deg(np.arccos(chosen.up[2])) < 2.0
+
+
+def test_tilts_are_not_wrong_for_contradicting_rough_ground() -> None:
+    """Positions along one line leave it to the ground, 40 degrees off and known to 20, whether right tilts are wrong:
+    they are where the same is known to 3."""
+    measured = _Measured(in_model(CENTERS_M), CENTERS_M, 1.0)
+    fit = similarity(measured.centers, CENTERS_M)
+    found = Placement(*fit, "positions", np.ones(3, dtype=bool), trusted=True)
+    about_line = Rotation.from_rotvec(40.0 * (CENTERS_M[2] - CENTERS_M[0]) / 95.4, degrees=True)
+    off = MODEL_FROM_WORLD @ about_line.apply([0.0, 0.0, 1.0])
+    by_tilts = _Vertical(MODEL_FROM_WORLD[:, 2], 1.0)
+    assert not _off_level(found, measured, _Vertical(off, 20.0), by_tilts)
+    assert _off_level(found, measured, _Vertical(off, 3.0), by_tilts)
+
+
+@pytest.mark.parametrize(("turned_deg", "sigma_m", "believed"), [
+    (10.0, 1.0, True),
+    (30.0, 1.0, False),
+    (30.0, 200.0, True),  # positions that say so little of north contradict no heading
+    (90.0, 200.0, False),
+])  # fmt: skip
+def test_headings_are_wrong_as_far_as_positions_tell_north(turned_deg: float, sigma_m: float, believed: bool) -> None:
+    """Headings that are wrong together take the tilts with them that were given beside them."""
+    model = built()
+    positions_m = centers_of(model)
+    true = np.array([model.images[number].cam_from_world().rotation.matrix() for number in sorted(model.images)])
+    given = true @ rotation_z(turned_deg)
+    ups = given[:, :, 2]
+    sigmas_m = np.full(len(positions_m), sigma_m)
+    found = believed_tilts(pycolmap, model, positions_m, sigmas_m, ups, given)
+    assert np.isfinite(found).all() == believed
+    assert not believed or np.array_equal(found, ups)

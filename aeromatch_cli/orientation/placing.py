@@ -3,7 +3,8 @@
 A mapper gives poses and points up to a similarity. Positions that are spread in two directions determine it, the
 worse the closer they lie together; positions along one line leave the turn about the line open; without positions the
 whole orientation and the scale are open. What is open is taken from the tilts that the cameras have measured, where
-these agree with each other, else from the terrain: its plane of best fit is about level, the cameras are above it.
+these agree with each other, else from the terrain: the plane near most of its points is about level, the cameras are
+above it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _DOUBTFUL = 5.0
 # A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
 _STATED_RESIDUALS = 3.0
 _UNKNOWNS = 7  # of a similarity
-# How far from level the plane of best fit of a terrain usually is, and from how many independent heights it comes: a
+# How far from level the plane through most points of a terrain usually is, and from how many independent heights it comes: a
 # roof or a hillside lifts many points together.
 _LEVEL_SIGMA_DEG = 3.0
 _HEIGHTS = 4.0
