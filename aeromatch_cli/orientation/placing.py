@@ -34,8 +34,8 @@ _DOUBTFUL = 5.0
 # A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
 _STATED_RESIDUALS = 3.0
 _UNKNOWNS = 7  # of a similarity
-# How far from level the plane through most points of a terrain usually is, and from how many independent heights it comes: a
-# roof or a hillside lifts many points together.
+# How far from level the plane through most points of a terrain usually is, and from how many independent heights it
+# comes: a roof or a hillside lifts many points together.
 _LEVEL_SIGMA_DEG = 3.0
 _HEIGHTS = 4.0
 # Planes that are tried through three of so many points at least and at most; one counts where this share of all points
