@@ -211,7 +211,8 @@ class View:
     ground_from_view: (3, 3) view pixel -> world x, y in metres on the plane that the view was made of, None for the
     source. north_up: whether the view's axes follow the world's alone (a function of world_direction), so that things
     on the ground have the same orientation in all views of like direction. enhanced: whether its picture is the
-    enhanced one where the picture as it was taken has a view of its own.
+    enhanced one where the picture as it was taken has a view of its own. beyond: of a view of distant ground: the
+    view of nearer ground whose box it leaves out.
     """
 
     name: str
@@ -225,6 +226,7 @@ class View:
     north_up: bool = False
     ground_from_view: FloatArray | None = None
     enhanced: bool = False
+    beyond: View | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,7 +58,7 @@ def test_simulators_are_frozen_recipes(name: str) -> None:
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])
 @pytest.mark.parametrize("seen_from", [pose(0, 0, 0), pose(25.0, -10.0, 140.0), pose(70.0, 5.0, -30.0)])
 def test_view_and_camera_agree_on_ground_points(camera: Camera, seen_from: Pose) -> None:
-    (view,) = GroundView()(camera, seen_from, GROUND_Z, 0.2)
+    (view,) = GroundView(far_ground=False)(camera, seen_from, GROUND_Z, 0.2)
     assert not view.is_source
     xs, ys = np.meshgrid(np.linspace(0, view.width_px - 1, 23), np.linspace(0, view.height_px - 1, 19))
     points = np.stack([xs.ravel(), ys.ravel()], axis=1)
@@ -92,7 +92,7 @@ def test_nadir_view_by_hand() -> None:
 @settings(max_examples=100, deadline=None)
 def test_view_is_bounded_and_within_the_cut(omega_deg: float, kappa_deg: float, gsd_m: float, factor: float) -> None:
     seen_from = pose(omega_deg, 0.0, kappa_deg)
-    strategy = GroundView(max_distance_factor=factor, max_megapixels=1.5)
+    strategy = GroundView(max_distance_factor=factor, max_megapixels=1.5, far_ground=False)
     (view,) = strategy(PINHOLE, seen_from, GROUND_Z, gsd_m)
     if view.is_source:
         return
@@ -114,7 +114,7 @@ def _undistorted_from_world(seen_from: Pose) -> FloatArray:
 def test_points_behind_the_camera_are_masked() -> None:
     # Looking south 60 degrees from nadir; a view made by hand that reaches 300 m to the north of the camera.
     seen_from = pose(-60.0, 0.0, 0.0)
-    (view,) = GroundView()(PINHOLE, seen_from, GROUND_Z, 0.5)
+    (view,) = GroundView(far_ground=False)(PINHOLE, seen_from, GROUND_Z, 0.5)
     north_px = np.array([[view.width_px / 2.0, -y / 0.5] for y in (300.0, 400.0)])
     assert np.isnan(source_from_view(PINHOLE, view.undistorted_from_view, north_px)).all()
     inside = source_from_view(PINHOLE, view.undistorted_from_view, np.array([[view.width_px / 2.0, 5.0]]))
@@ -132,7 +132,7 @@ def test_view_is_never_finer_than_the_image() -> None:
 
 def test_far_ground_is_not_enlarged_beyond_the_stretch() -> None:
     seen_from = pose(72.0, 0.0, 0.0)
-    wide, tight = GroundView(max_stretch=50.0), GroundView(max_stretch=2.0)
+    wide, tight = (GroundView(max_stretch=most, far_ground=False) for most in (50.0, 2.0))
     far = np.array([[0.0, 0.0]])
     for strategy, within in ((wide, False), (tight, True)):
         (view,) = strategy(PINHOLE, seen_from, GROUND_Z, 0.1)
@@ -158,3 +158,56 @@ def test_images_without_ground_keep_the_source(blind: Pose) -> None:
     # Looking up; below the ground; so low that nothing of the view is left at this scale.
     (view,) = GroundView()(PINHOLE, blind, GROUND_Z, 0.5)
     assert view.is_source
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, LENS])
+def test_distant_ground_is_looked_at_as_the_image_shows_it(camera: Camera) -> None:
+    """Together with the ground view every place on the ground is seen, no place twice, and the sky not at all."""
+    seen_from = pose(72.0, 5.0, -30.0)
+    far, near = GroundView()(camera, seen_from, GROUND_Z, 0.2)
+    assert (far.name, near.name, far.is_source, far.angle_deg, far.gsd_m) == ("far", "ground", False, 0.0, None)
+    pixels = np.tile(np.arange(camera.width_px) % 200, (camera.height_px, 1)).astype(np.uint8)
+    picture, seen = render_view(pixels, None, camera, far)
+    assert seen is not None
+    rows, columns = np.nonzero(seen)
+    source_px = source_from_view(camera, far.undistorted_from_view, np.column_stack([columns, rows]))
+    own = (source_px[:, 0] % 200 > 2) & (source_px[:, 0] % 200 < 196)
+    assert np.abs(picture[rows, columns][own] - source_px[own, 0] % 200).max() <= 1.0
+    places = np.random.default_rng(0).uniform([20.0, 20.0], [camera.width_px - 21, camera.height_px - 21], (4000, 2))
+    assert seen_from.world_rotation is not None
+    below = (np.column_stack([normalise(camera, places), np.ones(len(places))]) @ seen_from.world_rotation)[:, 2] < 0.0
+    near_px = view_from_source(camera, near.undistorted_from_view, places)
+    in_near = below & (near_px > 0.0).all(axis=1) & (near_px < [near.width_px - 1, near.height_px - 1]).all(axis=1)
+    far_px = np.rint(view_from_source(camera, far.undistorted_from_view, places)).astype(int)
+    inside = ((far_px >= 0) & (far_px < [far.width_px, far.height_px])).all(axis=1)
+    in_far = np.zeros(len(places), bool)
+    in_far[inside] = seen[far_px[inside, 1], far_px[inside, 0]]
+    assert (in_near ^ in_far)[below].mean() > 0.98  # the mask is exact to some pixels
+    assert in_far[~below].mean() < 0.02
+    assert 0.1 < in_far.mean() < 0.6
+
+
+def test_distant_ground_has_no_view_where_it_is_little_or_not_wanted() -> None:
+    steep = pose(72.0, 0.0, 0.0)
+    assert [view.name for view in GroundView()(PINHOLE, pose(30.0, 0, 0), GROUND_Z, 0.2)] == ["ground"]
+    assert [view.name for view in GroundView(far_ground=False)(PINHOLE, steep, GROUND_Z, 0.2)] == ["ground"]
+    assert [view.name for view in GroundView(keep_source=True)(PINHOLE, steep, GROUND_Z, 0.2)] == ["source", "ground"]
+
+
+def test_an_image_with_distant_ground_gets_as_many_keypoints_more() -> None:
+    camera, steep = PINHOLE, pose(72.0, 0.0, 0.0)
+    gray = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px), dtype=np.uint8)
+    pictures = [ViewPixels(view, *render_view(gray, None, camera, view)) for view in GroundView()(camera, steep, GROUND_Z, 0.2)]
+    share = further_views(pictures, camera)
+    shown = pictures[0].valid
+    assert shown is not None
+    assert share == pytest.approx(shown.sum() / (gray.size - shown.sum()))
+    assert 0.1 < share < 0.6
+    extractor = Sift(keypoints=500, pixels_per_keypoint=400.0).with_extra_views(share)
+    assert extractor.keypoints == round(500 * (1.0 + share))
+    assert extractor.pixels_per_keypoint * extractor.keypoints == pytest.approx(500 * 400.0)
+    assert further_views(pictures[1:], camera) == 0.0
+    features = extractor(camera, pictures)
+    counts = np.bincount(features.view_idx, minlength=2)
+    assert counts.sum() == extractor.keypoints
+    assert counts[0] == pytest.approx(share / (1.0 + share) * counts.sum(), rel=0.15)

@@ -43,7 +43,7 @@ def neighbour(pose: Pose, camera: Camera = NADIR) -> Neighbour:
 
 
 def views_of(pose: Pose, *others: Pose, camera: Camera = NADIR, **settings: float) -> dict[str, View]:
-    strategy = NeighbourViews(**{"min_stretch": 1.6, **settings})
+    strategy = NeighbourViews(**{"min_stretch": 1.6, "far_ground": False, **settings})
     made = strategy(camera, pose, GROUND_Z, GSD_M, [neighbour(other) for other in others])
     return {view.name: view for view in made}
 
@@ -138,7 +138,7 @@ def test_neighbours_of_small_stretch_are_served_by_the_ground_view(others: tuple
 def test_by_default_only_the_steepest_get_a_view_of_their_own() -> None:
     for tilt_deg, count in ((70.0, 1), (77.0, 2)):
         others = [neighbour(looking(180.0, tilt_deg))]
-        assert len(NeighbourViews()(NADIR, looking(0.0, tilt_deg), GROUND_Z, GSD_M, others)) == count
+        assert len(NeighbourViews(far_ground=False)(NADIR, looking(0.0, tilt_deg), GROUND_Z, GSD_M, others)) == count
 
 
 def test_crossed_obliques_are_served_by_the_ground_view() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Pose
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose, View
 from aeromatch_cli.geometry.cameras import calibration_matrix, distort, undistort
 from aeromatch_cli.geometry.frames import apply_homography
 
@@ -44,6 +44,17 @@ def view_from_source(camera: Camera, undistorted_from_view: FloatArray, points_p
 def source_from_view(camera: Camera, undistorted_from_view: FloatArray, points_px: FloatArray) -> FloatArray:
     """Stored source pixels (N, 2) of view pixels (N, 2); NaN where the source cannot see them."""
     return distort(camera, apply_homography(undistorted_from_view, points_px))
+
+
+def ground_beyond(view: View, points: FloatArray) -> BoolArray:
+    """Whether undistorted pixels (N, 2) show ground below the horizon that lies outside the box of a ground view."""
+    view_from_undistorted = np.linalg.inv(view.undistorted_from_view)
+    # Of a ground point the third homogeneous coordinate is one over its depth.
+    inverse_depth = points @ view_from_undistorted[2, :2] + view_from_undistorted[2, 2]
+    places = apply_homography(view_from_undistorted, points)
+    with np.errstate(invalid="ignore"):
+        inside = ((places > -0.5) & (places < [view.width_px - 0.5, view.height_px - 0.5])).all(axis=1)
+    return np.asarray((inverse_depth > 0.0) & ~inside)
 
 
 def area_scale(homography: FloatArray, points_px: FloatArray) -> FloatArray:

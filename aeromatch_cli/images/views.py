@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.geometry.cameras import distort
 from aeromatch_cli.geometry.frames import apply_homography
-from aeromatch_cli.geometry.warps import area_scale
+from aeromatch_cli.geometry.warps import area_scale, ground_beyond
 from aeromatch_cli.images.scaling import shrink
 
 _GRID_STEP_PX = 8
+# Where distant ground begins is known to so many pixels.
+_FAR_STEP_PX = 8
 
 _GRID_ERROR_PX = 0.015
 
@@ -47,7 +49,21 @@ def render_view(
     if valid is not None:
         seen = shrink(valid.astype(np.uint8) * 255, scale) if scale < _ALIASING_SCALE else valid.astype(np.uint8) * 255
         inside &= cv2.remap(seen, map_x, map_y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 127
+    if view.beyond is not None:
+        inside &= _beyond(view, view.beyond)
     return picture, inside
+
+
+def _beyond(view: View, near: View) -> BoolArray:
+    """Where a view (H, W) shows ground that a nearer one leaves out, to a few pixels."""
+    import cv2
+
+    columns, rows = -(-view.width_px // _FAR_STEP_PX), -(-view.height_px // _FAR_STEP_PX)
+    middles = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) + 0.5
+    places = apply_homography(view.undistorted_from_view, middles * _FAR_STEP_PX - 0.5)
+    coarse = ground_beyond(near, places).reshape(rows, columns).astype(np.uint8)
+    whole = cv2.resize(coarse, (columns * _FAR_STEP_PX, rows * _FAR_STEP_PX), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(whole[: view.height_px, : view.width_px] > 0)
 
 
 def view_maps(camera: Camera, view: View) -> tuple[FloatArray, FloatArray]:

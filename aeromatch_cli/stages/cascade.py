@@ -36,6 +36,7 @@ from aeromatch_cli.strategies.matchers.descriptors.bidirectional import Bidirect
 from aeromatch_cli.strategies.matchers.descriptors.search import EVERY_PAIR
 from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
+from aeromatch_cli.strategies.simulators.plane import PlaneViews
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows, Step
 
 # The first step of every cascade.
@@ -67,6 +68,12 @@ def _reduction(settings: Settings, kind: type[Described]) -> dict[str, float]:
     return {"pixels_per_keypoint": own.pixels_per_keypoint} if taken else {}
 
 
+def _views(settings: Settings) -> NeighbourViews:
+    """Of steps with features of their own: with distant ground where the settings have it."""
+    own = settings.simulate
+    return NeighbourViews(far_ground=own.far_ground) if isinstance(own, PlaneViews) else NeighbourViews()
+
+
 # What a step changes of the settings.
 _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = {
     GuidedSearch: lambda _, settings: {
@@ -74,7 +81,7 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
         "match": settings.match.model_copy(update={"guided": True, "guide_below_matches": EVERY_PAIR}),
     },
     LearnedFeatures: lambda step, settings: {
-        "simulate": NeighbourViews(),
+        "simulate": _views(settings),
         "extract": Learned(
             keypoints=keypoints_of(step, settings),
             precision=step.precision,
@@ -85,7 +92,7 @@ _RECIPES: Mapping[type[Step], Callable[[Any, Settings], dict[str, Strategy]]] = 
     },
     LiftedShadows: lambda step, settings: {
         "enhance": ShadowEnhancement(),
-        "simulate": NeighbourViews(),
+        "simulate": _views(settings),
         "extract": Sift(keypoints=keypoints_of(step, settings), **_reduction(settings, Sift)),
         "match": LightGlue(guided=True, precision=step.precision, device=step.device),
     },

@@ -46,14 +46,14 @@ class Grid(Strategy):
         "points, more time.",
     )
 
-    def with_extra_views(self, views: int) -> Grid:
+    def with_extra_views(self, views: float) -> Grid:
         """The same: a grid is of the source alone."""
         del views
         return self
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
-        """Features of the first view (the source, with simulate=none), without descriptors."""
-        shown = views[0]
+        """Features of the first view of near ground (the source, with simulate=none), without descriptors."""
+        shown = next(view for view in views if view.view.beyond is None)
         height, width = shown.gray.shape
         scale = min(1.0, _JUDGED_PX / max(height, width))
         texture = _texture(shown.gray, shown.valid, scale)

@@ -18,7 +18,8 @@ class GroundView(PlaneViews):
     of the top-left pixel, x runs east and y south along the grid. The view's box encloses the footprint cut at
     max_distance_factor flying heights and, in oblique images, at the depth from where on the view would enlarge the
     source more than max_stretch times (square root of area). Its scale is the common ground sampling distance, made
-    coarser where the image itself is coarser (max_magnification) and where the box would exceed max_megapixels.
+    coarser where the image itself is coarser (max_magnification) and where the box would exceed max_megapixels. Ground
+    beyond the box is view 0, as the image shows it, where there is enough of it (far_ground).
 
     Without attitude, ground or common ground sampling distance, or where no ground is seen: the source view alone.
     """
@@ -43,4 +44,4 @@ class GroundView(PlaneViews):
         view = self.plane_view(ground, ground.polygon_m, direction_of(0, 0.0), self.name)
         if view is None:
             return (source,)
-        return (source, view) if self.keep_source else (view,)
+        return (source, view) if self.keep_source else (*self.far_view(camera, ground), view)

@@ -98,7 +98,7 @@ class NeighbourViews(PlaneViews):
         made = tuple(view for view in views if view is not None)
         if not made:
             return (source,)
-        return (source, *made) if self.keep_source else made
+        return (source, *made) if self.keep_source else (*self.far_view(camera, ground), *made)
 
     def _wanted(self, ground: GroundPlane, own: Neighbour, other: Neighbour, gsd_m: float) -> _Wanted | None:
         """What one neighbour asks for, None where both share no ground."""

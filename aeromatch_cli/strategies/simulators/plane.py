@@ -8,20 +8,23 @@ import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.data import Camera, FloatArray, Pose, View
+from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.footprints import (
     MAX_DISTANCE_FACTOR,
     clip_half_plane,
     ground_footprint,
     ground_sampling_distance_m,
 )
-from aeromatch_cli.geometry.views import view_from_ground
-from aeromatch_cli.geometry.warps import undistorted_from_ground
+from aeromatch_cli.geometry.views import direction_of, view_from_ground
+from aeromatch_cli.geometry.warps import ground_beyond, undistorted_from_ground
 from aeromatch_cli.strategies import Strategy
 
 # A smaller view holds no feature worth the name; the source is used instead.
 _SMALLEST_VIEW_PX = 32
 # Of a pixel: a box whose side falls on a pixel's edge up to rounding keeps that pixel.
 _ROUNDING_PX = 1e-6
+# Distant ground is looked at by itself where it fills this share of an image, counted on so many places a side.
+_LEAST_FAR, _FAR_SAMPLES = 0.05, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +72,12 @@ class PlaneViews(Strategy):
         "Larger: more distant, more blurred ground.",
     )
 
+    far_ground: bool = Field(
+        default=True,
+        description="Look at distant ground that the views leave out as the image shows it, where that is 5 % of the "
+        "image or more. The image gets as many keypoints more.",
+    )
+
     def ground_plane(
         self, camera: Camera, pose: Pose | None, ground_z_m: float | None, gsd_m: float | None, per_side: int = 8
     ) -> GroundPlane | None:
@@ -89,6 +98,26 @@ class PlaneViews(Strategy):
         if len(polygon) < 3:
             return None
         return GroundPlane(polygon, undistorted_from_world, np.array(pose.world_rotation[2]), scale_m, height_m)
+
+    def far_view(self, camera: Camera, ground: GroundPlane) -> tuple[View, ...]:
+        """The part of the undistorted image that shows more distant ground than views do, where there is enough.
+
+        Ground that no neighbour shares counts as shown.
+        """
+        near = self.plane_view(ground, ground.polygon_m, direction_of(0, 0.0), "near")
+        if near is None or self.keep_source or not self.far_ground:
+            return ()
+        steps = np.array([camera.width_px, camera.height_px]) / _FAR_SAMPLES
+        columns, rows = (np.arange(_FAR_SAMPLES) + 0.5) * steps[:, None]
+        places = undistort(camera, np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2))
+        far = places[ground_beyond(near, places)]
+        if len(far) < _LEAST_FAR * len(places):
+            return ()
+        first = np.floor(far.min(axis=0) - steps)  # what that adds beyond the image is masked
+        width, height = (int(size) for size in np.ceil(far.max(axis=0) + steps) - first)
+        part = np.array([[1.0, 0.0, first[0]], [0.0, 1.0, first[1]], [0.0, 0.0, 1.0]])
+        return (View("far", width, height, part, is_source=False, angle_deg=0.0, world_direction=ground.axis,
+                     beyond=near),)  # fmt: skip
 
     def plane_view(self, ground: GroundPlane, polygon_m: FloatArray, direction: FloatArray, name: str) -> View | None:
         """The parallel view along a downward unit `direction` of the box around polygon_m, or None if that is small.
