@@ -8,10 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeromatch_cli.data import Camera, FloatArray, Pose, View
-from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.footprints import ground_footprint, ground_sampling_distance_m
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.geometry.warps import area_scale, source_from_view
+from aeromatch_cli.geometry.warps import area_scale, source_from_view, view_from_source
+from aeromatch_cli.images.views import render_view
+from aeromatch_cli.strategies import ViewPixels
+from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.simulators import SIMULATORS
 from aeromatch_cli.strategies.simulators.ground import GroundView
 
@@ -194,20 +197,12 @@ def test_distant_ground_has_no_view_where_it_is_little_or_not_wanted() -> None:
     assert [view.name for view in GroundView(keep_source=True)(PINHOLE, steep, GROUND_Z, 0.2)] == ["source", "ground"]
 
 
-def test_an_image_with_distant_ground_gets_as_many_keypoints_more() -> None:
-    camera, steep = PINHOLE, pose(72.0, 0.0, 0.0)
-    gray = np.random.default_rng(0).integers(0, 256, (camera.height_px, camera.width_px), dtype=np.uint8)
-    pictures = [ViewPixels(view, *render_view(gray, None, camera, view)) for view in GroundView()(camera, steep, GROUND_Z, 0.2)]
-    share = further_views(pictures, camera)
-    shown = pictures[0].valid
-    assert shown is not None
-    assert share == pytest.approx(shown.sum() / (gray.size - shown.sum()))
-    assert 0.1 < share < 0.6
-    extractor = Sift(keypoints=500, pixels_per_keypoint=400.0).with_extra_views(share)
-    assert extractor.keypoints == round(500 * (1.0 + share))
-    assert extractor.pixels_per_keypoint * extractor.keypoints == pytest.approx(500 * 400.0)
-    assert further_views(pictures[1:], camera) == 0.0
-    features = extractor(camera, pictures)
-    counts = np.bincount(features.view_idx, minlength=2)
-    assert counts.sum() == extractor.keypoints
-    assert counts[0] == pytest.approx(share / (1.0 + share) * counts.sum(), rel=0.15)
+def test_distant_ground_has_keypoints_of_its_own_as_many_for_each_pixel() -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (PINHOLE.height_px, PINHOLE.width_px), dtype=np.uint8)
+    views = GroundView()(PINHOLE, pose(72.0, 0.0, 0.0), GROUND_Z, 0.2)
+    pictures = [ViewPixels(view, *render_view(gray, None, PINHOLE, view)) for view in views]
+    far_px = 0 if pictures[0].valid is None else int(pictures[0].valid.sum())
+    found = np.bincount(Sift(keypoints=500)(PINHOLE, pictures).view_idx, minlength=2)
+    assert found[1] == 500
+    assert found[0] == round(500 * far_px / (gray.size - far_px))
+    assert 50 < found[0] < 300

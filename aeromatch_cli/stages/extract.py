@@ -59,7 +59,7 @@ def run_task(task: ExtractTask) -> Extracted:
     """Write features/<id>.npz."""
     pictures, enhancement = simulate.render(task.views)
     source = task.views.enhance.source
-    further = simulate.further_views(pictures, source.working_camera)
+    further = simulate.further_views(pictures)
     features = (task.extractor.with_extra_views(further) if further else task.extractor)(
         source.working_camera, pictures
     )

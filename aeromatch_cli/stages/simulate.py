@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, Image, Neighbour, Pose, View
+from aeromatch_cli.data import Image, Neighbour, Pose, View
 from aeromatch_cli.files import whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
@@ -82,13 +82,9 @@ def render(task: SimulateTask) -> tuple[list[ViewPixels], Any]:
     return pictures, result
 
 
-def further_views(pictures: Sequence[ViewPixels], camera: Camera) -> float:
-    """1 where the image as it was taken was added to simulated views because of other images' attitudes; where distant
-    ground has a view, its pixels for one of the others; else 0."""
-    if any(item.view.name == _ADDED for item in pictures):
-        return 1.0
-    far_px = next((float(item.valid.sum()) for item in pictures if item.view.beyond and item.valid is not None), 0.0)
-    return min(far_px / max(camera.width_px * camera.height_px - far_px, 1.0), 1.0)
+def further_views(pictures: Sequence[ViewPixels]) -> int:
+    """1 where the image as it was taken was added to simulated views because of other images' attitudes, else 0."""
+    return int(any(item.view.name == _ADDED for item in pictures))
 
 
 @dataclass(frozen=True)

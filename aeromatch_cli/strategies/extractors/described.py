@@ -95,19 +95,22 @@ class Described(Strategy):
     def north_up_only(self) -> bool:
         """Whether descriptors of views with north up match no others."""
 
-    def with_extra_views(self, views: float) -> Described:
-        """With as many descriptors more for further views of an image; 0.2 views show a fifth of what the others do.
-        They are reduced as those of images without further views."""
-        if self.budget == "view":
-            return self
-        keypoints = round(self.keypoints * (1.0 + views))
-        each_px = self.pixels_per_keypoint * self.keypoints / keypoints
-        return self.model_copy(update={"keypoints": keypoints, "pixels_per_keypoint": each_px})
+    def with_extra_views(self, views: int) -> Described:
+        """With as many descriptors more for further views of an image, which are reduced as those of other images."""
+        more = {
+            "keypoints": self.keypoints * (1 + views),
+            "pixels_per_keypoint": self.pixels_per_keypoint / (1 + views),
+        }
+        return self.model_copy(update=more) if self.budget == "image" else self
 
     def __call__(self, camera: Camera, views: Sequence[ViewPixels]) -> Features:
         """Features of one image, merged over its views; empty arrays of the right shapes where nothing was found."""
         found, small, factors = self._looked_for(camera, views)
-        raw = concatenate([self._cut(found, views, group) for group in self._groups(views)])
+        raw = concatenate([
+            self._cut(found, views, part, self._wanted(camera, views, part))
+            for group in self._groups(views)
+            for part in _near_and_far(views, group)
+        ])  # fmt: skip
         turned = self.turned(in_reduced_views(raw, factors[raw.view_idx]), small)
         raw = replace(raw, orientations_deg=turned.orientations_deg)
         keypoint_idx, standing = merge_keypoints(raw.source_px, raw.source_sizes_px, raw.view_idx, int(factors.max()))
@@ -149,12 +152,26 @@ class Described(Strategy):
         groups = [[i for i, item in enumerate(views) if item.view.enhanced is enhanced] for enhanced in (False, True)]
         return [group for group in groups if group]
 
-    def _cut(self, found: Sequence[Raw], views: Sequence[ViewPixels], group: Sequence[int]) -> Raw:
+    def _wanted(self, camera: Camera, views: Sequence[ViewPixels], group: Sequence[int]) -> int:
+        """The budget of a group of views: distant ground has its own, as large as the others' for each pixel."""
+        far = views[group[0]]
+        if self.budget == "view" or far.view.beyond is None or far.valid is None:
+            return self.keypoints
+        far_px = int(far.valid.sum())
+        return round(self.keypoints * min(far_px / max(camera.width_px * camera.height_px - far_px, 1), 1.0))
+
+    def _cut(self, found: Sequence[Raw], views: Sequence[ViewPixels], group: Sequence[int], budget: int) -> Raw:
         """The features of a group of views that the budget buys."""
         raw = concatenate([found[index] for index in group])
         within = np.searchsorted(group, raw.view_idx)
         shown, strengths = [views[index] for index in group], self.strengths(raw)
-        return raw.take(even_selection(shown, within, raw.points_px, strengths, self.keypoints, self.per_cell))
+        return raw.take(even_selection(shown, within, raw.points_px, strengths, budget, self.per_cell))
+
+
+def _near_and_far(views: Sequence[ViewPixels], group: Sequence[int]) -> list[list[int]]:
+    """A group of views in two, that of distant ground first."""
+    parts = [[i for i in group if (views[i].view.beyond is None) is near] for near in (False, True)]
+    return [part for part in parts if part]
 
 
 def _features(

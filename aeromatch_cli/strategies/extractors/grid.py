@@ -46,7 +46,7 @@ class Grid(Strategy):
         "points, more time.",
     )
 
-    def with_extra_views(self, views: float) -> Grid:
+    def with_extra_views(self, views: int) -> Grid:
         """The same: a grid is of the source alone."""
         del views
         return self
