@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aeromatch_cli.data import Camera, FloatArray, Pose, View
-from aeromatch_cli.geometry.cameras import normalise, project
+from aeromatch_cli.geometry.cameras import normalise, project, undistort
 from aeromatch_cli.geometry.footprints import ground_footprint, ground_sampling_distance_m
+from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.geometry.warps import area_scale, source_from_view, view_from_source
+from aeromatch_cli.geometry.warps import area_scale, border_px, source_from_view, view_from_source
 from aeromatch_cli.images.views import render_view
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
@@ -20,6 +24,7 @@ from aeromatch_cli.strategies.simulators.ground import GroundView
 
 PINHOLE = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 LENS = Camera("OPENCV", 1000, 800, (820.0, 815.0, 503.2, 391.1, -0.08, 0.03, 1e-3, -5e-4))
+WIDE = Camera("OPENCV", 1000, 800, (500.0, 500.0, 499.5, 399.5, -0.25, 0.03, 0.0, 0.0))
 GROUND_Z = 12.0
 
 
@@ -206,3 +211,51 @@ def test_distant_ground_has_keypoints_of_its_own_as_many_for_each_pixel() -> Non
     assert found[1] == 500
     assert found[0] == round(500 * far_px / (gray.size - far_px))
     assert 50 < found[0] < 300
+
+
+@pytest.mark.parametrize("keypoints", [1, 2, 5, 40])
+def test_a_sliver_of_distant_ground_may_have_no_keypoint(keypoints: int) -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (PINHOLE.height_px, PINHOLE.width_px), dtype=np.uint8)
+    views = GroundView()(PINHOLE, pose(62.0, 0.0, 0.0), GROUND_Z, 0.2)
+    pictures = [ViewPixels(view, *render_view(gray, None, PINHOLE, view)) for view in views]
+    assert pictures[0].valid is not None
+    pictures[0] = replace(pictures[0], valid=pictures[0].valid & (np.arange(pictures[0].gray.shape[0]) < 30)[:, None])
+    found = np.bincount(Sift(keypoints=keypoints)(PINHOLE, pictures).view_idx, minlength=2)
+    far_px = int(pictures[0].valid.sum())
+    assert list(found) == [round(keypoints * far_px / (gray.size - far_px)), keypoints]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(50.0, 90.0), st.floats(-180.0, 180.0), st.floats(0.2, 8.0), st.sampled_from([PINHOLE, LENS, WIDE]))
+def test_views_of_distant_ground_are_bounded(
+    omega_deg: float, kappa_deg: float, megapixels: float, camera: Camera
+) -> None:
+    strategy = GroundView(max_megapixels=megapixels)
+    for view in strategy(camera, pose(omega_deg, 5.0, kappa_deg), GROUND_Z, 0.2):
+        if view.is_source:
+            continue
+        assert view.width_px * view.height_px <= megapixels * 1e6
+        if view.beyond is not None:  # a pixel is none of a finer picture, and the box lies within the image
+            outline = undistort(camera, border_px(camera, 50))
+            corners = np.array([[-0.5, -0.5], [view.width_px - 0.5, view.height_px - 0.5]])
+            places = apply_homography(view.undistorted_from_view, corners)
+            assert view.undistorted_from_view[0, 0] >= 1.0
+            assert (places > outline.min(axis=0) - 1.0).all()
+            assert (places < outline.max(axis=0) + 1.0).all()
+
+
+def test_distant_ground_does_not_tell_how_views_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distant ground full of blobs beside near ground with fine ones: that goes back to full size all the same."""
+    monkeypatch.setattr("aeromatch_cli.strategies.extractors.reduction._LEAST_PX", 1000)
+    rng = np.random.default_rng(0)
+    gray = np.full((PINHOLE.height_px, PINHOLE.width_px), 128, np.uint8)
+    gray[:350] = cv2.resize(rng.integers(0, 256, (50, 143), dtype=np.uint8), (1000, 350), interpolation=cv2.INTER_CUBIC)
+    gray[640:720] = rng.integers(0, 256, (80, 1000), dtype=np.uint8)
+    found = {}
+    for far_ground in (False, True):
+        views = GroundView(far_ground=far_ground)(PINHOLE, pose(72.0, 0.0, 0.0), GROUND_Z, 0.05)
+        pictures = [ViewPixels(view, *render_view(gray, None, PINHOLE, view)) for view in views]
+        features = Sift(keypoints=500, pixels_per_keypoint=900.0)(PINHOLE, pictures)
+        found[far_ground] = int((features.view_idx == len(views) - 1).sum())
+    assert found[True] == found[False]
+    assert found[True] > 250

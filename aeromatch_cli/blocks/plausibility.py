@@ -131,7 +131,7 @@ def _attitude_warnings(block: Block, ids: Sequence[str], names: Names) -> list[s
     if horizon:
         return [
             f"{_some(names[horizon])} with the horizon in view: ground beyond {MAX_DISTANCE_FACTOR:g} flying heights "
-            "is left out; if the flight was not oblique, check the angle convention"
+            "does not count as overlap; if the flight was not oblique, check the angle convention"
         ]
     return []
 

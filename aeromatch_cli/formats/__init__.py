@@ -159,8 +159,8 @@ enhanced have none.
   were made of.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
-  With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image and shows only
-  ground that the box of the ground view leaves out.
+  With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image, a few pixels
+  larger or smaller than what it shows: only ground that the box of the ground view leaves out, the rest is black.
 - `<view>.png`: gray picture of the view (kept by the single stage and with `--keep-images`).
 
 ## Features and matches

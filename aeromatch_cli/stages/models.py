@@ -23,6 +23,8 @@ log = logging.getLogger("aeromatch")
 _MAX_ROUNDS = 4
 # A block falls into parts where the largest model holds fewer than this share of its images though so many are matched.
 _WHOLE = 0.8
+# A model with this many times the images of another says more of given positions.
+_BY_CHANCE = 2
 # An exact match of the first pass lies this near its epipolar line, in pixels of its own reduced image.
 _EXACT_PX = 3.0
 
@@ -42,10 +44,13 @@ class Mapped:
         return not self.models or bool(self.models[0].figures["contradiction"])
 
     def beats(self, other: Mapped) -> bool:
-        """Whether its largest model has more images, and none that a model at its right place holds is lost for it."""
-        larger = _largest(self.models) > _largest(other.models)
-        loses = self.contradicted or _images(self.models) < _images(other.models)
-        return larger and (other.contradicted or not loses)
+        """Whether its largest model has more images, and none that models at their right places hold is lost for it.
+
+        A small model may fit positions by chance: a larger one that contradicts them beats it all the same.
+        """
+        largest, others = _largest(self.models), _largest(other.models)
+        loses = _images(self.models) < _images(other.models) or (self.contradicted and largest < _BY_CHANCE * others)
+        return largest > others and (other.contradicted or not loses)
 
 
 def best_mapped(

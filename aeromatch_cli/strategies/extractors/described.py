@@ -29,8 +29,8 @@ def keypoints_field(default: int) -> Any:
         ge=1,
         description="Number of descriptors per image over all its views; fewer only where the image, or what halving "
         "leaves of it, has fewer. A keypoint with two orientations counts twice, as in OpenCV and COLMAP. With "
-        "enhance.keep_source the source image and the enhanced one have this number each. Larger: more matches, more "
-        "time.",
+        "enhance.keep_source the source image and the enhanced one have this number each; distant ground "
+        "(simulate.far_ground) has as many more for each pixel, this number at most. Larger: more matches, more time.",
     )
 
 
@@ -130,7 +130,9 @@ class Described(Strategy):
                 for index in group:
                     small[index] = reduced(views[index], factor)
                     found[index] = in_source(camera, views[index], self._found(small[index], factor, index))
-                if factor == 1 or self.suffice(concatenate([found[index] for index in group]), factor):
+                # Distant ground does not tell, or images would be reduced by how much of it they show.
+                nearest = _near_and_far(views, group)[-1]
+                if factor == 1 or self.suffice(concatenate([found[index] for index in nearest]), factor):
                     break
                 factor //= 2
             factors[group] = factor
@@ -157,7 +159,7 @@ class Described(Strategy):
         far = views[group[0]]
         if self.budget == "view" or far.view.beyond is None or far.valid is None:
             return self.keypoints
-        far_px = int(far.valid.sum())
+        far_px = far.valid.sum() * far.view.undistorted_from_view[0, 0] ** 2
         return round(self.keypoints * min(far_px / max(camera.width_px * camera.height_px - far_px, 1), 1.0))
 
     def _cut(self, found: Sequence[Raw], views: Sequence[ViewPixels], group: Sequence[int], budget: int) -> Raw:

@@ -56,8 +56,8 @@ def even_selection(
     per_cell of `budget` features: squares of a power of two metres along the world's axes where the view's ground is
     known, else squares of view pixels. Equal features go by their order.
     """
-    if len(points_px) <= budget:
-        return np.arange(len(points_px))
+    if len(points_px) <= budget or budget < 1:
+        return np.arange(min(len(points_px), budget))
     samples = [_samples(view) for view in views]
     cell_px2 = sum(len(seen) * step**2 for seen, step in samples) * per_cell / budget
     turn = np.zeros(len(points_px))

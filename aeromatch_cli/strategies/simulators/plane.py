@@ -16,7 +16,7 @@ from aeromatch_cli.geometry.footprints import (
     ground_sampling_distance_m,
 )
 from aeromatch_cli.geometry.views import direction_of, view_from_ground
-from aeromatch_cli.geometry.warps import ground_beyond, undistorted_from_ground
+from aeromatch_cli.geometry.warps import border_px, ground_beyond, undistorted_from_ground
 from aeromatch_cli.strategies import Strategy
 
 # A smaller view holds no feature worth the name; the source is used instead.
@@ -25,6 +25,8 @@ _SMALLEST_VIEW_PX = 32
 _ROUNDING_PX = 1e-6
 # Distant ground is looked at by itself where it fills this share of an image, counted on so many places a side.
 _LEAST_FAR, _FAR_SAMPLES = 0.05, 40
+# OpenCV warps no longer ones.
+_LONGEST_VIEW_PX = 32_766
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +57,8 @@ class PlaneViews(Strategy):
     max_distance_factor: float = Field(
         default=MAX_DISTANCE_FACTOR,
         gt=0.0,
-        description="Ground farther away than this many flying heights is left out of the view. Larger: more distant "
-        "ground.",
+        description="Ground farther away than this many flying heights is left out of the ground view (but see "
+        "far_ground). Larger: more distant ground.",
     )
     max_magnification: float = Field(
         default=1.0,
@@ -68,14 +70,14 @@ class PlaneViews(Strategy):
     max_stretch: float = Field(
         default=3.0,
         gt=1.0,
-        description="Largest magnification of distant ground; ground that would be stretched more is left out. "
-        "Larger: more distant, more blurred ground.",
+        description="Largest magnification of distant ground; ground that would be stretched more is left out of the "
+        "ground view (but see far_ground). Larger: more distant, more blurred ground.",
     )
 
     far_ground: bool = Field(
         default=True,
-        description="Look at distant ground that the views leave out as the image shows it, where that is 5 % of the "
-        "image or more. The image gets as many keypoints more.",
+        description="Look at distant ground that the ground view leaves out as the image shows it, where that is 5 % "
+        "of the image or more. It gets keypoints of its own, as many for each pixel as the rest of the image.",
     )
 
     def ground_plane(
@@ -113,9 +115,16 @@ class PlaneViews(Strategy):
         far = places[ground_beyond(near, places)]
         if len(far) < _LEAST_FAR * len(places):
             return ()
-        first = np.floor(far.min(axis=0) - steps)  # what that adds beyond the image is masked
-        width, height = (int(size) for size in np.ceil(far.max(axis=0) + steps) - first)
-        part = np.array([[1.0, 0.0, first[0]], [0.0, 1.0, first[1]], [0.0, 0.0, 1.0]])
+        outline = undistort(camera, border_px(camera, _FAR_SAMPLES))
+        low = np.floor(np.maximum(far.min(axis=0) - steps, np.nanmin(outline, axis=0)) + 0.5)
+        high = np.ceil(np.minimum(far.max(axis=0) + steps, np.nanmax(outline, axis=0)) - 0.5)
+        sides = high - low + 1.0
+        scale = max(1.0, float(np.sqrt(sides.prod() / (self.max_megapixels * 1e6))), sides.max() / _LONGEST_VIEW_PX)
+        width, height = (int(side / scale) for side in sides)
+        if min(width, height) < _SMALLEST_VIEW_PX:
+            return ()
+        part = np.diag([scale, scale, 1.0])
+        part[:2, 2] = low + 0.5 * (scale - 1.0)
         return (View("far", width, height, part, is_source=False, angle_deg=0.0, world_direction=ground.axis,
                      beyond=near),)  # fmt: skip
 

@@ -8,8 +8,8 @@ from aeromatch_cli.data import BoolArray, Features, FloatArray
 
 
 def comparable_views(features0: Features, features1: Features, max_direction_deg: float) -> BoolArray:
-    """View pairs (V0, V1) worth comparing: source with source, and simulated views whose directions differ by at most
-    max_direction_deg. A view of unknown direction is compared with every view.
+    """View pairs (V0, V1) worth comparing: pictures as taken, of distant ground too, with each other, and simulated
+    views whose directions differ by at most max_direction_deg. A view of unknown direction is compared with every view.
     """
     directions0, directions1 = (np.asarray(f.view_directions, np.float64) for f in (features0, features1))
     return comparable(directions0, directions1, _is_source(features0), _is_source(features1), max_direction_deg)
@@ -41,8 +41,8 @@ def appearances(features0: Features, features1: Features) -> list[BoolArray]:
 
 
 def _is_source(features: Features) -> BoolArray:
-    """The source is the first view of its picture where there is one, without a ground sampling distance and not turned
-    from its own axis."""
+    """The source, or its part with distant ground, is the first view of its picture where there is one, without a
+    ground sampling distance and not turned from its own axis."""
     flags = np.isnan(features.view_gsd_m) & (features.view_angles_deg == 0.0)
     first = np.ones(len(flags), dtype=bool)
     first[1:] = features.view_enhanced[1:] != features.view_enhanced[:-1]
