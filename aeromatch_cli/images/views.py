@@ -14,10 +14,11 @@ from aeromatch_cli.geometry.warps import area_scale, ground_beyond
 from aeromatch_cli.images.scaling import shrink
 
 _GRID_STEP_PX = 8
-# Where distant ground begins is known to so many pixels.
-_FAR_STEP_PX = 8
 
 _GRID_ERROR_PX = 0.015
+
+# Where distant ground begins is known to so many pixels.
+_FAR_STEP_PX = 8
 
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
@@ -56,14 +57,11 @@ def render_view(
 
 def _beyond(view: View, near: View) -> BoolArray:
     """Where a view (H, W) shows ground that a nearer one leaves out, to a few pixels."""
-    import cv2
-
     columns, rows = -(-view.width_px // _FAR_STEP_PX), -(-view.height_px // _FAR_STEP_PX)
     middles = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) + 0.5
     places = apply_homography(view.undistorted_from_view, middles * _FAR_STEP_PX - 0.5)
-    coarse = ground_beyond(near, places).reshape(rows, columns).astype(np.uint8)
-    whole = cv2.resize(coarse, (columns * _FAR_STEP_PX, rows * _FAR_STEP_PX), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(whole[: view.height_px, : view.width_px] > 0)
+    coarse = ground_beyond(near, places).reshape(rows, columns)
+    return coarse.repeat(_FAR_STEP_PX, axis=0).repeat(_FAR_STEP_PX, axis=1)[: view.height_px, : view.width_px]
 
 
 def view_maps(camera: Camera, view: View) -> tuple[FloatArray, FloatArray]:

@@ -57,7 +57,7 @@ def best_mapped(
     context: Context, recipe: FirstPass, first: Context, evidence: Evidence
 ) -> tuple[Mapped, list[dict[str, Any]]]:
     """Models of a first pass, or of a further one where that has better ones, and what further ones were tried."""
-    best = Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
+    best = _mapped(context, recipe, first, evidence)
     tried: list[dict[str, Any]] = []
     for words, further in (
         ("more keypoints", _with_more_keypoints),
@@ -67,9 +67,14 @@ def best_mapped(
         if found is None:
             continue
         counts = {"images": _largest(best.models), "images_then": _largest(found.models)}
-        tried.append({"with": words, **counts, "used": found.beats(best)})
-        best = found if found.beats(best) else best
+        used = found.beats(best)
+        tried.append({"with": words, **counts, "used": used})
+        best = found if used else best
     return best, tried
+
+
+def _mapped(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> Mapped:
+    return Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
 
 
 def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
@@ -78,8 +83,7 @@ def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
     dearer = first_pass.thorough(best.recipe, best.first) if falls_apart and best.recipe.replaces else None
     if dearer is None:
         return None
-    first, evidence = evidence_of(context, dearer)
-    return Mapped(dearer, first, evidence, _sound_models(context, dearer, first, evidence))
+    return _mapped(context, dearer, *evidence_of(context, dearer))
 
 
 def _without_positions(context: Context, best: Mapped) -> Mapped | None:
@@ -89,7 +93,7 @@ def _without_positions(context: Context, best: Mapped) -> Mapped | None:
     first, evidence = evidence_of(context, best.recipe, by_position=False)
     if {(p.image_id0, p.image_id1) for p in first.pairs} <= {(p.image_id0, p.image_id1) for p in best.first.pairs}:
         return None
-    return Mapped(best.recipe, first, evidence, _sound_models(context, best.recipe, first, evidence))
+    return _mapped(context, best.recipe, first, evidence)
 
 
 def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:

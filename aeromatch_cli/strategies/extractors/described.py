@@ -125,13 +125,13 @@ class Described(Strategy):
         less where the features of the reduced views of a budget do not `suffice`."""
         found, small, factors = dict[int, Raw](), list(views), np.ones(len(views), np.int64)
         for group in self._groups(views):
+            # Distant ground does not tell, or images would be reduced by how much of it they show.
+            nearest = _near_and_far(views, group)[-1]
             factor = factor_for(camera, [views[i] for i in group], self.keypoints, self.pixels_per_keypoint)
             while True:
                 for index in group:
                     small[index] = reduced(views[index], factor)
                     found[index] = in_source(camera, views[index], self._found(small[index], factor, index))
-                # Distant ground does not tell, or images would be reduced by how much of it they show.
-                nearest = _near_and_far(views, group)[-1]
                 if factor == 1 or self.suffice(concatenate([found[index] for index in nearest]), factor):
                     break
                 factor //= 2

@@ -73,7 +73,6 @@ class PlaneViews(Strategy):
         description="Largest magnification of distant ground; ground that would be stretched more is left out of the "
         "ground view (but see far_ground). Larger: more distant, more blurred ground.",
     )
-
     far_ground: bool = Field(
         default=True,
         description="Look at distant ground that the ground view leaves out as the image shows it, where that is 5 % "
@@ -106,8 +105,8 @@ class PlaneViews(Strategy):
 
         Ground that no neighbour shares counts as shown.
         """
-        near = self.plane_view(ground, ground.polygon_m, direction_of(0, 0.0), "near")
-        if near is None or self.keep_source or not self.far_ground:
+        near = self.plane_view(ground, ground.polygon_m, direction_of(0, 0.0), "near") if self.far_ground else None
+        if near is None:
             return ()
         steps = np.array([camera.width_px, camera.height_px]) / _FAR_SAMPLES
         columns, rows = (np.arange(_FAR_SAMPLES) + 0.5) * steps[:, None]
