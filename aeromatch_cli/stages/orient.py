@@ -42,7 +42,7 @@ from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
 
 # The second counts for blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 18, 1
+VERSION, _LARGE_BLOCK_VERSION = 19, 1
 # Standard deviation of a focal length that the pictures gave, as a share of it.
 _FOUND_FOCAL = 0.01
 
