@@ -77,25 +77,6 @@ def test_a_block_of_many_pairs_is_not_searched_with_more_keypoints(
     assert ([model["images"] for model in facts["models"]], facts["further_first_passes"]) == ([3], [])
 
 
-def test_an_orientation_of_an_earlier_version_is_made_anew(
-    site: Site, rendered: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Version 18 knew no further first passes: its records lack what the summary says of them."""
-    shutil.copy2(rendered / "poses_noisy.csv", site.poses)
-    monkeypatch.setattr("aeromatch_cli.stages.orient.VERSION", 18)
-    assert site("orient").counts("orient")[0] == IMAGES
-    assert site("orient").counts("orient")[1] == IMAGES  # up to date
-    path = site.work / "orientation" / "orientation.json"
-    record = json.loads(path.read_text())
-    del record["facts"]["further_first_passes"]
-    path.write_text(json.dumps(record))
-    monkeypatch.undo()
-    outcome = site("orient")
-    assert outcome.code == 0
-    assert outcome.counts("orient")[0] == IMAGES
-    assert json.loads(path.read_text())["facts"]["further_first_passes"] == []
-
-
 def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Site, rendered: Path) -> None:
     """x and y exchanged: adjusted, exported and labelled without them, and the same command again does nothing."""
 
