@@ -233,6 +233,22 @@ def test_an_orbit_looks_at_the_middle_from_every_heading() -> None:
     assert gsd_m(flight) == pytest.approx(GSD_M, rel=0.03)
 
 
+def test_an_arc_looks_at_the_middle_from_one_side_and_far_beyond_it() -> None:
+    flight = plan("arc", 9)
+    for k, station in enumerate(flight.stations):
+        place, look = center(station), axis(station)
+        assert np.hypot(*(place + look * (place[2] / -look[2]))[:2]) < 0.1 * HEIGHT_M
+        assert turn(azimuth(look), 8.0 * (k - 4)) < 4.0
+        assert tilt(station) == pytest.approx((64.0, 60.0, 68.0)[k % 3], abs=2.5)
+    assert gsd_m(flight) == pytest.approx(GSD_M, rel=0.03)
+    # Half the opening angle of the picture's shorter side below the horizon: no picture shows the sky.
+    upper_deg = np.rad2deg(np.arctan2(0.5 * HEIGHT, focal_px(flight.cameras["2"])))
+    assert 76.0 < 60.0 + upper_deg < 68.0 + upper_deg < 85.0
+    # A long arc is a circle: no two pictures of many have one place.
+    headings = sorted(azimuth(axis(s)) % 360.0 for s in plan("arc", 90).stations)
+    assert np.median(np.diff(headings)) == pytest.approx(4.0, abs=1.0)
+
+
 def test_the_second_flight_crosses_the_first_at_1_35_times_its_height() -> None:
     flight = plan("two-flights", 25)
     parts = [[s for s in flight.stations if s.sortie == sortie] for sortie in (0, 1)]
@@ -308,7 +324,8 @@ def test_every_flight_takes_the_pictures_asked_for_and_sees_ground(name: str, im
     assert len(flight.stations) == images
     assert {s.camera_id for s in flight.stations} == set(flight.cameras)
     assert all(p.is_valid and p.area > 1000.0 for p in footprints(flight))
-    assert all(tilt(s) < 60.0 and s.exterior.z_m > 0.0 for s in flight.stations)
+    steepest_deg = 72.0 if name == "arc" else 60.0
+    assert all(tilt(s) < steepest_deg and s.exterior.z_m > 0.0 for s in flight.stations)
     assert gsd_m(flight) > 0.0
 
 
@@ -368,7 +385,7 @@ def test_the_corners_have_rays_whatever_the_format(width: int, height: int, shar
 
 
 def test_wrong_orders_are_refused_by_name() -> None:
-    with pytest.raises(ConfigError, match=r"'zigzag'.*nadir, oblique, sweep, orbit, two-flights, mixed"):
+    with pytest.raises(ConfigError, match=r"'zigzag'.*nadir, oblique, sweep, orbit, arc, two-flights, mixed"):
         plan("zigzag", 3)
     with pytest.raises(ConfigError, match=r"'FISHEYE'.*SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV"):
         plan("nadir", 3, lens="FISHEYE")

@@ -53,6 +53,18 @@ def test_scan_finds_images_at_any_depth_and_says_what_it_passed_over(tmp_path: P
     assert lost == {"._b.JPG": False, "broken.jpg": True, "empty.jpg": True, "x.jpg": False}
 
 
+def test_results_of_an_earlier_project_among_the_images_are_named(tmp_path: Path) -> None:
+    import rasterio
+
+    write_image(tmp_path / "images" / "a.jpg")
+    profile = {"driver": "GTiff", "width": 64, "height": 48, "count": 1, "dtype": "float32"}
+    with rasterio.open(tmp_path / "dem.tif", "w", transform=rasterio.Affine(0.5, 0, 9, 0, -0.5, 8), **profile) as out:
+        out.write(np.ones((48, 64), np.float32), 1)
+    said = "1 of 2 images (dem.tif) are georeferenced (GeoTIFF)"
+    assert any(warning.startswith(said) for warning in read_inputs(tmp_path).warnings)
+    assert not any("georeferenced" in warning for warning in read_inputs(tmp_path / "images").warnings)
+
+
 def test_scan_of_no_folder_or_an_unreadable_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         scan_images(tmp_path / "none")

@@ -37,6 +37,7 @@ _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
+_GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
@@ -51,8 +52,9 @@ class ExifFacts:
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
     relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: standard
-    deviation of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles. notes:
-    what was found and could not be used.
+    deviation of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles.
+    georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
+    be used.
     """
 
     width_px: int
@@ -73,6 +75,7 @@ class ExifFacts:
     calibrated: Camera | None = None
     sigma_position_m: float | None = None
     sigma_angle_deg: float | None = None
+    georeferenced: bool = False
     notes: tuple[str, ...] = ()
 
 
@@ -120,6 +123,7 @@ def read_exif(path: Path) -> ExifFacts:
         calibrated=calibrated_camera(xmp, width_px, height_px),
         sigma_position_m=position_sigma_m(xmp) or _positive(header.gps.get(_POSITIONING_ERROR)),
         sigma_angle_deg=angle_sigma_deg(xmp),
+        georeferenced=bool(_GEOTIFF & tags.keys()),
         notes=tuple(notes),
     )
 

@@ -147,6 +147,7 @@ def block_inputs(
     if not facts:
         raise InputError(_nothing_left(images_dir, failures))
 
+    warnings += _rasters(facts)
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
@@ -257,6 +258,13 @@ def _cameras_of_poses(
         others.warnings,
         {**others.focal_sigmas, **found.focal_sigmas},
     )
+
+
+def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:
+    """A warning of files that are probably results of an earlier project: a folder above the images was given."""
+    names = [name for name, fact in facts.items() if fact.georeferenced]
+    words = "georeferenced (GeoTIFF), as orthophotos and height models are: move out of the folder what is no aerial image"
+    return [f"{_count(names, facts)} are {words}"] if names else []
 
 
 def _observations(

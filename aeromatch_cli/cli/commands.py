@@ -32,7 +32,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
 }
 # Written out: the modules that know them are too heavy for --help. A test compares.
 _SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"
-_FLIGHTS = "nadir, oblique, sweep, orbit, two-flights, mixed"
+_FLIGHTS = "nadir, oblique, sweep, orbit, arc, two-flights, mixed"
 
 
 def evaluate(

@@ -1,4 +1,4 @@
-"""Flight plans: strips, five-camera rigs, sweeps, orbits and mixtures of them, a planner for each in FLIGHTS.
+"""Flight plans: strips, five-camera rigs, sweeps, orbits, arcs and mixtures of them, a planner for each in FLIGHTS.
 
 Headings are clockwise from grid north (world y). A flight's own plan is (right, forward) of its heading; every flight
 is centred on the world's origin. All cameras of a sortie sample the ground about equally finely.
@@ -6,7 +6,7 @@ is centred on the world's origin. All cameras of a sortie sample the ground abou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -34,6 +34,10 @@ _SWEEP_FORWARD_OVERLAP = 0.50
 # the same ground, 35 to 50 degrees apart: tan 37.5 + tan 12.5 = 0.99, 2 tan 25 = 0.93, tan 50 - tan 12.5 = 0.97.
 _SWEEP_STRIP_DISTANCE = 0.97
 _ORBIT_TILTS_DEG = (45.0, 35.0, 55.0)
+# Of an arc: the upper edge of a picture of 4:3 looks 76 to 84 degrees off straight down, at ground 2.4 to 4.1 times as
+# far from the foot point as its middle.
+_ARC_TILTS_DEG = (64.0, 60.0, 68.0)
+_ARC_STEP_DEG = 8.0
 _SECOND_HEADING_DEG = 75.0
 _MIXED_SWEEP_DEG = 25.0
 # Sigmas of the wobble: height and plan position in flying heights, then tilt, heading in degrees. The long focal length
@@ -179,12 +183,23 @@ def _sweep_station(order: Order, spot: _Spot, height_m: float, angle_deg: float,
 
 def _plan_orbit(order: Order) -> _Planned:
     """Three circles at one distance from the middle, taken in turn, so that neighbours differ in tilt as well."""
+    return _around_the_middle(order, [360.0 * k / order.images for k in range(order.images)], _ORBIT_TILTS_DEG)
+
+
+def _plan_arc(order: Order) -> _Planned:
+    """Strongly oblique pictures from one side, as of a drone that passes a site: their upper half looks far beyond."""
+    step_deg, middle = min(_ARC_STEP_DEG, 360.0 / order.images), 0.5 * (order.images - 1)
+    return _around_the_middle(order, [step_deg * (k - middle) for k in range(order.images)], _ARC_TILTS_DEG)
+
+
+def _around_the_middle(order: Order, headings_deg: Sequence[float], tilts_deg: Sequence[float]) -> _Planned:
+    """Pictures of the middle of the block, from one distance, a heading each, the tilts in turn."""
     distance_m = order.height_m / float(np.cos(np.deg2rad(_OBLIQUE_TILT_DEG)))
     stations = []
-    for k in range(order.images):
-        heading, tilt = 360.0 * k / order.images, np.deg2rad(_ORBIT_TILTS_DEG[k % len(_ORBIT_TILTS_DEG)])
+    for k, heading_deg in enumerate(headings_deg):
+        tilt = np.deg2rad(tilts_deg[k % len(tilts_deg)])
         wobble = order.rng.standard_normal(6)
-        foot = _spot(0.0, -distance_m * float(np.sin(tilt)), heading)
+        foot = _spot(0.0, -distance_m * float(np.sin(tilt)), heading_deg)
         height_m = distance_m * float(np.cos(tilt))
         position = np.array([foot.x_m, foot.y_m, height_m])
         position += order.height_m * _POSITION_SIGMA * wobble[:3]
@@ -258,6 +273,7 @@ FLIGHTS: Mapping[str, Callable[[Order], _Planned]] = MappingProxyType(
         "oblique": _plan_oblique,
         "sweep": _plan_sweep,
         "orbit": _plan_orbit,
+        "arc": _plan_arc,
         "two-flights": _plan_two_flights,
         "mixed": _plan_mixed,
     }
