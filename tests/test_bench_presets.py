@@ -6,7 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import pytest
-from benchmarks.presets import main, table_of
+from benchmarks.presets import given_poses, main, table_of
 from benchmarks.quality import draw_quality, quality
 
 ARGS = Namespace(presets=["auto", "baseline"], peers=["aliked"])
@@ -47,6 +47,15 @@ def test_a_step_of_auto_is_no_other_preset() -> None:
     text = table_of(Namespace(presets=["auto", "auto[cascade=none]", "baseline"], peers=[]), found)
     assert "| 150 | 93.8 % | 0.50 | `baseline` 75 | 93.8 % | 2.00 | - | - | - |" in text
     assert "| city | 10.0 | `baseline` 4.0 | 2.50 | `baseline` 4.0 | 2.50 |" in text
+
+
+def test_presets_know_as_much_of_the_poses_as_asked_for(tmp_path: Path) -> None:
+    noisy = tmp_path / "poses_noisy.csv"
+    noisy.write_text("image,x,y,z,omega_deg,phi_deg,kappa_deg,camera\na.jpg,1.5,-2,90,1,2,3,1\n")
+    assert given_poses(noisy, "noisy") == ["--poses", str(noisy)]
+    assert given_poses(noisy, "nothing") == []
+    option, path = given_poses(noisy, "positions")
+    assert (option, Path(path).read_text()) == ("--poses", "image,x,y,z\na.jpg,1.5,-2,90\n")
 
 
 def test_quality_and_seconds_are_per_pair(tmp_path: Path) -> None:

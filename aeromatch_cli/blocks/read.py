@@ -263,8 +263,8 @@ def _cameras_of_poses(
 def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:
     """A warning of files that are probably results of an earlier project: a folder above the images was given."""
     names = [name for name, fact in facts.items() if fact.georeferenced]
-    words = "georeferenced (GeoTIFF), as orthophotos and height models are: move out of the folder what is no aerial image"
-    return [f"{_count(names, facts)} are {words}"] if names else []
+    what = "georeferenced (GeoTIFF), as orthophotos and height models are"
+    return [f"{_count(names, facts)} are {what}: move out of the folder what is no aerial image"] if names else []
 
 
 def _observations(

@@ -1,14 +1,15 @@
 """Presets on whole rendered blocks with inexact poses, beside peers on the same pairs, all judged by exact truth.
 
-A preset is one `aeromatch run PRESET` with the block's noisy poses (5 % of the flying height, 3 degrees) and cameras:
-orientation, pairs, features, matches, verification and consistency. Peers get every pair of the block that overlaps by
-20 % or more, those that read poses the noisy ones. All pairs with so much overlap count, whether a preset tries them or
-not. As by default (8,000 and 4,000), methods with SIFT may have twice the descriptors of those with networks, which
-take longer for each; a cascade has both. `auto[cascade=none]` is `auto` without its further steps, and so on: the
-picture shows what each step brings and takes; none of them counts as another preset. Correct: within 3 px of the exact
-place. Best: the preset, or peer, with most correct matches in that line. Median error: of the medians of pairs.
-Seconds: of features, each image's once, matching and verification, on --jobs cores; orientation, start-up and export,
-which peers do without, are in the seconds of the whole command alone.
+A preset is one `aeromatch run PRESET` with the block's cameras and its noisy poses (5 % of the flying height, 3
+degrees), with --poses their positions alone or nothing: orientation, pairs, features, matches, verification and
+consistency. Peers get every pair of the block that overlaps by 20 % or more, those that read poses the noisy ones. All
+pairs with so much overlap count, whether a preset tries them or not. As by default (8,000 and 4,000), methods with SIFT
+may have twice the descriptors of those with networks, which take longer for each; a cascade has both.
+`auto[cascade=none]` is `auto` without its further steps, and so on: the picture shows what each step brings and takes;
+none of them counts as another preset. Correct: within 3 px of the exact place. Best: the preset, or peer, with most
+correct matches in that line. Median error: of the medians of pairs. Seconds: of features, each image's once, matching
+and verification, on --jobs cores; orientation, start-up and export, which peers do without, are in the seconds of the
+whole command alone.
 
 Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has is
 not made again: a killed run goes on there. A preset may be PRESET[key=value,key=value].
@@ -41,6 +42,7 @@ from benchmarks.whole import budget_settings, evaluated, whole_run
 
 _JUDGED = "auto"
 _ALL_PAIRS = 1_000_000
+_NOISY, _POSITIONS, _NOTHING = "noisy", "positions", "nothing"
 # Whose seconds are those of features, matching and verification.
 _STAGES = ("extract", "match", "filter")
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
@@ -49,7 +51,8 @@ _FIGURES = ("possible", "kept", "correct", "median_error_px")
 def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
     """One row for each pair of a preset's run."""
     scene = judged.scene
-    given = ["--poses", str(scene.poses.with_name(NOISY_POSES)), "--cameras", str(scene.block), "--crs", "local"]
+    poses = given_poses(scene.poses.with_name(NOISY_POSES), args.poses)
+    given = [*poses, "--cameras", str(scene.block), "--crs", "local"]
     work = folder / "work"
     name, own_settings = parse_method(preset)
     settings = [*budget_settings(load(name, own_settings), args.keypoints), *own_settings, *args.set]
@@ -66,6 +69,18 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
         {"angle": row["view_angle_class"], **{key: plain(float(row[key] or "nan")) for key in _FIGURES}, **own}
         for row in found
     ]
+
+
+def given_poses(noisy: Path, known: str) -> list[str]:
+    """Options that give a preset so much of the noisy poses: a value of --poses."""
+    if known == _NOTHING:
+        return []
+    if known == _POSITIONS:
+        with noisy.open(encoding="utf-8", newline="") as stream:
+            rows = [[row[key] for key in ("image", "x", "y", "z")] for row in csv.DictReader(stream)]
+        noisy = noisy.with_name("positions_noisy.csv")
+        noisy.write_text("\n".join(",".join(row) for row in [["image", "x", "y", "z"], *rows]) + "\n", encoding="utf-8")
+    return ["--poses", str(noisy)]
 
 
 def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
@@ -95,10 +110,11 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
         args.seed = seed
         for flight, judged in rendered_scenes(args, "all"):
             for method in (*args.presets, *args.peers):
-                folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}"
+                ours = method in args.presets
+                given = f"-{args.poses}" if ours and args.poses != _NOISY else ""
+                folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}{given}"
                 path = folder / "rows.json"
                 if not path.is_file():
-                    ours = method in args.presets
                     found = preset_rows(args, judged, method, folder) if ours else peer_rows(args, judged, method)
                     folder.mkdir(parents=True, exist_ok=True)
                     write_json(path, {"rows": found})
@@ -206,6 +222,8 @@ def main(arguments: Sequence[str]) -> None:
         default=4096,
         help="SIFT descriptors per image; networks have half as many",
     )
+    given = (_NOISY, _POSITIONS, _NOTHING)
+    add("--poses", choices=given, default=_NOISY, help="what presets know of them")
     add("--set", type=options.names, default="", metavar="KEY=VALUE", help="settings of every preset, comma-separated")
     add("--jobs", type=options.positive, default=2)
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks")
