@@ -1,4 +1,4 @@
-"""docs/results: every table has a stamp, and a page says in its first line which tables are older than the code."""
+"""docs/results: every table has a stamp, and says in its first line what has changed in the code since."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ KEYS = ["command", "commit", "date", "machine", "trained_on", "versions"]
 
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.name)
-def test_a_page_names_the_tables_that_are_older_than_the_code(path: Path) -> None:
+def test_every_table_has_a_stamp_and_says_whether_it_is_older_than_the_code(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# ")
-    assert text.partition("\n")[0] == pages.first_line(text, PRESENT), "scripts/bench pages mends it"
     assert text == pages.refreshed(text, PRESENT), "scripts/bench pages mends it"
     made = [name for name, _ in pages.stamps(text)]
     assert made == pages.table_names(text), "a table is empty: its benchmark fills it with --docs"
@@ -44,7 +43,7 @@ def stamp(**versions: Any) -> stamps.Stamp:
 
 
 def page(**tables: stamps.Stamp) -> str:
-    parts = [f"<!-- table {name}: start -->\n{pages.head(one)}\nold\n<!-- table {name}: end -->\n"
+    parts = [f"<!-- table {name}: start -->\n{pages.head(one, PRESENT)}\nold\n<!-- table {name}: end -->\n"
              for name, one in tables.items()]  # fmt: skip
     return "# Title\n\nText.\n\n" + "\nBetween.\n\n".join(parts)
 
@@ -60,24 +59,31 @@ def test_a_table_is_outdated_where_any_of_its_versions_is_another_one() -> None:
         none=stamp() | {"versions": None},
     )
     assert pages.outdated_tables(text) == ["doctored", "gone", "unknown", "none"]
-    assert pages.first_line(text) == "# Title (older than the code: doctored, gone, unknown, none)"
-    assert pages.first_line(page(good=stamp(extract_sift=sift))) == "# Title"
+    assert [line for line in text.splitlines() if line.startswith("Older")] == [
+        "Older than the code; changed since: extract.sift.",
+        "Older than the code; changed since: extract.nowhere.",
+        "Older than the code; changed since: extract.sift.",
+        "Older than the code; what it rests on is not known.",
+    ]
+    two = page(two=stamp(extract_sift=0, extract_nowhere=1))
+    assert "\n\nOlder than the code; changed since: extract.sift, extract.nowhere.\n\n    scripts/bench" in two
     assert pages.outdated_tables(text.replace("95a1b2c", "other")) == pages.outdated_tables(text)
 
 
-def test_a_table_is_replaced_with_its_stamp_and_the_first_line_follows(tmp_path: Path) -> None:
+def test_a_table_is_replaced_with_its_stamp_and_the_others_first_lines_follow(tmp_path: Path) -> None:
     path = tmp_path / "page.md"
     old, new = stamp(pipeline=0), stamp(pipeline=PRESENT["pipeline"])
     path.write_text(page(one=old, two=old), encoding="utf-8")
     pages.write_table(path, "two", "| new |\n", new)
     text = path.read_text(encoding="utf-8")
-    assert text.startswith("# Title (older than the code: one)\n\nText.\n\n")
+    assert text.count("Older than the code; changed since: pipeline.") == 1
+    assert text.index("Older than") < text.index("table two")
     table = f"<!-- table two: start -->\n<!-- stamp {json.dumps(new)} -->\n\n    scripts/bench methods --out DIR\n\n"
     table += "Commit 95a1b2c, 2026-11-22; 2 cores, AVX2, no bfloat16; networks trained on sheffield.\n\n| new |\n"
     assert text.endswith(f"Between.\n\n{table}<!-- table two: end -->\n")
-    assert text.count("old") == 2  # of the other table and of the first line
+    assert text.count("\nold\n") == 1
     pages.write_table(path, "one", "| new |\n", new)
-    assert path.read_text(encoding="utf-8").startswith("# Title\n\nText.")
+    assert "Older" not in path.read_text(encoding="utf-8")
     with pytest.raises(SystemExit, match="table three: start"):
         pages.write_table(path, "three", "", new)
     with pytest.raises(ValueError, match="four has no stamp"):

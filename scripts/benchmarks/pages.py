@@ -3,6 +3,8 @@
     <!-- table NAME: start -->
     <!-- stamp {"command": ..., "commit": ..., "date": ..., "machine": ..., "trained_on": [...], "versions": {...}} -->
 
+    Older than the code; changed since: FAMILY.STRATEGY, ....
+
         scripts/bench ...
 
     Commit ..., DATE; MACHINE; networks trained on ....
@@ -11,8 +13,8 @@
     <!-- table NAME: end -->
 
 `versions` holds every number that the table depends on: FAMILY.STRATEGY, "pipeline", "filter.chain" and
-"weights.NETWORK" (SHA-256, 12 digits); null is unknown. The first line of a page names the tables that are older than
-the code: `# Title (older than the code: NAME, NAME)`. `scripts/bench pages` brings these lines up to date.
+"weights.NETWORK" (SHA-256, 12 digits); null is unknown. The first line of a table says which of them have changed, and
+is left out where none has. `scripts/bench pages` brings these lines up to date.
 """
 
 from __future__ import annotations
@@ -78,12 +80,11 @@ PAGES: Mapping[str, str] = {
 }
 _TABLE = re.compile(r"<!-- table (\S+): start -->\n(.*?)<!-- table \1: end -->", re.DOTALL)
 _STAMP = re.compile(r"<!-- stamp (\{.*\}) -->\n")
-_HEAD = re.compile(_STAMP.pattern + r"\n    \S.*\n\nCommit .*\n")
-_OLDER = re.compile(r" \(older than the code: [^)]*\)$")
+_HEAD = re.compile(_STAMP.pattern + r"\n(?:Older than the code.*\n\n)?    \S.*\n\nCommit .*\n")
 
 
 def write_table(page: Path, name: str, text: str, stamp: Stamp) -> None:
-    """Replace what stands between the page's markers of this name, and bring its first line up to date.
+    """Replace what stands between the page's markers of this name, and bring the page up to date.
 
     Raises SystemExit where the markers are missing.
     """
@@ -91,14 +92,18 @@ def write_table(page: Path, name: str, text: str, stamp: Stamp) -> None:
     if not any(match[1] == name for match in _TABLE.finditer(old)):
         start, end = f"<!-- table {name}: start -->", f"<!-- table {name}: end -->"
         raise SystemExit(f"{page} lacks the lines {start} and {end}: add them where the table belongs")
-    body = f"<!-- table {name}: start -->\n{head(stamp)}\n{text.strip()}\n<!-- table {name}: end -->"
+    body = f"<!-- table {name}: start -->\n{head(stamp, {})}\n{text.strip()}\n<!-- table {name}: end -->"
     new = _TABLE.sub(lambda match: body if match[1] == name else match[0], old)
     write_text(page, refreshed(new))
 
 
-def head(stamp: Stamp) -> str:
+def head(stamp: Stamp, present: Versions) -> str:
     """The lines of a table above its text."""
-    return f"<!-- stamp {json.dumps(stamp, ensure_ascii=False)} -->\n\n    {stamp['command']}\n\n{said(stamp)}\n"
+    lines = [f"<!-- stamp {json.dumps(stamp, ensure_ascii=False)} -->", f"    {stamp['command']}", said(stamp)]
+    if older := list(changed(stamp, present)):
+        what = "what it rests on is not known" if stamp["versions"] is None else f"changed since: {', '.join(older)}"
+        lines.insert(1, f"Older than the code; {what}.")
+    return "\n\n".join(lines) + "\n"
 
 
 def stamps(page_text: str) -> Iterator[tuple[str, Stamp]]:
@@ -123,17 +128,10 @@ def outdated_tables(page_text: str, present: Versions | None = None) -> list[str
     return [name for name, stamp in stamps(page_text) if any(changed(stamp, now))]
 
 
-def first_line(page_text: str, present: Versions | None = None) -> str:
-    """As it has to be: the title, and which tables are older than the code."""
-    title = _OLDER.sub("", page_text.partition("\n")[0])
-    older = outdated_tables(page_text, present)
-    return f"{title} (older than the code: {', '.join(older)})" if older else title
-
-
 def refreshed(page_text: str, present: Versions | None = None) -> str:
-    """The page with its first line, and every table's command and line of facts, as its stamps say."""
-    text = _HEAD.sub(lambda match: head(json.loads(match[1])), page_text)
-    return first_line(text, present) + "\n" + text.partition("\n")[2]
+    """The page with the lines above every table's text as its stamps say."""
+    now = present_versions() if present is None else present
+    return _HEAD.sub(lambda match: head(json.loads(match[1]), now), page_text)
 
 
 def main(arguments: Sequence[str]) -> None:
