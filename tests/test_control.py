@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages.lines import _control_words
 from aeromatch_cli.synthetic import load_truth
 
 IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
@@ -99,6 +101,19 @@ def test_a_point_that_the_others_contradict_is_named(truth: Truth) -> None:
     offsets_m[5] = 0.0
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, rows, offsets_m, set()))
     assert figures["doubtful"] == []
+
+
+def test_a_point_whose_rays_meet_behind_the_cameras_is_named_and_left_out(truth: Truth) -> None:
+    points = surveyed(truth, list(range(0, 400, 100)), np.zeros((4, 3)), set())
+    (id0, pixel0), (id1, pixel1) = list(points[1].pixels.items())[:2]
+    swapped = replace(points[1], pixels={id0: pixel1, id1: pixel0})
+    left = control_figures(adjusted_truth(truth), cameras(truth), [points[0], swapped, *points[2:]])
+    assert left["rays_do_not_meet"] == ["p100"]
+    assert left["not_measured_in_two_images"] == []
+    assert max(left["control_rmse_m"]) < 1e-6
+    assert left["reprojection_error_px"] < 1e-3
+    assert json.dumps(left, allow_nan=False)
+    assert _control_words(left)[1].startswith("rays do not meet of p100: ")
 
 
 def test_two_points_determine_nothing(truth: Truth) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from test_orientation import CAMERA, flight, limits, matches
 
 from aeromatch_cli.data import Pose
-from aeromatch_cli.orientation.arrangement import arranged
+from aeromatch_cli.orientation.arrangement import Before, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.judgement import PairPoints
 from aeromatch_cli.orientation.mapping import Model
@@ -110,11 +110,26 @@ def test_models_without_positions_lie_beside_those_with() -> None:
     placed = model_of(truth, "positions")
     beside = model_of({f"x{i}": pose for i, pose in truth.items()})
     more = model_of({f"y{i}": pose for i, pose in truth.items()})
-    found = arranged([beside, placed, more], {})
+    found = arranged([beside, placed, more], Before())
     east = [np.array([center[0] for center in model.centers_m.values()]) for model, _ in found]
     np.testing.assert_array_equal(east[1], [pose.center_m[0] for pose in truth.values()])
     assert east[0].min() > east[1].max() + 1000.0
     assert east[2].min() > east[0].max() + 1000.0
+
+
+@pytest.mark.parametrize(("kind", "placed", "stays"), [("positions", False, False), ("positions", True, True),
+                                                       ("level", False, True)])  # fmt: skip
+def test_a_model_that_positions_place_now_leaves_the_frame_that_it_had_to_itself(
+    kind: str, placed: bool, stays: bool
+) -> None:
+    truth = flight()
+    aside = {i: replace(pose, center_m=0.01 * pose.center_m + [5000.0, 0.0, 0.0]) for i, pose in truth.items()}
+    before = Before(aside, {}, truth.keys() if placed else ())
+    ((model, kept),) = arranged([model_of(truth, kind)], before)
+    assert (kept == aside) is stays
+    expected = aside if stays else truth
+    moved = [np.linalg.norm(model.centers_m[i] - pose.center_m) for i, pose in expected.items()]
+    assert max(moved) < 1e-6
 
 
 def test_inexact_poses_are_consistent_and_wrong_ones_are_not() -> None:

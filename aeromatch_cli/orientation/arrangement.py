@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray, Pose
+from aeromatch_cli.data import Camera, FloatArray, Pose
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.placing import similarity
 
@@ -17,12 +17,28 @@ SAME_SHARE = 0.01
 _GAP_EXTENTS, _GAP_M = 2.0, 1000.0
 
 
-def arranged(models: Sequence[Model], before: Mapping[str, Pose]) -> list[tuple[Model, dict[str, Pose]]]:
+@dataclass(frozen=True, eq=False)
+class Before:
+    """What an earlier run found for images that have not changed: poses, and cameras by camera_id.
+
+    placed: images that positions had placed; the others lay in a frame of their own, or beside these.
+    """
+
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    placed: Collection[str] = frozenset()
+
+    def of(self, kind: str) -> dict[str, Pose]:
+        """Poses that a model of this kind may be moved onto: what positions place now stays where they say."""
+        return {i: pose for i, pose in self.poses.items() if kind == "level" or i in self.placed}
+
+
+def arranged(models: Sequence[Model], before: Before) -> list[tuple[Model, dict[str, Pose]]]:
     """Every model where it is to lie, and those of its images that keep the poses of `before`; in the same order.
 
     Models that no position places ("level") lie east of the placed ones, side by side.
     """
-    anchored = [_anchored(model, before) for model in models]
+    anchored = [_anchored(model, before.of(model.kind)) for model in models]
     placed = [model for model, kept in anchored if kept or model.kind != "level"]
     ends = [_east(model).max() + _gap_m(model) for model in placed]
     next_m = max(ends, default=0.0)

@@ -24,10 +24,12 @@ def control_figures(
 
     cameras: image_id -> adjusted camera. `check_rmse_m` (x, y, z) is of the check points; without any, of every control
     point under the transformation of the others (leave-one-out). `offset_m`: from the block as it is to the surveyed
-    positions, median over the control points. `doubtful`: control points that the others contradict. None where points
-    are too few.
+    positions, median over the control points. `doubtful`: control points that the others contradict.
+    `rays_do_not_meet`: points whose rays are parallel or meet behind a camera, which are left out. None where too few
+    are left.
     """
-    found = {point.name: _intersected(adjusted, cameras, point) for point in points}
+    rays = {point.name: _rays(adjusted, cameras, point) for point in points}
+    found = {point.name: _intersected(*rays[point.name]) for point in points}
     seen = [point for point in points if found[point.name] is not None]
     control = [point for point in seen if not point.check]
     checks = [point for point in seen if point.check]
@@ -35,7 +37,10 @@ def control_figures(
         "points": len(points),
         "control": len(control),
         "check": len(checks),
-        "not_measured_in_two_images": sorted(point.name for point in points if found[point.name] is None),
+        "not_measured_in_two_images": sorted(name for name, (_, directions) in rays.items() if len(directions) < 2),
+        "rays_do_not_meet": sorted(
+            name for name, (_, directions) in rays.items() if len(directions) > 1 and found[name] is None
+        ),
     }
     if len(control) < _LEAST_POINTS:
         unknown = ("offset_m", "transformation", "control_rmse_m", "check_rmse_m", "check_kind")
@@ -77,21 +82,27 @@ def offset_words(figures: Mapping[str, Any]) -> str:
     return f"to fit them the exported block is to be moved by {offset} m and made {size}"
 
 
-def _intersected(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: ControlPoint) -> FloatArray | None:
-    """World point (3,) nearest to the rays of all oriented images that measure it; None below two."""
+def _rays(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: ControlPoint) -> tuple[FloatArray, FloatArray]:
+    """Projection centres and unit directions (N, 3) in the world of all oriented images that measure a point."""
     rays, centers = [], []
     for image_id, pixel in point.pixels.items():
         pose = adjusted.poses.get(image_id)
         if pose is not None:
             rays.append(world_rays(cameras[image_id], pose.rotation, pixel[None])[0])
             centers.append(pose.center_m)
-    if len(rays) < 2:
+    return np.array(centers).reshape(-1, 3), np.array(rays).reshape(-1, 3)
+
+
+def _intersected(centers_m: FloatArray, rays: FloatArray) -> FloatArray | None:
+    """World point (3,) nearest to the rays; None below two, where they are parallel or meet behind a camera."""
+    if len(rays) < 2 or not np.isfinite(rays).all():
         return None
-    across = np.eye(3) - np.einsum("ni,nj->nij", np.array(rays), np.array(rays))
+    across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
     normal = across.sum(axis=0)
     if np.linalg.cond(normal) > 1e10:
         return None
-    return np.asarray(np.linalg.solve(normal, np.einsum("nij,nj->i", across, np.array(centers))))
+    place = np.asarray(np.linalg.solve(normal, np.einsum("nij,nj->i", across, centers_m)))
+    return place if (((place - centers_m) * rays).sum(axis=1) > 0.0).all() else None
 
 
 def _fit(points: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> tuple[float, FloatArray, FloatArray]:
@@ -148,4 +159,7 @@ def _pixel_error(
             pose = adjusted.poses.get(image_id)
             if pose is not None:
                 off.append(project(cameras[image_id], pose.rotation, pose.center_m, found[point.name][None])[0] - pixel)
-    return round(float(np.sqrt((np.array(off) ** 2).sum(axis=1).mean())), 3) if off else None
+    # Where a point is far off, it may lie outside what the lens model holds for.
+    squares = (np.array(off).reshape(-1, 2) ** 2).sum(axis=1)
+    squares = squares[np.isfinite(squares)]
+    return round(float(np.sqrt(squares.mean())), 3) if len(squares) else None

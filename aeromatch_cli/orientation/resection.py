@@ -5,11 +5,11 @@ Source: PoseLib (Larsson, https://github.com/PoseLib/PoseLib), P3P in LO-RANSAC 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Pose
+from aeromatch_cli.data import Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.cameras import parameters, undistort
 from aeromatch_cli.orientation.judgement import PairPoints, triangulated
 
@@ -35,8 +35,8 @@ def resected(
         return found
     seen = _PointsSeen(pairs, poses, cameras)
     failed: dict[str, int] = {}
+    ties = {i: seen.ties(i, poses) for i in waiting}
     while waiting:
-        ties = {i: seen.ties(i, poses) for i in waiting}
         order = sorted(waiting, key=lambda i: (-len(ties[i][0]), i))
         best = next((i for i in order if len(ties[i][0]) > max(failed.get(i, 0), _MIN_POINTS - 1)), None)
         if best is None:
@@ -47,12 +47,15 @@ def resected(
             continue
         poses[best] = found[best] = pose
         waiting.remove(best)
-        seen.add(best, poses)
+        ties |= {i: seen.ties(i, poses) for i in seen.add(best, poses).intersection(waiting)}
     return found
 
 
 class _PointsSeen:
-    """World points by image and keypoint, from the pair whose points are most: each keypoint of a known image."""
+    """World points by image and keypoint: the median over the pairs of known images that see it.
+
+    Of images alone that share a pair with one that is not known at first: in a large block these are few.
+    """
 
     def __init__(self, pairs: Sequence[PairPoints], poses: Mapping[str, Pose], cameras: Mapping[str, Camera]) -> None:
         self._cameras = cameras
@@ -60,35 +63,60 @@ class _PointsSeen:
         for pair in pairs:
             for image_id in (pair.image_id0, pair.image_id1):
                 self._of.setdefault(image_id, []).append(pair)
-        self._points: dict[str, dict[int, list[FloatArray]]] = {}
-        self._add([p for p in pairs if p.image_id0 in poses and p.image_id1 in poses], poses)
+        waiting = [pair for pair in pairs if not {pair.image_id0, pair.image_id1} <= poses.keys()]
+        self._asked = {i for pair in waiting for i in (pair.image_id0, pair.image_id1)}
+        self._points: dict[str, list[tuple[IntArray, FloatArray]]] = {}
+        self._medians: dict[str, tuple[IntArray, FloatArray]] = {}
+        self._add([pair for pair in pairs if {pair.image_id0, pair.image_id1} & self._asked], poses)
 
-    def add(self, image_id: str, poses: Mapping[str, Pose]) -> None:
-        """Points of the pairs of an image that has become known."""
-        self._add([p for p in self._of[image_id] if p.image_id0 in poses and p.image_id1 in poses], poses)
+    def add(self, image_id: str, poses: Mapping[str, Pose]) -> set[str]:
+        """Points of the pairs of an image that has become known. The images whose ties this changes."""
+        changed = {image_id} | self._add(self._of[image_id], poses)
+        return {i for one in changed for pair in self._of[one] for i in (pair.image_id0, pair.image_id1)}
 
-    def _add(self, pairs: Sequence[PairPoints], poses: Mapping[str, Pose]) -> None:
-        for pair, points in zip(pairs, triangulated(pairs, poses, self._cameras), strict=True):
-            for row in np.flatnonzero(np.isfinite(points).all(axis=1)):
-                for side, image_id in enumerate((pair.image_id0, pair.image_id1)):
-                    place = self._points.setdefault(image_id, {})
-                    place.setdefault(int(pair.indices[row, side]), []).append(points[row])
+    def _add(self, pairs: Iterable[PairPoints], poses: Mapping[str, Pose]) -> set[str]:
+        """Points of those pairs of which both images are known; the images that have more of them now."""
+        known = [pair for pair in pairs if pair.image_id0 in poses and pair.image_id1 in poses]
+        changed = set()
+        for pair, points in zip(known, triangulated(known, poses, self._cameras), strict=True):
+            rows = np.flatnonzero(np.isfinite(points).all(axis=1))
+            for side, image_id in enumerate((pair.image_id0, pair.image_id1)):
+                if image_id in self._asked and len(rows):
+                    self._points.setdefault(image_id, []).append((pair.indices[rows, side], points[rows]))
+                    self._medians.pop(image_id, None)
+                    changed.add(image_id)
+        return changed
 
     def ties(self, image_id: str, poses: Mapping[str, Pose]) -> tuple[FloatArray, FloatArray]:
         """Stored pixels (N, 2) of an image and the world points (N, 3) that known images see there."""
-        pixels, points = [], []
+        pixels, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
         for pair in self._of.get(image_id, ()):
             side = 0 if pair.image_id0 == image_id else 1
             other = pair.image_id1 if side == 0 else pair.image_id0
-            if other not in poses:
+            if other not in poses or other not in self._points:
                 continue
-            known = self._points.get(other, {})
-            own_px = (pair.points0_px, pair.points1_px)[side]
-            for row, keypoint in enumerate(pair.indices[:, 1 - side]):
-                if int(keypoint) in known:
-                    pixels.append(own_px[row])
-                    points.append(np.median(known[int(keypoint)], axis=0))
-        return np.array(pixels).reshape(-1, 2), np.array(points).reshape(-1, 3)
+            if other not in self._medians:
+                self._medians[other] = _medians(self._points[other])
+            keypoints, places = self._medians[other]
+            wanted = pair.indices[:, 1 - side]
+            at = np.minimum(np.searchsorted(keypoints, wanted), len(keypoints) - 1)
+            seen = keypoints[at] == wanted
+            pixels.append((pair.points0_px, pair.points1_px)[side][seen])
+            points.append(places[at[seen]])
+        return np.concatenate(pixels), np.concatenate(points)
+
+
+def _medians(parts: Sequence[tuple[IntArray, FloatArray]]) -> tuple[IntArray, FloatArray]:
+    """Keypoints (K,) in order, each once, and the median (K, 3) of its points."""
+    numbers = np.concatenate([keypoints for keypoints, _ in parts])
+    order = np.argsort(numbers, kind="stable")
+    points = np.concatenate([places for _, places in parts])[order]
+    keypoints, starts, counts = np.unique(numbers[order], return_index=True, return_counts=True)
+    medians = np.empty((len(keypoints), 3))
+    for count in np.unique(counts):
+        rows = starts[counts == count, None] + np.arange(count)
+        medians[counts == count] = np.median(points[rows], axis=1)
+    return keypoints, medians
 
 
 def _resection(

@@ -11,7 +11,7 @@ import numpy as np
 from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import focal_px
-from aeromatch_cli.orientation.arrangement import SAME_SHARE, arranged
+from aeromatch_cli.orientation.arrangement import SAME_SHARE, Before, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
 from aeromatch_cli.orientation.dem import Terrain, terrains_of
@@ -171,14 +171,6 @@ def _kept_remarks(given: Solution, pictures: Solution) -> list[str]:
     ]
 
 
-@dataclass(frozen=True, eq=False)
-class Before:
-    """What an earlier run found for images that have not changed: poses, and cameras by camera_id."""
-
-    poses: Mapping[str, Pose]
-    cameras: Mapping[str, Camera]
-
-
 def from_models(
     evidence: Evidence,
     models: Sequence[Model],
@@ -194,7 +186,7 @@ def from_models(
     block = evidence.block
     cameras = dict(block.cameras)
     found: dict[str, Pose] = {}
-    for model, kept in reversed(arranged(models, before.poses)):  # the largest model's cameras count
+    for model, kept in reversed(arranged(models, before)):  # the largest model's cameras count
         height_m = float(np.median([c[2] for c in model.centers_m.values()]) - np.median(model.points_m[:, 2]))
         sigma_m = _SIGMA_POSITION_SHARE * abs(height_m)
         for image_id, rotation in model.rotations.items():

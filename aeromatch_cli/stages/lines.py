@@ -189,13 +189,15 @@ def _control_words(control: Mapping[str, Any] | None) -> list[str]:
     counts = f"control: {control['control']} control points, {control['check']} check points"
     if control["points"] and len(control["not_measured_in_two_images"]) == control["points"]:
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
+    apart = control["rays_do_not_meet"]
+    wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
     if control["control_rmse_m"] is None:
-        return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare"]
+        return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare", *wrong]
 
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
 
-    words = [counts, offset_words(control)]
+    words = [counts, *wrong, offset_words(control)]
     words.append(f"after a similarity to the control points: RMSE of the fit {shown(control['control_rmse_m'])} m")
     if control["check_rmse_m"] is not None:
         words[-1] += f", at {_CHECKED[control['check_kind']]} {shown(control['check_rmse_m'])} m"

@@ -17,11 +17,11 @@ from aeromatch_cli.files import read_json, translated_os_errors, whole_record, w
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
+from aeromatch_cli.orientation.arrangement import Before
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.focal import better_cameras
 from aeromatch_cli.orientation.mapping import Group
 from aeromatch_cli.orientation.solution import (
-    Before,
     Evidence,
     Solution,
     from_given,
@@ -145,7 +145,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
         mapped, tried = best_mapped(context, recipe, first, evidence)
         models, first, evidence = mapped.models, mapped.first, mapped.evidence
         exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
-        solution = from_models(evidence, models, _before(context, kept), context.angles, exchanged)
+        solution = from_models(evidence, models, _before(context, kept, before), context.angles, exchanged)
         if not models:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
@@ -176,13 +176,14 @@ def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -
     )
 
 
-def _before(context: Context, kept: set[str]) -> Before:
+def _before(context: Context, kept: set[str], record: Mapping[str, Any]) -> Before:
     if not kept:
-        return Before({}, {})
+        return Before()
     folder = context.workspace.orientation
     poses = read_poses(folder / "poses.csv")
     held = {i: pose for i, pose in poses.items() if i in kept and pose.world_rotation is not None}
-    return Before(held, read_cameras(folder / "cameras.csv"))
+    placing = [one["images"] for one in record["groups"] if one["kind"] != "level"]
+    return Before(held, read_cameras(folder / "cameras.csv"), {i for images in placing for i in images})
 
 
 def _prints(context: Context) -> tuple[dict[str, str], str]:
@@ -191,7 +192,9 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
     images = {}
     for image in block.images:
         pose = block.poses.get(image.image_id)
-        place = None if pose is None else (pose.center_m, pose.world_rotation, pose.sigma_position_m)
+        place = None
+        if pose is not None:
+            place = pose.center_m, pose.world_rotation, pose.sigma_position_m, pose.sigma_angle_deg
         taken = context.image_fingerprints[image.image_id], image.time
         images[image.image_id] = fingerprint(
             taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
