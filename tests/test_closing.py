@@ -14,7 +14,7 @@ NAMES = {i: f"{i}.jpg" for i in "abcd"}
 
 def reports(**changes: Any) -> list[StageReport]:
     filtered = {"components": [4], "weakly_tied": [], **changes.get("filter", {})}
-    adjusted = {"outside": {}, "groups": [{}], "images": 4, **changes.get("adjust", {})}
+    adjusted = {"outside": {}, "groups": [{"kind": "positions"}], "images": 4, **changes.get("adjust", {})}
     spread = {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})
     return [
         StageReport("filter", facts=filtered),
@@ -38,7 +38,12 @@ def test_a_sound_block_is_called_so() -> None:
             {"adjust": {"outside": {"b": "few matches"}}},
             ["not sound: not oriented: b.jpg", "aeromatch show WORK b.jpg"],
         ),
-        ({"adjust": {"groups": [{}, {}]}}, ["2 parts whose scale and place nothing ties", "--poses"]),
+        (
+            {"adjust": {"groups": [{"kind": "positions"}, {"kind": "positions"}, {"kind": "level"}]}},
+            ["2 parts whose scale and place nothing ties", "--poses"],
+        ),
+        ({"adjust": {"groups": [{"kind": "level"}] * 3}}, ["3 parts whose scale and place nothing ties", "--poses"]),
+        ({"adjust": {"groups": [{"kind": "positions"}] * 2}}, ["sound: all 4 images are connected and oriented"]),
         ({"adjust": {"images": 0}}, ["sound: all 4 images are connected; they are not oriented"]),
         (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches

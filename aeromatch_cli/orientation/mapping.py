@@ -20,6 +20,7 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
+from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents
@@ -119,9 +120,10 @@ def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: 
         if kind == "level":
             frame = 1 + max(frames.values(), default=0)
             frames |= {image_ids[number - 1]: frame for number in arrays["images"]}
+        of_image = rows_by_number(arrays["track_images"])
         parts = (arrays[name] for name in ("images", "centers_m", "rotations", "sigmas_m", "sigmas_deg"))
         for number, *pose in zip(*parts, strict=True):
-            own = arrays["track_images"] == number
+            own = of_image.get(int(number), np.zeros(0, dtype=np.int64))
             keypoints, points = arrays["track_keypoints"][own], arrays["track_points"][own] + first
             poses[image_ids[number - 1]] = AdjustedPose(*pose)
             tracks[image_ids[number - 1]] = np.column_stack([keypoints, points]).astype(np.int32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 from aeromatch_cli.errors import InputError, tells_of_memory
+from aeromatch_cli.workers import ONE_THREAD
 
 
 def run_process(module: str, folder: Path, result: str, what: str) -> Path:
@@ -19,7 +21,8 @@ def run_process(module: str, folder: Path, result: str, what: str) -> Path:
     latter says something of the block.
     """
     command = [sys.executable, "-m", f"aeromatch_cli.orientation.{module}", str(folder)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    environment = {**os.environ, **ONE_THREAD}  # whatever ran before in this process
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     if done.returncode == -signal.SIGKILL or tells_of_memory(done.stderr):
         raise MemoryError(f"{what} ended for lack of memory")
     if done.returncode or not (folder / result).is_file():

@@ -207,7 +207,9 @@ def from_models(
     # Given positions are in another frame than one of the pictures' own.
     poses = found if own else {**block.poses, **_loose_poses(evidence, found, convention, angles), **found}
     terrains, points = _terrains(evidence, found, [set(model.rotations) for model in models], lenses)
-    north_deg = {i: _north_sigma_deg(model, block.poses) for model in models for i in model.rotations}
+    north_deg = {
+        i: sigma for model in models for sigma in [_north_sigma_deg(model, block.poses)] for i in model.rotations
+    }
     judged_poses = {i: pose for i, pose in found.items() if i not in beside}
     wrong = _judged(block.poses, judged_poses, convention, angles, north_deg)
     facts = {

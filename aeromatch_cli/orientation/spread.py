@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.results import image_numbers, tracks_of
 
 # Cells of an image along its sides, and points in each.
@@ -43,9 +44,9 @@ def chosen_points(model: Any) -> BoolArray:
     # By chance: the longest tracks are those that something is wrong with more often than with others.
     rank = np.minimum(seen, _ENOUGH_IMAGES) + np.random.default_rng(0).random(len(seen))
     keep = np.zeros(len(rank), dtype=bool)
-    for number in image_numbers(model):
-        own = np.flatnonzero(images == number)
-        image = model.images[number]
+    of_image = rows_by_number(images)
+    for number in sorted(of_image):
+        own, image = of_image[number], model.images[number]
         camera = model.cameras[image.camera_id]
         places = np.array([image.points2D[k].xy for k in keypoints[own].tolist()]).reshape(-1, 2)
         keep[points[own[_spread(places, rank[points[own]], camera.width, camera.height)]]] = True

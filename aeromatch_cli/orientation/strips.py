@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -34,8 +35,8 @@ def predicted(block: Block, found: Mapping[str, Pose]) -> dict[str, Pose]:
         known = [row for row, image in enumerate(strip) if image.image_id in found]
         for row, image in enumerate(strip):
             given = block.poses.get(image.image_id)
-            before = [k for k in known if k < row][-1:]
-            after = [k for k in known if k > row][:1]
+            at = bisect_left(known, row)
+            before, after = known[max(0, at - 1) : at], known[at : at + 1]  # of an image that is not known itself
             if image.image_id in found or given is None or not before or not after:
                 continue
             ends = [found[strip[k].image_id].world_rotation for k in (*before, *after)]

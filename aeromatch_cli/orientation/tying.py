@@ -42,19 +42,32 @@ def tied_by_pairs(
     """
     poses = dict(known)
     found: dict[str, tuple[Pose, str]] = {}
-    left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES]
+    left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES and not {p.image_id0, p.image_id1} <= poses.keys()]
+    left.sort(key=lambda p: -len(p.indices))
     while True:
-        ties = [p for p in left if (p.image_id0 in poses) != (p.image_id1 in poses)]
-        ties = [_from_known(p, poses) for p in ties]
-        ties = [p for p in ties if p.image_id1 in given]
-        if not ties:
+        best = _best_tie(left, poses, given)
+        if best is None:
             return found
-        best = max(ties, key=lambda p: (len(p.indices), p.image_id0, p.image_id1))
         left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
         pose = _tied(best, poses[best.image_id0], given[best.image_id1], cameras, thresholds_px)
         if pose is not None:
             poses[best.image_id1] = pose
             found[best.image_id1] = pose, best.image_id0
+
+
+def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Mapping[str, Pose]) -> PairPoints | None:
+    """Of pairs with most matches first: the first of a known and another image, the last by name of several alike."""
+    best: PairPoints | None = None
+    for pair in pairs:
+        if best is not None and len(pair.indices) < len(best.indices):
+            break
+        if (pair.image_id0 in poses) == (pair.image_id1 in poses):
+            continue
+        tie = _from_known(pair, poses)
+        later = best is None or (tie.image_id0, tie.image_id1) > (best.image_id0, best.image_id1)
+        if tie.image_id1 in given and later:
+            best = tie
+    return best
 
 
 def _from_known(pair: PairPoints, poses: Mapping[str, Pose]) -> PairPoints:

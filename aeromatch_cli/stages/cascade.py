@@ -133,7 +133,9 @@ def run(context: Context) -> list[StepContext]:
         own.workspace.create()
         # All images in the first step: what failed there is told of those, too, that are in no pair.
         ids = match.images_of_rows(own) if step.name == FIRST else step.images
-        reports = [extract.run(own, ids), match.run(own), filter.run(own)]
+        # Features of the first step are made once, also where everything is made anew.
+        making = own if step.own_features else replace(own, overwrite=False)
+        reports = [extract.run(making, ids), match.run(own), filter.run(own)]
         for report in reports:
             report.part = own.part
         done.append(replace(step, reports=tuple(reports)))
@@ -207,6 +209,8 @@ def strategies_of(step: Step, settings: Settings) -> dict[str, Strategy]:
 def _further_step(context: Context, recipe: Step, reasons: Mapping[Key, str]) -> StepContext:
     changed = {"cascade": (), **strategies_of(recipe, context.settings)}
     features_of = recipe.name if recipe.own_features else FIRST
+    # A step with the first one's features goes on from its matches.
+    context = replace(context, searched_by=None if recipe.own_features else context.settings.match)
     return _step(context, recipe.name, features_of, context.settings.model_copy(update=changed), reasons)
 
 

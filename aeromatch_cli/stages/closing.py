@@ -57,11 +57,13 @@ def _faults(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[tuple[st
                 "may be left out",
             )
         )
-    parts = facts["adjust"].get("groups", ())
-    if len(parts) > 1 and len(groups) == 1:
+    kinds = [part["kind"] for part in facts["adjust"].get("groups", ())]
+    # Those that positions place lie in one frame.
+    parts = kinds.count("level") + any(kind != "level" for kind in kinds)
+    if parts > 1 and len(groups) == 1:
         found.append(
             (
-                f"{len(parts)} parts whose scale and place nothing ties to each other",
+                f"{parts} parts whose scale and place nothing ties to each other",
                 "positions (--poses) place each of them",
             )
         )

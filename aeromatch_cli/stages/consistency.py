@@ -55,7 +55,8 @@ def run(context: Context) -> StageReport:
                 stale.unlink(missing_ok=True)
         return report.write(context.workspace)
     report.items = len(context.pairs)
-    report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context))
+    # An adjustment may fail, and succeed when it is tried again.
+    report.fingerprint = fingerprint(VERSION, recipe, adjust.current_fingerprint(context), bool(adjusted.poses))
     last = context.workspace.stage_report("consistency")
     if not context.overwrite and path.is_file() and last.is_file():
         before = read_json(last)

@@ -18,6 +18,7 @@ from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
+from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace
 
 # A focal length with a larger standard deviation, as a share of it, is a guess.
@@ -56,6 +57,8 @@ class Context:
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
     # The pairs that are worked on, of a step of a cascade; None: all.
     chosen: frozenset[tuple[str, str]] | None = None
+    # What has made the matches that a step of a cascade goes on from; None where it does not.
+    searched_by: Matcher | None = None
     # Fingerprints of features and matches that steps of a cascade have made together; None without a cascade.
     union: Union | None = None
     # Stands before the names of stages in what is shown of progress.

@@ -69,7 +69,7 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
         for i in (pair.image_id0, pair.image_id1)
     ]
-    return fingerprint(matcher, library_version("poselib"), sides)
+    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides)
 
 
 def images_of_rows(context: Context) -> set[str]:

@@ -31,12 +31,16 @@ _EXACT_PX = 3.0
 
 @dataclass(frozen=True)
 class Mapped:
-    """A first pass with its verified matches, and the models of these, the largest first."""
+    """A first pass with its verified matches, and the models of these, the largest first.
+
+    stopped: why there is none, where the mapper stopped on a fault: this says nothing of the block.
+    """
 
     recipe: FirstPass
     first: Context
     evidence: Evidence
     models: tuple[Model, ...]
+    stopped: str = ""
 
     @property
     def contradicted(self) -> bool:
@@ -74,7 +78,10 @@ def best_mapped(
 
 
 def _mapped(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> Mapped:
-    return Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
+    try:
+        return Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
+    except InputError as error:  # matches are found without orientation, too
+        return Mapped(recipe, first, evidence, (), str(error))
 
 
 def _with_more_keypoints(context: Context, best: Mapped) -> Mapped | None:
@@ -97,11 +104,19 @@ def _without_positions(context: Context, best: Mapped) -> Mapped | None:
 
 
 def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
-    """Models that explain their matches, the largest first. What is left after one is mapped again by itself."""
+    """Models that explain their matches, the largest first. What is left after one is mapped again by itself.
+
+    Raises InputError where no mapper finds one and the last to try stopped on a fault.
+    """
     models: list[Model] = []
     left = evidence.matched
     for _ in range(_MAX_ROUNDS):
-        found = _one_round(context, recipe, first, evidence, left)
+        try:
+            found = _one_round(context, recipe, first, evidence, left)
+        except InputError:
+            if not models:
+                raise
+            break
         models += found
         left = left - {i for model in found for i in model.rotations}
         if not found or len(left) < FEWEST_IMAGES:
@@ -114,18 +129,29 @@ def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence:
 def _one_round(
     context: Context, recipe: FirstPass, first: Context, evidence: Evidence, image_ids: set[str]
 ) -> list[Model]:
-    """Sound models of some images; by the other mapper where that finds more of them."""
+    """Sound models of some images; by the other mapper where that finds more of them.
+
+    Raises InputError where none is found and a mapper stopped on a fault.
+    """
     best: list[Model] = []
+    fault: InputError | None = None
     for mapper in (recipe.mapper, *(name for name in MAPPERS if name != recipe.mapper)):
-        mapped = _mapped_images(context, first, mapper, image_ids)
-        found = _sound_parts(context, evidence, mapped)
-        whole = _images(found) == _images(mapped)
-        if not whole:  # what was cut off has bent the rest
-            again = [_mapped_images(context, first, mapper, set(part.rotations))[:1] for part in found]
-            found = _sound_parts(context, evidence, [model for models in again for model in models])
+        try:
+            mapped = _mapped_images(context, first, mapper, image_ids)
+            found = _sound_parts(context, evidence, mapped)
+            whole = _images(found) == _images(mapped)
+            if not whole:  # what was cut off has bent the rest
+                again = [_mapped_images(context, first, mapper, set(part.rotations))[:1] for part in found]
+                found = _sound_parts(context, evidence, [model for models in again for model in models])
+        except InputError as error:  # the other mapper may do
+            log.warning("warning: %s", error)
+            fault = error
+            continue
         best = found if _images(found) > _images(best) else best
         if found and whole:
             break
+    if fault is not None and not best:
+        raise fault
     return best
 
 
@@ -148,14 +174,10 @@ def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
 
 
 def _mapped_images(context: Context, first: Context, mapper: Mapper, image_ids: set[str]) -> tuple[Model, ...]:
-    """Models of the pairs of the first pass between some images."""
+    """Models of the pairs of the first pass between some images. InputError where the mapper stops on a fault."""
     pairs = tuple(pair for pair in first.pairs if {pair.image_id0, pair.image_id1} <= image_ids)
     with context.executor.step(f"first pass: {mapper} mapping of {len(image_ids)} images"):
-        try:
-            return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
-        except InputError as error:  # the other mapper may do, and matches are found without orientation, too
-            log.warning("warning: %s", error)
-            return ()
+        return map_block(contents_of(replace(first, pairs=pairs)), context.observed, mapper)
 
 
 def _images(models: Sequence[Model]) -> int:

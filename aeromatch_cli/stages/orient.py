@@ -43,6 +43,8 @@ from aeromatch_cli.strategies.pairings.similar import Similar
 
 # The second counts for blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 19, 1
+# What failures.csv calls the mapper's process.
+_MAPPING = "mapping"
 # Standard deviation of a focal length that the pictures gave, as a share of it.
 _FOUND_FOCAL = 0.01
 
@@ -102,6 +104,8 @@ def run(
         outside=frozenset(record["facts"]["outside"]),
     )
     report.failures = _failed_images(context, record["failed"])
+    if stopped := record["facts"].get("stopped"):  # records of earlier versions lack it
+        report.failures.append((_MAPPING, stopped))
     found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
     context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
     return context, report if dry else report.write(context.workspace)
@@ -134,6 +138,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
         context, first, evidence = _with_better_cameras(context, first, evidence)
     good = evidence.explained()
     tried: list[dict[str, Any]] = []
+    stopped = ""
     if looks and recipe.replaces and not suffices(evidence, good):
         first, evidence = evidence_of(context, recipe)
         good = evidence.explained()
@@ -143,10 +148,10 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
             solution.facts["remarks"].append(unoriented_remark(evidence))
     else:
         mapped, tried = best_mapped(context, recipe, first, evidence)
-        models, first, evidence = mapped.models, mapped.first, mapped.evidence
+        models, first, evidence, stopped = mapped.models, mapped.first, mapped.evidence, mapped.stopped
         exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
         solution = from_models(evidence, models, _before(context, kept, before), context.angles, exchanged)
-        if not models:
+        if not models and not stopped:
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
             solution = judged(from_given(evidence, good, correct=False), solution)
@@ -154,7 +159,8 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     facts["further_first_passes"] = tried
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
-    facts["failed"] = list(evidence.failed)
+    facts["failed"] = [*evidence.failed, *([_MAPPING] if stopped else [])]  # is tried again by the next run
+    facts["stopped"] = stopped
     terrains = solution.terrains
     old = _terrains(context, before) if kept else ()
     if len(old) == len(terrains):

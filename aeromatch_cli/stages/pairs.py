@@ -125,7 +125,7 @@ def _within_memory(settings: Settings, executor: Executor, block: Block) -> list
     budget = budget_mb(settings.run.memory)
     if budget is None or executor.kind == "serial":
         return []
-    network = settings.extract.name == "learned" or bool(settings.cascade)
+    network = settings.extract.network or settings.match.network or any(s.own_features for s in settings.cascade)
     size_px = settings.block.max_size_px
     jobs, remark = jobs_within(budget, executor.jobs, block.images, network=network, max_size_px=size_px)
     executor.limit(jobs)
