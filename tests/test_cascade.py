@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sqlite3
+from typing import Any
 
 import numpy as np
 import pytest
@@ -199,7 +200,7 @@ def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(
         rows = list(csv.DictReader(stream))
     assert {row["steps"] for row in rows} == {"first+guided"}
     assert not (site.work / "steps" / "guided" / "features").exists()
-    extracted = json.loads((site.work / "steps" / "guided" / "reports" / "extract.json").read_text())
+    extracted = _report(site, "guided", "extract")
     assert extracted["skipped"] == extracted["items"] == IMAGES
     first, guided = (_rows(site.work / "steps" / step / "verified") for step in ("first", "guided"))
     whole = _rows(site.work / "verified")
@@ -216,9 +217,20 @@ def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(
     changed = next(path for path in before if path.parent == site.work / "steps" / "first" / "matches")
     changed.write_bytes(before[changed][:-40])
     assert site("run", *settings).code == 0
-    assert {path: path.read_bytes() for path in before if path.suffix == ".npz"} == {
-        path: content for path, content in before.items() if path.suffix == ".npz"
-    }
+    arrays = {path: content for path, content in before.items() if path.suffix == ".npz"}
+    assert {path: path.read_bytes() for path in arrays} == arrays
+    # All is made again, each image's features once.
+    assert site("run", *settings, "--overwrite").code == 0
+    assert {path: path.read_bytes() for path in arrays} == arrays
+    assert [_report(site, step, "extract")["done"] for step in ("first", "guided")] == [IMAGES, 0]
+    # The step goes on from what the first one finds: other settings of that count.
+    assert site("match", *settings, "--set", "match.guided=true").code == 0
+    assert _report(site, "guided", "match")["done"] == len(rows)
+
+
+def _report(site: Site, step: str, stage: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((site.work / "steps" / step / "reports" / f"{stage}.json").read_text())
+    return found
 
 
 @pytest.mark.slow

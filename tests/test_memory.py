@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 from conftest import Site
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, worker_mb
+from aeromatch_cli.stages.pairs import runs_network
 
 
 def image(width: int, height: int) -> Image:
@@ -49,6 +51,14 @@ def test_workers_fit_the_budget() -> None:
     jobs, remark = jobs_within(2400.0, 8, [image(12000, 9000)], network=True)
     assert jobs == 1
     assert "with a network more than 2400 MB may be needed" in remark
+
+
+@pytest.mark.parametrize(("preset", "words", "network"), [
+    ("baseline", (), False), ("fusion", (), True), ("fusion", ("match=nearest",), False), ("oblique", (), True),
+    ("auto", (), True), ("auto", ("cascade=guided",), False),
+])  # fmt: skip
+def test_networks_count_wherever_they_run(preset: str, words: tuple[str, ...], network: bool) -> None:
+    assert runs_network(load(preset, words)) is network
 
 
 def test_an_executor_keeps_to_its_limit() -> None:

@@ -120,12 +120,17 @@ def _with_ground(context: Context, found: BlockRead) -> Context:
     return replace(context, block=with_gsd(block, found.gsd_before_m))
 
 
+def runs_network(settings: Settings) -> bool:
+    """Whether some worker may run one."""
+    return settings.extract.network or settings.match.network or any(step.own_features for step in settings.cascade)
+
+
 def _within_memory(settings: Settings, executor: Executor, block: Block) -> list[str]:
     """Fewer workers where the memory budget asks for that, and what is said of it."""
     budget = budget_mb(settings.run.memory)
     if budget is None or executor.kind == "serial":
         return []
-    network = settings.extract.network or settings.match.network or any(s.own_features for s in settings.cascade)
+    network = runs_network(settings)
     size_px = settings.block.max_size_px
     jobs, remark = jobs_within(budget, executor.jobs, block.images, network=network, max_size_px=size_px)
     executor.limit(jobs)
