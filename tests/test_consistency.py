@@ -66,6 +66,22 @@ def test_right_matches_agree_with_the_block(truth: Truth) -> None:
     assert found.mean() < 0.01
 
 
+def test_what_the_adjusted_lens_shows_nowhere_contradicts_the_block(truth: Truth) -> None:
+    """A lens that folds within the picture: beyond, keypoints have no ray."""
+    keypoints = dict(truth.keypoints_px)
+    image_id = matched(truth)[0].image_id0
+    outside = np.zeros(len(keypoints[image_id]), dtype=bool)
+    outside[::7] = True
+    keypoints[image_id] = np.where(outside[:, None], np.nan, keypoints[image_id])
+    pairs = matched(truth)
+    block, limits = held_together(truth, [set(truth.block.poses)]), replace(LIMITS, min_probability=0.5)
+    found = contradicting(block, cameras(truth), keypoints.__getitem__, pairs, limits)
+    for pair, mask in zip(pairs, found.masks, strict=True):
+        if pair.image_id0 == image_id:
+            assert mask[outside[pair.indices[:, 0]]].all()
+            assert not mask[~outside[pair.indices[:, 0]]].all()
+
+
 def test_matches_beside_the_epipolar_line_are_found(truth: Truth) -> None:
     pairs = matched(truth)
     wrong = pairs[0].indices.copy()

@@ -237,6 +237,9 @@ class _Rays:
         image_ids: Sequence[str],
     ) -> _Rays:
         rays = [world_rays(cameras[i], block.poses[i].rotation, np.asarray(keypoints_px(i), float)) for i in image_ids]
+        for image_id, one in zip(image_ids, rays, strict=True):
+            # What the adjusted lens shows nowhere lies behind its camera: it contradicts whatever it is matched with.
+            one[~np.isfinite(one).all(axis=1)] = -block.poses[image_id].rotation[2]
         counts = [len(one) for one in rays]
         return cls(
             rays=np.concatenate([np.zeros((0, 3)), *rays]),
