@@ -177,7 +177,7 @@ Memory = Annotated[
         envvar="AEROMATCH_MEMORY",
         show_envvar=False,
         rich_help_panel=_WORK,
-        help="Memory for all workers together; fewer run side by side where it needs that (default: no limit).",
+        help="Memory for all workers together; fewer workers start where more would need more (default: no limit).",
     ),
 ]
 ExecutorName = Annotated[
@@ -205,7 +205,7 @@ Scheduler = Annotated[
 ShardText = Annotated[
     str | None,
     typer.Option(
-        "--shard", metavar="I/N", rich_help_panel=_WORK, help="Only part I of N of the images and pairs, 1 <= I <= N."
+        "--shard", metavar="I/N", rich_help_panel=_WORK, help="Only part I of N of the images and pairs; not for check, adjust, export, report."
     ),
 ]
 Overwrite = Annotated[

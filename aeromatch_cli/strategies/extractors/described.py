@@ -39,9 +39,9 @@ def pixels_field(default: float) -> Any:
     return Field(
         default,
         ge=0.0,
-        description="Views are halved before keypoints are looked for, again and again, while the image has more "
-        "pixels per wanted keypoint; for SIFT not where it finds too few in them, or mostly the smallest that they "
-        "show. 0: never. Smaller: less time, keypoints less accurate.",
+        description="Views are halved before keypoints are looked for, while the image has more pixels per wanted "
+        "keypoint than this. SIFT goes back to a larger size where it finds too few keypoints in the halved view, or "
+        "mostly very small ones. 0: never halved. Smaller: less time, keypoints less accurate.",
     )
 
 
