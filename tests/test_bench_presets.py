@@ -53,9 +53,9 @@ def test_presets_know_as_much_of_the_poses_as_asked_for(tmp_path: Path) -> None:
     noisy = tmp_path / "poses_noisy.csv"
     noisy.write_text("image,x,y,z,omega_deg,phi_deg,kappa_deg,camera\na.jpg,1.5,-2,90,1,2,3,1\n")
     assert given_poses(noisy, "noisy") == ["--poses", str(noisy)]
-    assert given_poses(noisy, "nothing") == []
-    option, path = given_poses(noisy, "positions")
-    assert (option, Path(path).read_text()) == ("--poses", "image,x,y,z\na.jpg,1.5,-2,90\n")
+    for known, place in (("positions", "1.5,-2,90"), ("nothing", ",,")):
+        option, path = given_poses(noisy, known)
+        assert (option, Path(path).read_text()) == ("--poses", f"image,x,y,z,camera\na.jpg,{place},1\n")
 
 
 def test_quality_and_seconds_are_per_pair(tmp_path: Path) -> None:

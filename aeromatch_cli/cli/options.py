@@ -205,7 +205,10 @@ Scheduler = Annotated[
 ShardText = Annotated[
     str | None,
     typer.Option(
-        "--shard", metavar="I/N", rich_help_panel=_WORK, help="Only part I of N of the images and pairs; not for check, adjust, export, report."
+        "--shard",
+        metavar="I/N",
+        rich_help_panel=_WORK,
+        help="Only part I of N of the images and pairs; not for check, adjust, export, report.",
     ),
 ]
 Overwrite = Annotated[

@@ -72,15 +72,17 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
 
 
 def given_poses(noisy: Path, known: str) -> list[str]:
-    """Options that give a preset so much of the noisy poses: a value of --poses."""
-    if known == _NOTHING:
-        return []
-    if known == _POSITIONS:
-        with noisy.open(encoding="utf-8", newline="") as stream:
-            rows = [[row[key] for key in ("image", "x", "y", "z")] for row in csv.DictReader(stream)]
-        noisy = noisy.with_name("positions_noisy.csv")
-        noisy.write_text("\n".join(",".join(row) for row in [["image", "x", "y", "z"], *rows]) + "\n", encoding="utf-8")
-    return ["--poses", str(noisy)]
+    """Options that give a preset the camera of every image and so much of its noisy pose: a value of --poses."""
+    if known == _NOISY:
+        return ["--poses", str(noisy)]
+    with noisy.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    place = ("x", "y", "z") if known == _POSITIONS else ()
+    columns = ("image", "x", "y", "z", "camera")
+    lines = [[row[key] if key in ("image", "camera", *place) else "" for key in columns] for row in rows]
+    found = noisy.with_name(f"poses_{known}.csv")
+    found.write_text("\n".join(",".join(line) for line in [columns, *lines]) + "\n", encoding="utf-8")
+    return ["--poses", str(found)]
 
 
 def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
