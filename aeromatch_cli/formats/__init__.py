@@ -94,9 +94,10 @@ apart have one each: `terrain-2.tif` and so on.
 Written by `adjust`: the bundle adjustment of the verified matches. One line per image of known place, in the block's
 CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
 (photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
-are not known, too small in blocks of more than 1,500 images, where each is taken with the others as known; `camera`: camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north
-and scale are arbitrary, standard deviations hold within the group), or `predicted` of an image that is not oriented:
-the position given, the attitude given or that of its strip, empty where nothing is known.
+are not known, too small in blocks of more than 1,500 images, where each is taken with the others as known; `camera`:
+camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary,
+standard deviations hold within the group), or `predicted` of an image that is not oriented: the position given, the
+attitude given or that of its strip, empty where nothing is known.
 
 ### orientation/adjusted.json
 
