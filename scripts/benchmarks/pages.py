@@ -34,6 +34,8 @@ PAGES: Mapping[str, str] = {
     "bench_methods": "methods.md",
     "bench_presets": "auto.md",
     "bench_presets_second": "auto.md",
+    "bench_presets_nothing": "auto.md",
+    "bench_presets_positions": "auto.md",
     "bench_evidence": "auto.md",
     "bench_refine": "auto.md",
     "bench_probability": "auto.md",
