@@ -28,7 +28,7 @@ from benchmarks.tables import Row, markdown, number, write_rows
 _WIDTH, _HEIGHT, _FOCAL, _GSD_M = 160, 120, 200.0, 0.5
 _STEP_X, _STEP_Y = 48, 48
 _SIZE_IN = (7.5, 5.0)
-STAGES = ("orient", "pairs", "extract", "match", "filter", "adjust", "consistency", "export", "report")
+STAGES = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
 
 
 def write_block(folder: Path, images: int, seed: int) -> None:

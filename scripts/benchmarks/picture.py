@@ -19,7 +19,7 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.evaluate.rendered import RenderedTruth
-from aeromatch_cli.formats.features import read_features
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
@@ -108,7 +108,8 @@ def _preset(work: Path, truth: RenderedTruth, name0: str, name1: str, preset: st
     workspace = Workspace(work)
     ids = {image.name: image.image_id for image in read_images(workspace.images)}
     entry = FinalEntries(workspace)(ids[name0], read_verified_row(workspace.verified(ids[name0]))[ids[name1]])
-    all_px = [read_features(workspace.features(ids[name])).keypoints_px for name in (name0, name1)]
+    pair_ids = ids[name0], ids[name1]
+    all_px = [read_final_keypoints(workspace.features(i), workspace.refined(i)) for i in pair_ids]
     points = match_points(entry.matches, *all_px)
     return _judged(f"preset {preset}", truth, (name0, name1), all_px, points, entry.matches.scores)
 

@@ -2,17 +2,19 @@
 
 A preset is one `aeromatch run PRESET` with the block's cameras and its noisy poses (5 % of the flying height, 3
 degrees), with --poses their positions alone or nothing: orientation, pairs, features, matches, verification and
-consistency. Peers get every pair of the block that overlaps by 20 % or more, those that read poses the noisy ones. All
-pairs with so much overlap count, whether a preset tries them or not. As by default (8,000 and 4,000), methods with SIFT
+consistency. Peers get every pair of the block that overlaps by 20 % or more, those that read poses the noisy ones.
+These pairs count, whether a preset tries them or not, and no others. As by default (8,000 and 4,000), methods with SIFT
 may have twice the descriptors of those with networks, which take longer for each; a cascade has both.
 `auto[cascade=none]` is `auto` without its further steps, and so on: the picture shows what each step brings and takes;
 none of them counts as another preset. Correct: within 3 px of the exact place. Best: the preset, or peer, with most
-correct matches in that line. Median error: of the medians of pairs. Seconds: of features, each image's once, matching
-and verification, on --jobs cores; orientation, start-up and export, which peers do without, are in the seconds of the
-whole command alone.
+correct matches in that line. Median error: of the medians of pairs. Seconds: of features, each image's once, matching,
+verification, least-squares measuring, adjustment and consistency, on --jobs cores; pycolmap's extraction, which has one
+thread for an image, counts as if it filled them. Orientation, start-up and export, which peers do without, are in the
+seconds of the whole command alone.
 
-Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has is
-not made again: a killed run goes on there. A preset may be PRESET[key=value,key=value].
+Writes OUT/results.json row by row, OUT/presets.md and OUT/quality.svg, correct matches against seconds. What OUT has of
+the same size, images, keypoints and settings is not made again: a killed run goes on there. A preset may be
+PRESET[key=value,key=value].
 """
 
 from __future__ import annotations
@@ -43,13 +45,15 @@ from benchmarks.whole import budget_settings, evaluated, whole_run
 _JUDGED = "auto"
 _ALL_PAIRS = 1_000_000
 _NOISY, _POSITIONS, _NOTHING = "noisy", "positions", "nothing"
-# Whose seconds are those of features, matching and verification.
-_STAGES = ("extract", "match", "filter")
+# Whose seconds count: of all that final matches come from, once the block is oriented.
+_STAGES = ("extract", "match", "filter", "refine", "adjust", "consistency")
+# Peers whose features take one core.
+_ONE_CORE = ("pycolmap", "pycolmap-guided")
 _FIGURES = ("possible", "kept", "correct", "median_error_px")
 
 
 def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: Path) -> list[Row]:
-    """One row for each pair of a preset's run."""
+    """One row for each judged pair of a preset's run."""
     scene = judged.scene
     poses = given_poses(scene.poses.with_name(NOISY_POSES), args.poses)
     given = [*poses, "--cameras", str(scene.block), "--crs", "local"]
@@ -61,7 +65,8 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
         raise SystemExit(f"aeromatch run {preset} on {scene.name} failed with exit code {run.code}:\n{run.said}")
     evaluated(work, scene.images.parent, mapping=False)
     with (work / "evaluation" / "pairs.csv").open(encoding="utf-8", newline="") as stream:
-        found = list(csv.DictReader(stream))
+        by_pair = {(row["image0"], row["image1"]): row for row in csv.DictReader(stream)}
+    found = [by_pair[pair.images] for pair in judged.pairs]
     shutil.rmtree(work)
     seconds = sum(run.answer["stages"][stage]["seconds"] for stage in _STAGES)
     own = {"seconds": seconds / max(1, len(found)), "run_seconds": run.seconds / max(1, len(found))}
@@ -100,7 +105,10 @@ def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
         again = [s for image, s in zip(pair.images, measured.features_seconds, strict=True) if image in known]
         known.update(pair.images)
         figures = {key: plain(score[key]) for key in _FIGURES}
-        own = {"seconds": measured.seconds - sum(again)}
+        seconds = measured.seconds - sum(again)
+        if peer in _ONE_CORE:
+            seconds -= (1.0 - 1.0 / args.jobs) * (sum(measured.features_seconds) - sum(again))
+        own = {"seconds": seconds}
         rows.append({"angle": pair.conditions.view_angle_class, **figures, **own})
     return rows
 
@@ -108,6 +116,7 @@ def peer_rows(args: argparse.Namespace, judged: Judged, peer: str) -> list[Row]:
 def rows_of(args: argparse.Namespace) -> Iterator[Row]:
     """Of every method on every block, pair by pair."""
     first = args.seed
+    asked = {name: getattr(args, name) for name in ("size", "images", "keypoints", "set")}
     for seed in (first + k for k in range(args.seeds)):
         args.seed = seed
         for flight, judged in rendered_scenes(args, "all"):
@@ -116,10 +125,10 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
                 given = f"-{args.poses}" if ours and args.poses != _NOISY else ""
                 folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}{given}"
                 path = folder / "rows.json"
-                if not path.is_file():
+                if not path.is_file() or read_json(path).get("asked") != asked:
                     found = preset_rows(args, judged, method, folder) if ours else peer_rows(args, judged, method)
                     folder.mkdir(parents=True, exist_ok=True)
-                    write_json(path, {"rows": found})
+                    write_json(path, {"asked": asked, "rows": found})
                 for row in read_json(path)["rows"]:
                     yield {"seed": seed, "flight": flight, "scene": judged.scene.name, "method": method, **row}
     args.seed = first

@@ -6,8 +6,9 @@ brackets as in `--set` and a label before it where the name gets long ('plain=fu
 SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
 
   blocks    every k-th image (--thin); `aeromatch run` without its report, of which orientation, pairs, extraction,
-            matching and verification are timed, start-up, adjustment and export are not; then both of pycolmap's
-            mappings from each database. COLMAP matches all pairs, a preset those it chooses
+            matching and verification are timed; start-up, least-squares measuring, adjustment, consistency and
+            export are not; then both of pycolmap's mappings from each database. COLMAP matches all pairs, a preset
+            those it chooses
   thinned   the same where ordinary matching falls apart
   cross     only pairs across a block's darker and brighter series that share a fifth of the smaller footprint
   easy      wall clock of `aeromatch run`, everything included, against the first method
@@ -15,13 +16,14 @@ SIFT: pycolmap, pycolmap-uncut, and each with -guided. Sections:
   orient    whole chains from pictures to an oriented block: `scripts/bench blocks orient --help`
 
 Presets are given (--poses) the reference poses, positions alone with 5 m noise, or nothing; COLMAP uses none. All have
-the reference's cameras. The budget is exact, in COLMAP's sense of a keypoint (a place with two orientations counts
-twice); networks, which take longer for each, have half as many, as by default, and `auto` has both. pycolmap's
-max_num_features is not: it keeps whole scale levels, up to 45 % more. It is therefore cut to the budget after
-extraction, untimed, largest scales first as its own rule would; pycolmap-uncut is not. Verified matches are those of
-pairs with at least 15, each pair of places once (COLMAP counts a place with two orientations twice); within 3 and 5 px:
-by symmetric epipolar distance from the reference poses. Cells filled: of 16 x 16 of each image, and ninths of 3 x 3,
-that hold a match within 3 px.
+the reference's cameras. The budget is exact but for distant ground of strongly oblique images, which has its own, in
+COLMAP's sense of a keypoint (a place with two orientations counts twice); networks, which take longer for each, have
+half as many, as by default, and `auto` has both. pycolmap's max_num_features is not: it keeps whole scale levels, up to
+45 % more. It is therefore cut to the budget after extraction, untimed, largest scales first as its own rule would;
+pycolmap-uncut is not. Verified matches are those of pairs with at least 15, each pair of places once (COLMAP counts a
+place with two orientations twice); within 3 and 5 px: by symmetric epipolar distance from the reference poses, after
+matches are thinned one-to-one to 2 px. Cells filled: of 16 x 16 of each image, and ninths of 3 x 3, that hold a match
+within 3 px.
 Writes OUT/SECTION.json and OUT/SECTION.md; OUT/answers keeps what every method answered: a killed run goes on there.
 """
 

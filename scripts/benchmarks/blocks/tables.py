@@ -24,8 +24,8 @@ _BLOCKS: tuple[Column[Row], ...] = (
     ("keypoints", _known("keypoints_mean", 0)),
     _SECONDS,
     *_COUNTS,
-    ("within 3 px", lambda row: row["within_3px"]),
-    ("within 5 px", lambda row: row["within_5px"]),
+    ("within 3 px", lambda row: row["thinned_3px"]),
+    ("within 5 px", lambda row: row["thinned_5px"]),
     ("cells filled", lambda row: percent(row["filled_cells"]) if "filled_cells" in row else "-"),
     ("ninths", lambda row: percent(row["filled_ninths"]) if "filled_ninths" in row else "-"),
     ("registered", lambda row: f"{row['registered']} of {row['images']}" if "registered" in row else "-"),
@@ -67,8 +67,8 @@ _CROSS: list[Column[_Both]] = [
 _EASY: list[Column[_Both]] = [
     *_mine(_COUNTS),
     _over_first("x first (goal 1)", "unique_matches"),
-    *_mine([("within 3 px", lambda row: row["within_3px"])]),
-    _over_first("x first", "within_3px"),
+    *_mine([("within 3 px", lambda row: row["thinned_3px"])]),
+    _over_first("x first", "thinned_3px"),
     *_mine([_SECONDS]),
     _over_first("x first (goal <= 1.6)", "seconds"),
     *_mine([("processor seconds", _known("processor_seconds", 1))]),
@@ -83,8 +83,8 @@ def _per_minute(field: str) -> Callable[[Row], str]:
 # Columns of a preset's stages; COLMAP matches and verifies in one.
 _SHARES: Mapping[str, Sequence[str]] = {
     "orient": ("orient",), "pairs": ("pairs",), "extract": ("enhance", "simulate", "extract"),
-    "match": ("match", "match+verify"), "filter": ("filter",), "adjust": ("adjust", "consistency"),
-    "export": ("export",),
+    "match": ("match", "match+verify"), "filter": ("filter",), "adjust": ("refine", "adjust", "consistency"),
+    "export": ("export", "report"),
 }  # fmt: skip
 
 
@@ -103,8 +103,8 @@ _SPEED: list[Column[_Both]] = [
         ("tried a minute", _per_minute("tried_pairs")),
         ("verified", lambda row: row["pairs"]),
         ("verified a minute", _per_minute("pairs")),
-        ("within 3 px", lambda row: row["within_3px"]),
-        ("within 3 px a minute", _per_minute("within_3px")),
+        ("within 3 px", lambda row: row["thinned_3px"]),
+        ("within 3 px a minute", _per_minute("thinned_3px")),
         *((title, _share(stages)) for title, stages in _SHARES.items()),
     ]),
 ]  # fmt: skip

@@ -79,7 +79,7 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     row |= {"pairs": stages["filter"]["facts"]["pairs"].get("verified", 0), "seconds": run.seconds}
     row |= {"stages": {name: stage["seconds"] for name, stage in stages.items()}}
     row |= {"unregistered": sorted(stages["adjust"]["facts"].get("outside", names))}
-    row |= {"registered": (facts.get("mapping") or {}).get("registered")}
+    row |= {"registered": facts["consumer"].get("registered")}
     write_json(answer, row)
     if not args.keep:
         shutil.rmtree(work)
