@@ -103,7 +103,7 @@ def test_factors_are_against_the_first_method_of_a_block() -> None:
 
 
 def test_speed_is_a_rate_with_the_share_of_every_stage() -> None:
-    head = {"block": "x", "images": 5, "pairs": 6, "within_3px": 900}
+    head = {"block": "x", "images": 5, "pairs": 6, "thinned_3px": 900}
     peer = head | {"method": "pycolmap", "seconds": 30.0, "tried_pairs": 10}
     peer |= {"stages": {"extract": 24.0, "match+verify": 6.0}}
     mine = head | {"method": "baseline", "seconds": 20.0, "tried_pairs": 8}
