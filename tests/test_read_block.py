@@ -14,6 +14,8 @@ from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.crs import WorldFrame
 from aeromatch_cli.blocks.exif import exif_or_reason
+from aeromatch_cli.blocks.image_names import matched_rows
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.blocks.scan import image_id, image_ids, scan_files, scan_images
 from aeromatch_cli.data import FloatArray
@@ -267,6 +269,32 @@ def test_equal_names_in_two_folders_and_missing_images(tmp_path: Path) -> None:
         read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\nlost.jpg,1,0,9\n"))
     with pytest.raises(ConfigError, match=r"both mean the image b/2\.JPG"):
         read_inputs(tmp_path, write_poses(tmp_path, "image,x,y,z\nb/2.JPG,1,0,9\n2.jpg,1,0,9\n"))
+
+
+def test_a_line_of_a_folder_that_is_not_there_belongs_to_no_image(tmp_path: Path) -> None:
+    write_image(tmp_path / "a" / "5.jpg")
+    write_image(tmp_path / "a" / "6.jpg")
+    both = "image,x,y,z\na/5.jpg,1,0,9\nb/5.jpg,2,0,9\nb/6.jpg,3,0,9\na/7.jpg,4,0,9\nb/7.jpg,4,0,9\n"
+    inputs = read_inputs(tmp_path, write_poses(tmp_path, both))
+    found = {image.name: inputs.poses[image.image_id].center_m[0] for image in inputs.images}
+    # Of 6.jpg there is one line, of a folder that may have another name here.
+    assert found == {"a/5.jpg": 1.0, "a/6.jpg": 3.0}
+    assert any("names 3 images that are not in the folder: b/5.jpg, a/7.jpg, b/7.jpg" in w for w in inputs.warnings)
+
+
+@pytest.mark.parametrize("form", ["DJI_20260101_{:04d}_V-site2.jpg", "DJI_{}_0001_{:04d}.jpg", "IMG_{:04d}.jpg"])
+def test_running_numbers_are_the_digits_that_the_list_speaks_of(form: str) -> None:
+    names = [form.format(*([20260101120000 + k, k] if form.count("{") > 1 else [k])) for k in range(1, 6)]
+    rows = tuple(PoseRow(str(k), k, (float(k), 0.0, 0.0), "grid", None, "none", numbered=True) for k in range(1, 6))
+    found, remarks = matched_rows(PoseList(rows, "grid"), names, "list")
+    assert {name: int(row.image) for name, row in found.items()} == {name: k for k, name in enumerate(names, start=1)}
+    assert remarks == []
+
+
+def test_a_mask_among_the_images_is_no_image(tmp_path: Path) -> None:
+    for name in ("a.jpg", "mask.png"):
+        write_image(tmp_path / name)
+    assert scan_images(tmp_path, [tmp_path / "mask.png"]) == (["a.jpg"], [])
 
 
 def test_block_json_gives_camera_crs_and_ground(tmp_path: Path) -> None:

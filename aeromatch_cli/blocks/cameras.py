@@ -44,7 +44,8 @@ _FISHEYE_FOCAL = 0.45
 class CameraAssignment:
     """cameras: camera id -> Camera. camera_ids: image name -> camera id. reasons: image name -> why it has none.
 
-    focal_sigmas: camera id -> standard deviation of its focal length, as a share of it.
+    focal_sigmas: camera id -> standard deviation of its focal length, as a share of it. by_pose_file: images that have
+    the camera of the pose file.
     """
 
     cameras: Mapping[str, Camera]
@@ -52,6 +53,7 @@ class CameraAssignment:
     reasons: Mapping[str, str]
     warnings: tuple[str, ...]
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
+    by_pose_file: int = 0
 
 
 def focal_from_exif_px(facts: ExifFacts) -> tuple[float, str]:

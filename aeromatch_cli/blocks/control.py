@@ -13,6 +13,7 @@ comments.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,9 @@ def read_control(
     lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
     if len(lines) < 2:
         raise ConfigError(f"{path}: no control points: the first line names the CRS, then {_COLUMNS}")
-    ids = {image.name: image.image_id for image in images} | {Path(i.name).name: i.image_id for i in images}
+    alike = Counter(Path(image.name).name for image in images)
+    ids = {base: image.image_id for image in images if alike[base := Path(image.name).name] == 1}
+    ids |= {image.name: image.image_id for image in images}
     rows = [_row(path, number, line) for number, line in lines[1:]]
     positions = _to_block(path, lines[0][1], crs, np.array([row.position for row in rows])) - np.array(origin_m)
     places: dict[str, FloatArray] = {}
@@ -60,6 +63,8 @@ def read_control(
             seen[ids[row.image]] = np.array(row.pixel) - COLMAP_OFFSET_PX
     checks = {row.name for row in rows if row.check}
     points = tuple(ControlPoint(name, place_m, name in checks, pixels[name]) for name, place_m in places.items())
+    if unclear := sorted({row.image for row in rows if row.image not in ids and alike[row.image] > 1}):
+        raise ConfigError(f"{path}: several images are called {unclear[0]}: write paths relative to the images folder")
     absent = sorted({row.image for row in rows} - ids.keys())
     count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
     return points, [f"{path.name} names {count} that the block does not have: {listed(absent)}"] if absent else []

@@ -50,8 +50,8 @@ def checked_crs(code: str) -> str:
     for axis in crs.axis_info[:2]:
         if axis.direction.lower() not in ("east", "north") or axis.unit_conversion_factor != 1.0:
             raise ConfigError(
-                f"crs {code!r} ({crs.name}) counts in {axis.unit_name} to the {axis.direction}: give a CRS in metres "
-                "whose axes point east and north, or auto for the UTM zone"
+                f"crs {code!r} ({crs.name}) counts in {axis.unit_name} to the {axis.direction}: coordinates in metres "
+                "whose axes point east and north are needed, or degrees; export the list in such a CRS"
             )
     authority = crs.to_authority()
     return ":".join(authority) if authority else code.strip()

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Sequence
 from pathlib import PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 
+# Running numbers are looked for in so many groups of digits of a name, from the end.
+_DIGIT_GROUPS = 3
+
 
 def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and remarks on lines without image and images without line.
 
     An exact relative path comes first; then the same path in another case, the bare file name, and the name without
-    suffix (Metashape's labels); of several, the one whose folders are named, too. Running numbers (DJI's MRK, PATB) are
-    those at the end of the names, of one folder. Raises ConfigError where two images fit a line, or two lines an image.
+    suffix (Metashape's labels); of several, the one whose folders are named, too. A path does not fall back
+    to an image that has a line of its own, nor, where the list has several of its file name, to one of another folder.
+    Running numbers (DJI's MRK, PATB) stand in the names, of one folder. Raises ConfigError where two images fit a line,
+    or two lines an image.
     """
     by_key: dict[str, list[str]] = defaultdict(list)
-    by_number: dict[int, list[str]] = defaultdict(list)
     for name in names:
         path = PurePosixPath(name)
         for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
             by_key[key].append(name)
-        digits = re.findall(r"\d+", path.stem)
-        if digits:
-            by_number[int(digits[-1])].append(name)
+    by_number = _numbered(names, {int(float(row.image)) for row in pose_list.rows if row.numbered})
+    alike = Counter(PurePosixPath(row.image.lower()).name for row in pose_list.rows)
     exact = set(names)
     rows: dict[str, PoseRow] = {row.image: row for row in pose_list.rows if row.image in exact}
     absent: list[str] = []
@@ -41,8 +44,13 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
             if found and len({PurePosixPath(name).parent for name in found}) == 1:
                 rows |= dict.fromkeys(found, row)  # the cameras of one exposure
                 continue
+        if "/" in row.image:
+            several = alike[PurePosixPath(row.image.lower()).name] > 1
+            found = [name for name in found if rows.get(name, row).image not in exact]
+            found = [name for name in found if not several or _shared_folders(row.image, name)]
         if len(found) > 1:
-            found = _with_most_in_common(row.image, found)
+            most = max(_shared_folders(row.image, name) for name in found)
+            found = [name for name in found if _shared_folders(row.image, name) == most]
         if len(found) > 1:
             raise ConfigError(
                 f"{source}, line {row.line}, column image: {row.image!r} may be {found[0]} or {found[1]}: write the "
@@ -72,15 +80,22 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
     return rows, remarks
 
 
-def _with_most_in_common(written: str, names: Sequence[str]) -> list[str]:
-    """Those that share most folders, from the last on, with a path as it was written on another machine."""
-    wanted = PurePosixPath(written.lower()).parent.parts[::-1]
+def _numbered(names: Sequence[str], numbers: Collection[int]) -> dict[int, list[str]]:
+    """Running number -> the images that have it: of the groups of digits of their names, counted from the end, the one
+    that most numbers of the list are found in."""
+    found: dict[int, list[str]] = {}
+    for place in range(1, _DIGIT_GROUPS + 1):
+        by_number: dict[int, list[str]] = defaultdict(list)
+        for name in names:
+            digits = re.findall(r"\d+", PurePosixPath(name).stem)
+            if len(digits) >= place:
+                by_number[int(digits[-place])].append(name)
+        if len(by_number.keys() & numbers) > len(found.keys() & numbers):
+            found = by_number
+    return found
 
-    def shared(name: str) -> int:
-        own = PurePosixPath(name.lower()).parent.parts[::-1]
-        return next(
-            (k for k, (a, b) in enumerate(zip(wanted, own, strict=False)) if a != b), min(len(wanted), len(own))
-        )
 
-    most = max(map(shared, names))
-    return [name for name in names if shared(name) == most]
+def _shared_folders(written: str, name: str) -> int:
+    """How many folders, from the last on, a path has in common with one as it was written on another machine."""
+    wanted, own = (PurePosixPath(path.lower()).parent.parts[::-1] for path in (written, name))
+    return next((k for k, (a, b) in enumerate(zip(wanted, own, strict=False)) if a != b), min(len(wanted), len(own)))

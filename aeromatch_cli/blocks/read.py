@@ -179,15 +179,13 @@ def block_inputs(
         likely_focals=likely_focals,
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
-        recognised=_recognised(lists, rows, headers),
+        recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
     )
 
 
-def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object]) -> str:
+def _recognised(lists: GivenLists, rows: Mapping[str, PoseRow], headers: Mapping[str, object], with_camera: int) -> str:
     if lists.pose_list is None:
         return ""
-    own = lists.pose_list.cameras if lists.cameras == EXIF and lists.camera_file is None else {}
-    with_camera = sum(row.camera in own for row in rows.values())
     cameras = f", {with_camera} with its camera" if with_camera else ""
     return f"{lists.pose_list.format}: {len(rows)} of {len(headers)} images{cameras}"
 
@@ -232,8 +230,15 @@ def _assign_cameras(lists: GivenLists, facts: Mapping[str, ExifFacts], columns: 
         own = lists.camera_file.cameras
         # Cameras of the pose file give way, and so do their names.
         known = {name: camera for name, camera in columns.items() if camera in own or camera not in stated}
+        remarks = lists.camera_file.remarks
+        named = sorted({camera for camera in known.values() if camera})
+        if named and not own.keys() & set(named):
+            # Of an earlier result, say: names that the program has given.
+            remarks = (*remarks, f"the camera file has none of the cameras that the pose list names ({listed(named)}): "
+                       "the names are not used")  # fmt: skip
+            known = {}
         found = cameras_from_file(own, sizes_px, known)
-        return replace(found, warnings=(*lists.camera_file.remarks, *found.warnings))
+        return replace(found, warnings=(*remarks, *found.warnings))
     stated = stated if lists.cameras == EXIF else {}
     if stated:
         return _cameras_of_poses(stated, facts, columns)
@@ -251,12 +256,17 @@ def _cameras_of_poses(
     named = {name: (facts[name].width_px, facts[name].height_px) for name in facts if columns.get(name)}
     found = cameras_from_file(stated, named, columns)
     others = cameras_from_exif({name: fact for name, fact in facts.items() if name not in found.camera_ids}, {})
+    unfit = [
+        f"{_count(list(found.reasons), facts)} do not take the camera of the pose file but that of EXIF: {reason}"
+        for reason in list(found.reasons.values())[:1]
+    ]
     return CameraAssignment(
         {**others.cameras, **found.cameras},
         {**others.camera_ids, **found.camera_ids},
         others.reasons,
-        others.warnings,
+        (*others.warnings, *unfit),
         {**others.focal_sigmas, **found.focal_sigmas},
+        len(found.camera_ids),
     )
 
 

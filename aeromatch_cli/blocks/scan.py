@@ -44,8 +44,8 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
     """Relative names (forward slashes, sorted) of the images below a folder, and what was passed over and why.
 
     Folders are searched at any depth, links included; hidden files and folders are skipped. A suffix in any case
-    counts. exclude: folders that are not searched, such as masks; nor is any folder that is a workspace of this
-    program. Raises ConfigError where the folder is missing or cannot be read.
+    counts. exclude: folders that are not searched, such as masks, and files; nor is any folder that is a workspace of
+    this program. Raises ConfigError where the folder is missing or cannot be read.
     """
     if not folder.is_dir():
         what = "is not a folder" if folder.exists() else "does not exist"
@@ -61,7 +61,8 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
         name = Path(error.filename).relative_to(folder).as_posix() if error.filename else ""
         failures.append(ScanFailure(name, f"folder cannot be read ({error.strerror}): check its permissions", True))
 
-    visited = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
+    passed_over = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
+    visited = set(passed_over)
     for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(parent)
         if real in visited:  # excluded, or a link that leads back up
@@ -80,6 +81,8 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
             if Path(name).suffix.lower() not in SUFFIXES:
                 continue
             path = Path(parent) / name
+            if os.path.realpath(path) in passed_over:
+                continue
             relative = path.relative_to(folder).as_posix()
             failure = _failure_of(path, relative)
             if failure is not None:

@@ -62,6 +62,7 @@ def run(context: Context) -> StageReport:
             adjusted, figures = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
+        report.facts = {"images": 0, "remarks": []}  # not those of an earlier adjustment
         return report.write(context.workspace)
     report.facts = _facts(context, adjusted, figures)
     report.done = report.items

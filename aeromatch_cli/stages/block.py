@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.blocks.control import far_control, read_control
-from aeromatch_cli.blocks.crs import WorldFrame
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
@@ -155,7 +155,12 @@ def _read_inputs(
             remote = list_remote(given.images)
         names, passed_over = scan_files({name: file.size_bytes for name, file in remote.items()})
     else:
-        names, passed_over = scan_images(root, [workspace.root, *([Path(given.masks)] if given.masks else [])])
+        masks = [Path(given.masks)] if given.masks else []
+        if any(path.is_dir() and path.resolve() == root.resolve() for path in masks):
+            raise ConfigError(
+                f"{root} holds images and masks, which would be matched too: give masks a folder of their own"
+            )
+        names, passed_over = scan_images(root, [workspace.root, *masks])
     pictures = [remote.get(name) or root / name for name in names]
     outcomes = dict(zip(names, executor.run(_read_header, pictures, "read"), strict=True))
     for name, outcome in outcomes.items():
@@ -171,10 +176,15 @@ def _read_inputs(
         crs=given.crs,
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
-        known_frame=frame if frame is not None and given.crs in ("auto", frame.crs) else None,
+        known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
     )
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     return inputs, {image.image_id: prints[image.name] for image in inputs.images}, remote
+
+
+def _same_crs(given: str, known: str) -> bool:
+    """Whether the user asks for no other CRS than the one of an earlier run."""
+    return given.strip().lower() in ("", AUTO) or checked_crs(given) == known
 
 
 def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:

@@ -167,7 +167,7 @@ def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
     shown, places_px = _shown_ninths(context), contents_of(context).keypoints_px
     seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
     for track in adjusted.tracks.values():
-        seen += np.bincount(np.unique(track[:, 1]), minlength=len(seen))
+        seen[np.unique(track[:, 1])] += 1
     found = {}
     for image_id, track in sorted(adjusted.tracks.items()):
         image = context.image_by_id[image_id]

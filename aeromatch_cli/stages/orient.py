@@ -14,9 +14,10 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
 from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
-from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
+from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.orientation.arrangement import Before
 from aeromatch_cli.orientation.dem import Terrain, continued
 from aeromatch_cli.orientation.focal import better_cameras
@@ -41,7 +42,7 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
 
-# The second counts for blocks that are large (`first_pass.is_large`) alone.
+# The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 19, 1
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
@@ -63,7 +64,8 @@ def run(
         report.items = 0
         return context, report
     images, settings = _prints(context)
-    report.fingerprint = fingerprint(images, settings)
+    # A block that grows large is oriented anew, but where its images were.
+    report.fingerprint = fingerprint(images, settings, first_pass.is_large(context.block))
     before = _on_file(context)
     record = before if before.get("fingerprint") == report.fingerprint else None
     if record is None and dry:
@@ -201,16 +203,15 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         place = None
         if pose is not None:
             place = pose.center_m, pose.world_rotation, pose.sigma_position_m, pose.sigma_angle_deg
-        taken = context.image_fingerprints[image.image_id], image.time
+        mask = mask_path(settings.block.masks, image.name)
+        taken = context.image_fingerprints[image.image_id], image.time, image_fingerprint(mask) if mask else ""
         images[image.image_id] = fingerprint(
             taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
             context.likely_focals.get(image.camera_id),
         )  # fmt: skip
-    how: list[Any] = [settings.orient, settings.block.max_size_px, settings.block.masks]
+    how: list[Any] = [settings.orient, settings.block.max_size_px, _LARGE_BLOCK_VERSION]
     if isinstance(settings.pairs, Similar):
         how.append(settings.pairs)
-    if first_pass.is_large(block):
-        how.append(_LARGE_BLOCK_VERSION)
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
 
 

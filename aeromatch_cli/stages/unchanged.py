@@ -25,7 +25,7 @@ from aeromatch_cli.workspace import Workspace
 # Their arithmetic decides results.
 _LIBRARIES = ("numpy", "opencv-python-headless", "poselib", "pycolmap", "torch")
 # What readers of poses and cameras look for beside the file or folder that is named, and one folder above.
-_KINDS_BESIDE, _NAMES_BESIDE = (".bin", ".xml", ".xyz"), ("block.json", "world.json")
+_KINDS_BESIDE, _NAMES_BESIDE = (".bin", ".xml", ".xyz"), ("block.json", "world.json", "list.txt")
 
 
 def state_of_inputs(settings: Settings) -> dict[str, str]:

@@ -102,8 +102,8 @@ def _lens(group: Any) -> Nearest | None:
 
 
 def _short(path: str) -> str:
-    """The path without a drive or a root, which say nothing of the folder of images."""
-    return path.rsplit("/", 1)[-1] if re.match(r"([A-Za-z]:)?/", path) else path
+    """The path without a drive or a root; its folders tell images of one name apart."""
+    return re.sub(r"^([A-Za-z]:)?/+", "", path)
 
 
 def _value(source: Source, photo: str, element: Any, key: str) -> float:

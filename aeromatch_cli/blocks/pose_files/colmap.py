@@ -22,6 +22,7 @@ from aeromatch_cli.geometry.rotations import from_quaternion
 
 _FLOAT = r"[-+0-9.eE]+"
 _IMAGE = re.compile(rf"\d+[ ,]+(?:{_FLOAT}[ ,]+){{7}}\d+[ ,]+\S.*[A-Za-z_./].*")
+_POINTS = re.compile(rf"(?:{_FLOAT}[ ,]+{_FLOAT}[ ,]+-?\d+(?:[ ,]+|$))+")
 _NAMES = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID")
 # COLMAP's numbers of the models that are known here, and how many parameters all of them have.
 _MODEL_IDS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 5: "OPENCV_FISHEYE",
@@ -65,7 +66,7 @@ def _text_rows(source: Source, cameras: CameraShelf) -> Iterator[PoseRow]:
             continue
         if points:
             points = False
-            if not _IMAGE.fullmatch(text.strip()):
+            if not _IMAGE.fullmatch(text.strip()) or _POINTS.fullmatch(text.strip()):
                 continue
         elif not text.strip():
             continue

@@ -162,7 +162,8 @@ def read_inpho(source: Source) -> PoseList:
     for place, (line, text) in enumerate(lines):
         key, _, value = (part.strip() for part in text.partition(":"))
         if key == "$PHOTO_FILE":
-            name = PureWindowsPath(value.strip('"')).name
+            path = PureWindowsPath(value.strip('"'))
+            name = path.relative_to(path.anchor).as_posix()
         elif key == "$PHOTO_NUM" and not name:
             name = value
         elif key == "$CAMERA_ID":
