@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import gzip
+import io
 import json
 import pickle
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,26 +127,34 @@ def test_tracks_join_verified_matches_and_end_where_one_image_is_seen_twice(trut
     assert len(matched(spoilt).points_m) == 0
 
 
+class AsOpenSfm(pickle.Unpickler):
+    """Reads what OpenSfM's reader of matches allows: names of numpy alone."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        assert module in ("numpy", "numpy.core.multiarray"), (module, name)
+        return super().find_class(module.replace("numpy.core", "numpy._core"), name)
+
+
 def test_opensfm_normalises_from_the_middle_of_the_first_pixel(truth: Truth, tmp_path: Path) -> None:
     EXPORTERS["opensfm"]()(corner(truth), tmp_path / "o")  # type: ignore[operator]
-    with np.load(tmp_path / "o" / "features" / "flight" / "0.jpg.features.npz", allow_pickle=False) as features:
+    with np.load(tmp_path / "o" / "features" / "0.jpg.features.npz", allow_pickle=False) as features:
         np.testing.assert_allclose(features["points"][0, :2], [(0.5 - 500) / 1000, (0.5 - 375) / 1000], rtol=1e-6)
         assert int(features["OPENSFM_FEATURES_VERSION"]) == 3
     rows = (tmp_path / "o" / "tracks.csv").read_text().splitlines()
     assert rows[0] == "OPENSFM_TRACKS_VERSION_v2"
     last = rows[2].split("\t")
-    assert last[:3] == ["flight/1.jpg", "0", "0"]
+    assert last[:3] == ["1.jpg", "0", "0"]
     assert len(last) == 11
     np.testing.assert_allclose([float(v) for v in last[3:5]], [(799.5 - 400) / 800, (599.5 - 300) / 800])
 
 
 def test_opensfm_reads_matches_cameras_and_positions(contents, truth: Truth, tmp_path: Path) -> None:
     EXPORTERS["opensfm"]()(contents(), tmp_path / "o")  # type: ignore[operator]
-    raw = gzip.decompress((tmp_path / "o" / "matches" / "flight" / "0.jpg_matches.pkl.gz").read_bytes())
+    raw = gzip.decompress((tmp_path / "o" / "matches" / "0.jpg_matches.pkl.gz").read_bytes())
     assert b"numpy._core" not in raw  # which ODM's fork does not load
-    found = pickle.loads(raw)
-    np.testing.assert_array_equal(found["flight/1.jpg"], truth.pairs[0].verified)
-    exif = json.loads((tmp_path / "o" / "exif" / "flight" / "0.jpg.exif").read_text())
+    found = AsOpenSfm(io.BytesIO(raw)).load()
+    np.testing.assert_array_equal(found["1.jpg"], truth.pairs[0].verified)
+    exif = json.loads((tmp_path / "o" / "exif" / "0.jpg.exif").read_text())
     expected = geographic(truth.block.poses["img0"].center_m[None])[0]
     np.testing.assert_allclose([exif["gps"][k] for k in ("latitude", "longitude", "altitude")], expected, rtol=1e-12)
     model = json.loads((tmp_path / "o" / "camera_models.json").read_text())[exif["camera"]]
@@ -152,6 +162,23 @@ def test_opensfm_reads_matches_cameras_and_positions(contents, truth: Truth, tmp
     # Back to our pixels: the principal point from the middle of the first pixel.
     assert model["c_x"] * 1000 + 499.5 == pytest.approx(camera.params[2])
     assert model["focal_y"] * 1000 == pytest.approx(camera.params[1])
+
+
+def test_opensfm_refuses_two_images_of_one_file_name(truth: Truth, tmp_path: Path) -> None:
+    images = [dataclasses.replace(i, name=f"{k}/same.jpg") for k, i in enumerate(truth.block.images)]
+    block = dataclasses.replace(truth.block, images=tuple(images))
+    with pytest.raises(ItemError, match=r"several are called same\.jpg"):
+        EXPORTERS["opensfm"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "o")  # type: ignore[operator]
+
+
+def test_what_no_position_places_is_not_in_the_crs(contents, truth: Truth, tmp_path: Path) -> None:
+    """A group beside the others: its poses are no coordinates of the CRS."""
+    adjusted = dataclasses.replace(adjusted_block(truth), frames={"img1": 1})
+    aside = dataclasses.replace(contents(), adjusted=adjusted)
+    EXPORTERS["micmac"]()(aside, tmp_path / "m")  # type: ignore[operator]
+    written = sorted(path.name for path in (tmp_path / "m" / "Ori-aeromatch").glob("Orientation-*"))
+    assert "Orientation-flight_0.jpg.xml" in written
+    assert "Orientation-flight_1.jpg.xml" not in written
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -347,7 +374,11 @@ def test_alicevision_writes_rotations_by_columns_and_views_by_number(contents, t
     found = np.array([float(v) for v in pose["rotation"]]).reshape(3, 3, order="F")
     np.testing.assert_allclose(found, truth.block.poses["img1"].world_rotation, atol=1e-12)
     camera, intrinsic = truth.block.cameras["a"], data["intrinsics"][0]
-    assert float(intrinsic["focalLength"]) * 1000 / 36 == pytest.approx(camera.params[0])
+    assert data["version"] == ["1", "2", "1"]
+    assert [float(v) for v in intrinsic["pxFocalLength"]] == pytest.approx(list(camera.params[:2]))
+    # What AliceVision reads of this version without a default.
+    assert float(intrinsic["pxInitialFocalLength"]) == pytest.approx(camera.params[0])
+    assert {"serialNumber", "principalPoint", "distortionParams", "type", "width", "height"} <= intrinsic.keys()
     assert float(intrinsic["principalPoint"][0]) + 500.0 == pytest.approx(camera.params[2])
     tokens = (tmp_path / "a" / "matches" / "0.matches.txt").read_text().split()
     assert tokens[:5] == ["1", "2", "1", "sift", str(len(truth.pairs[0].verified))]
@@ -391,7 +422,7 @@ def test_bingo_writes_millimetres_from_the_principal_point(contents, truth: Trut
     for line in lines[1:end]:
         point, x, y = line.split()
         ray = np.asarray(pose.world_rotation) @ (adjusted.points_m[int(point) - 1] - pose.center_m)
-        expected = ray[0] / ray[2] * fx * 0.005, -ray[1] / ray[2] * fy * 0.005
+        expected = np.array([ray[0], -ray[1]]) / ray[2] * float(focal)  # square pixels: one focal length
         np.testing.assert_allclose([float(x), float(y)], expected, atol=2e-5)
     assert end > 50
     assert (tmp_path / "p" / "photos.txt").read_text().splitlines()[1] == "2 flight/1.jpg"

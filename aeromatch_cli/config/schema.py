@@ -221,6 +221,11 @@ class Settings(_Section):
     @model_validator(mode="after")
     def _colours_for_filters(self) -> Settings:
         readers = [getattr(one, "name", "") for one in self.filter if "colour" in one.needs]
+        if readers and self.cascade:
+            raise ValueError(
+                f"filter {'+'.join(readers)} compares colours, which are not kept where steps of a cascade are joined; "
+                "leave it out, or add --set cascade=none"
+            )
         if readers and not self.extract.colours:
             raise ValueError(
                 f"filter {'+'.join(readers)} compares colours that are not kept; add --set extract.colours=true"

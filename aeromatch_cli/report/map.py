@@ -249,7 +249,9 @@ def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
     places = axes.transData.transform([(s.x_m, s.y_m) for s in stations])
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):
         where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}
-        text = axes.annotate(station.label, (station.x_m, station.y_m), gid="label", color=COLOURS["ink"], **where)
+        # Names are no formulas, even with two dollar signs.
+        where |= {"gid": "label", "color": COLOURS["ink"], "parse_math": False}
+        text = axes.annotate(station.label, (station.x_m, station.y_m), **where)
         box = text.get_window_extent()
         hides = station.kind == "fine" and box.count_contains(places)
         if hides or any(box.overlaps(other) for other in taken):

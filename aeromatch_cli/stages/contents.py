@@ -85,6 +85,8 @@ def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairCont
 def _pairs(context: Context, verified: _Verified) -> Iterator[PairContents]:
     for item in _matched(context, verified):
         verdict, kept = item.verified.verdict, item.verified.matches.indices
+        # A filter may keep matches of a pair that it cannot verify.
+        kept = kept if verdict.state == "verified" else kept[:0]
         yield PairContents(item.pair, item.raw.indices, kept, verdict.model_kind, verdict.model)
 
 

@@ -69,7 +69,8 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
         (extract.task_of(context, i).fingerprint, context.geometry_fingerprint(i, matcher.reads()))
         for i in (pair.image_id0, pair.image_id1)
     ]
-    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides)
+    overlap = str(pair.overlap) if matcher.reads_pixels else ""  # where it is small, poses are not doubted
+    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides, overlap)
 
 
 def images_of_rows(context: Context) -> set[str]:

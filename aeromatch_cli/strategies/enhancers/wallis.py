@@ -42,7 +42,8 @@ class WallisEnhancement(KeepsSource):
         0.8,
         ge=0.0,
         le=1.0,
-        description="Weight (0-1) of the target standard deviation: 0 = unchanged, 1 = reached everywhere.",
+        description="Weight (0-1) of the target standard deviation: 0 = all local contrast taken away, 1 = reached "
+        "everywhere.",
     )
     brightness: float = Field(
         0.9, ge=0.0, le=1.0, description="Weight (0-1) of the target mean: 0 = unchanged, 1 = reached everywhere."

@@ -26,7 +26,7 @@ class AliceVision(Strategy):
     """Writes cameras.sfm (views, intrinsics, poses), features/*.sift.feat, matches/0.matches.txt and world.json (CRS
     and origin that poses count from)."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["alicevision"] = "alicevision"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -76,16 +76,16 @@ def _sfm(solution: Solution, views: dict[str, int]) -> dict[str, Any]:
 
 
 def _intrinsic(camera: Camera) -> dict[str, Any]:
-    """Brown's model by a focal length in millimetres of a sensor 36 mm wide."""
+    """Brown's model, with focal lengths in pixels; the sensor counts as 36 mm wide."""
     values, sensor_mm = parameters(camera), 36.0
+    focal_px = _texts([values["fx"], values["fy"]])
     # AliceVision adds half the size to it, in the frame of the features.
     middle = camera.width_px / 2.0, camera.height_px / 2.0
     return {
         "width": str(camera.width_px), "height": str(camera.height_px), "sensorWidth": f"{sensor_mm}",
         "sensorHeight": f"{sensor_mm * camera.height_px / camera.width_px:.15g}", "type": "brown",
-        "focalLength": f"{values['fx'] * sensor_mm / camera.width_px:.15g}",
-        "pixelRatio": f"{values['fy'] / values['fx']:.15g}",
-        "principalPoint": _texts([values["cx"] - middle[0], values["cy"] - middle[1]]),
+        "serialNumber": "", "initializationMode": "calibrated", "pxInitialFocalLength": focal_px[0],
+        "pxFocalLength": focal_px, "principalPoint": _texts([values["cx"] - middle[0], values["cy"] - middle[1]]),
         "distortionParams": _texts([values["k1"], values["k2"], 0.0, values["p1"], values["p2"]]), "locked": "0",
     }  # fmt: skip
 

@@ -30,7 +30,7 @@ class Bingo(Strategy):
     """Writes image.txt (image points of BINGO and PATB), exterior.txt (positions and angles in gon), photos.txt (their
     numbers) and camera.txt."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["bingo"] = "bingo"
     pixel_um: float = Field(
         4.0, gt=0.0, description="Size of a pixel on the sensor, micrometres; it sets the scale of all millimetres."
@@ -52,7 +52,9 @@ class Bingo(Strategy):
                 flat = undistort(camera, places[found.keypoint[own]]) - [values["cx"], values["cy"]]
                 names.append(f"{number} {image.name}\n")
                 lines.append(f"{number} {focal_px(camera) * mm:.5f}\n")
-                for track, (x, y) in zip(found.track[own], flat * [mm, -mm], strict=True):
+                # One focal length: as if pixels were square.
+                square = focal_px(camera) * mm / np.array([values["fx"], -values["fy"]])
+                for track, (x, y) in zip(found.track[own], flat * square, strict=True):
                     lines.append(f"{track + 1} {x:.6f} {y:.6f}\n")
                 lines.append(_END)
             write(partial / "image.txt", "".join(lines))

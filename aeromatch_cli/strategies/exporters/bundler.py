@@ -34,7 +34,7 @@ class Bundler(Strategy):
     """Writes bundle.out (cameras, points of the adjusted block with their measurements), list.txt and world.json;
     coordinates are those of the block's world, the CRS less the origin that world.json names."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["bundler"] = "bundler"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -59,7 +59,7 @@ def _camera(solution: Solution, number: int) -> str:
     if image.image_id not in solution.poses:
         return "0 0 0\n" * 5
     rotation, center_m = solution.poses[image.image_id]
-    values = parameters(solution.camera(image))
+    values = parameters(solution.camera(image))  # one focal length: that of x
     bundler = CAM_FROM_PHOTO @ rotation
     rows = [(values["fx"], values["k1"], values["k2"]), *bundler, -bundler @ center_m]
     return "".join(" ".join(f"{value:.15g}" for value in row) + "\n" for row in rows)

@@ -51,7 +51,7 @@ class GeoJson(Strategy):
     """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches, and beside each its
     style for QGIS."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

@@ -23,7 +23,7 @@ class Hloc(Strategy):
     """Writes features.h5, matches.h5, pairs.txt, poses.txt (name, cam_from_world quaternion and translation) and
     world.json (CRS and origin that poses count from); needs h5py."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["hloc"] = "hloc"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -46,7 +46,7 @@ class Hloc(Strategy):
             with h5py.File(partial / "matches.h5", "w", track_order=True) as stream:
                 for id0, id1, rows in found.pairs:
                     partner = np.full(sizes[id0], -1, np.int32)
-                    partner[rows[:, 0]] = rows[:, 1]
+                    partner[rows[::-1, 0]] = rows[::-1, 1]  # of several partners the first one
                     group = stream.create_group(pair_key(names[id0], names[id1]))
                     group.create_dataset("matches0", data=partner)
                     group.create_dataset("matching_scores0", data=(partner >= 0).astype(np.float16))

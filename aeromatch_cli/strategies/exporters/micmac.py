@@ -26,7 +26,7 @@ _ORI = "Ori-aeromatch"
 class MicMac(Strategy):
     """Writes Homol/ (tie points of every pair, both ways) and Ori-aeromatch/ (orientations and calibrations)."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["micmac"] = "micmac"
     binary: bool = Field(
         False, description="Write Homol as .dat, MicMac's default, instead of .txt (ExpTxt=1 in its commands)."

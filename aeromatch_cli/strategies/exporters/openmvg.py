@@ -7,6 +7,7 @@ Text: `<image>.feat` x y scale orientation; `matches.f.txt` with I J, the number
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Literal
 
@@ -26,9 +27,9 @@ _SCALE = "1 0"
 
 class OpenMvg(Strategy):
     """Writes sfm_data.json (views, intrinsics, poses), matches/ (features, matches.f.txt, image_describer.json) and
-    world.json (CRS and origin that poses count from)."""
+    world.json (CRS and origin that poses count from). It has one focal length: that of x, where y has another."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["openmvg"] = "openmvg"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -55,14 +56,14 @@ class OpenMvg(Strategy):
             write(partial / "matches" / "matches.f.txt", "".join(blocks))
             write(
                 partial / "matches" / "image_describer.json",
-                json.dumps({"regions_type": _kind("SIFT_Regions")}, indent=1),
+                json.dumps({"regions_type": _kind("SIFT_Regions", {"value0": [], "value1": []})}, indent=1),
             )
             write(partial / "sfm_data.json", json.dumps(_sfm_data(solution), indent=1))
             return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
 
 
-def _kind(name: str) -> dict[str, Any]:
-    return {"polymorphic_id": _NEW_KIND, "polymorphic_name": name, "ptr_wrapper": {"valid": 1, "data": {}}}
+def _kind(name: str, data: dict[str, Any]) -> dict[str, Any]:
+    return {"polymorphic_id": _NEW_KIND, "polymorphic_name": name, "ptr_wrapper": {"valid": 1, "data": data}}
 
 
 def _sfm_data(solution: Solution) -> dict[str, Any]:
@@ -82,8 +83,8 @@ def _sfm_data(solution: Solution) -> dict[str, Any]:
             rotation, center_m = solution.poses[image.image_id]
             poses.append({"key": number, "value": {"rotation": rotation.tolist(), "center": center_m.tolist()}})
     intrinsics = [
-        {"key": number, "value": _intrinsic(solution.cameras[camera_id], first=not number)}
-        for camera_id, number in cameras.items()
+        {"key": number, "value": value}
+        for number, value in enumerate(_intrinsics([solution.cameras[camera_id] for camera_id in cameras], len(views)))
     ]
     return {
         "sfm_data_version": "0.3", "root_path": "images", "views": views, "intrinsics": intrinsics, "extrinsics": poses,
@@ -91,13 +92,22 @@ def _sfm_data(solution: Solution) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _intrinsic(camera: Camera, *, first: bool) -> dict[str, Any]:
-    """Brown's model; its name stands at the first camera alone, as cereal writes it."""
-    values = parameters(camera)
-    data = {
-        "width": camera.width_px, "height": camera.height_px, "focal_length": values["fx"],
-        "principal_point": [values["cx"], values["cy"]],
-        "disto_t2": [values["k1"], values["k2"], 0.0, values["p1"], values["p2"]],
-    }  # fmt: skip
-    mark = {"polymorphic_id": _NEW_KIND, "polymorphic_name": "pinhole_brown_t2"} if first else {"polymorphic_id": 1}
-    return {**mark, "ptr_wrapper": {"id": _NEW_KIND, "data": data}}
+def _intrinsics(cameras: Sequence[Camera], objects: int) -> Iterator[dict[str, Any]]:
+    """Radial cameras where nothing is tangential, as every version reads them, else Brown's model. The name of a kind
+    stands at its first camera alone, as cereal writes it. objects: that are numbered already."""
+    kinds: dict[str, int] = {}
+    for number, camera in enumerate(cameras, start=objects + 1):
+        values = parameters(camera)
+        radial = [values["k1"], values["k2"], 0.0]
+        tangential = [values["p1"], values["p2"]]
+        kind, lens = ("pinhole_brown_t2", {"disto_t2": radial + tangential}) if any(tangential) else (
+            "pinhole_radial_k3", {"disto_k3": radial})  # fmt: skip
+        mark: dict[str, Any] = {"polymorphic_id": kinds.get(kind)}
+        if kind not in kinds:
+            kinds[kind] = len(kinds) + 1
+            mark = {"polymorphic_id": _NEW + kinds[kind], "polymorphic_name": kind}
+        data = {
+            "width": camera.width_px, "height": camera.height_px, "focal_length": values["fx"],
+            "principal_point": [values["cx"], values["cy"]], **lens,
+        }  # fmt: skip
+        yield {**mark, "ptr_wrapper": {"id": _NEW + number, "data": data}}

@@ -10,12 +10,14 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
-from pathlib import Path
+from collections import Counter
+from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, Image
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.strategies import Strategy
@@ -32,24 +34,29 @@ _CONFIG = "# Features, matches and tracks are those of aeromatch.\nmin_track_len
 
 class OpenSfm(Strategy):
     """Writes features, matches, tracks.csv, exif, camera_models.json, reference_lla.json and config.yaml of an OpenSfM
-    project; put the images beside them as `images`."""
+    project; put the images beside them as `images`. OpenSfM calls images by their file names, without folders."""
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: Literal["opensfm"] = "opensfm"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where file names are not different."""
         solution = Solution.of(contents)
+        names = {image.image_id: PurePosixPath(image.name).name for image in solution.images}
+        if twice := [name for name, count in Counter(names.values()).items() if count > 1]:
+            raise ItemError(f"OpenSfM calls images by file names, and several are called {twice[0]}: rename them")
         with whole_folder(folder) as partial:
             found = matched(contents)
             places = {i.image_id: _normalised(contents, i) for i in solution.images}
             for image in solution.images:
-                _write_features(partial / "features" / f"{image.name}.features.npz", places[image.image_id], image)
-            _write_matches(partial / "matches", found, {i.image_id: i.name for i in solution.images})
-            write(partial / "tracks.csv", _tracks_text(found, solution, places))
+                _write_features(
+                    partial / "features" / f"{names[image.image_id]}.features.npz", places[image.image_id], image
+                )
+            _write_matches(partial / "matches", found, names)
+            write(partial / "tracks.csv", _tracks_text(found, solution, places, names))
             write(partial / "image_list.txt", "".join(f"images/{image.name}\n" for image in solution.images))
             write(partial / "config.yaml", _CONFIG)
-            _write_metadata(partial, contents, solution)
+            _write_metadata(partial, contents, solution, names)
             keypoints = sum(map(len, places.values()))
             return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
 
@@ -76,14 +83,15 @@ def _write_matches(folder: Path, found: Matched, names: dict[str, str]) -> None:
     for id0, id1, rows in found.pairs:
         of_image[id0][names[id1]] = np.ascontiguousarray(rows, np.int32)
     for image_id, matches in of_image.items():
-        # Protocol 2 names modules in plain text, so that they can be those of numpy 1.
-        raw = pickle.dumps(matches, protocol=2).replace(b"numpy._core.", b"numpy.core.")
+        # Protocol 3 names modules in plain text, so that they can be those of numpy 1; protocol 2 would name one more,
+        # which OpenSfM's reader forbids.
+        raw = pickle.dumps(matches, protocol=3).replace(b"numpy._core.", b"numpy.core.")
         path = folder / f"{names[image_id]}_matches.pkl.gz"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(gzip.compress(raw, mtime=0))
 
 
-def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArray]) -> str:
+def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArray], names: dict[str, str]) -> str:
     lines = [_TRACKS_HEAD]
     longer = [max(image.width_px, image.height_px) for image in solution.images]
     for track, image_idx, keypoint in zip(found.track, found.image_idx, found.keypoint, strict=True):
@@ -91,11 +99,11 @@ def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArra
         x, y = places[image.image_id][keypoint]
         scale = _SIZE_PX / longer[image_idx]
         colour = f"{_GREY}\t{_GREY}\t{_GREY}"
-        lines.append(f"{image.name}\t{track}\t{keypoint}\t{x:.9g}\t{y:.9g}\t{scale:.9g}\t{colour}\t-1\t-1\n")
+        lines.append(f"{names[image.image_id]}\t{track}\t{keypoint}\t{x:.9g}\t{y:.9g}\t{scale:.9g}\t{colour}\t-1\t-1\n")
     return "".join(lines)
 
 
-def _write_metadata(partial: Path, contents: ExportContents, solution: Solution) -> None:
+def _write_metadata(partial: Path, contents: ExportContents, solution: Solution, names: dict[str, str]) -> None:
     models = {camera_id: camera_model(camera) for camera_id, camera in solution.cameras.items()}
     keys = {camera_id: f"v2 aeromatch {camera_id} {m['width']} {m['height']} brown" for camera_id, m in models.items()}
     write(partial / "camera_models.json", _json({keys[camera_id]: model for camera_id, model in models.items()}))
@@ -115,7 +123,7 @@ def _write_metadata(partial: Path, contents: ExportContents, solution: Solution)
             "projection_type": "brown", "focal_ratio": model["focal_x"], "orientation": 1, "capture_time": 0.0,
             "camera": keys[image.camera_id], "skey": "", "gps": gps.get(image.image_id, {}),
         }  # fmt: skip
-        write(partial / "exif" / f"{image.name}.exif", _json(exif))
+        write(partial / "exif" / f"{names[image.image_id]}.exif", _json(exif))
     means = (
         [float(np.mean([place[key] for place in gps.values()])) for key in ("latitude", "longitude")]
         if gps

@@ -18,7 +18,8 @@ class Solution:
     """Cameras and poses after adjustment, else as the block has them.
 
     images: all, sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> ((3, 3) cam_from_world, (3,)
-    centre in the world); images without attitude are absent.
+    centre in the world); images without attitude are absent, and of a block with a CRS those of groups that no position
+    has placed in it.
     """
 
     images: tuple[Image, ...]
@@ -29,7 +30,8 @@ class Solution:
     def of(cls, contents: ExportContents) -> Solution:
         block, adjusted = contents.block, contents.adjusted
         if adjusted is not None:
-            poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items()}
+            aside = {} if contents.geographic is None else adjusted.frames
+            poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items() if i not in aside}
             return cls(block.images, adjusted.cameras, poses)
         given = {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
         return cls(block.images, block.cameras, given)

@@ -35,7 +35,7 @@ from aeromatch_cli.strategies.enhancers.tone import Tone
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path
 from trainings.blocks import IMAGES, LEFT_OUT, render
-from trainings.runs import at_least_one, load_state, save_state
+from trainings.runs import at_least_one, check_recipe, load_state, save_state
 
 WIDTHS = (16, 24, 40, 56, 64)
 PIECE_PX, BATCH = 160, 12
@@ -264,6 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--start", type=Path, metavar="STATE", help="state.pt of another run to start from")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(arguments)
+    check_recipe(parser, args, ("blocks", "steps", "rate", "start"))
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     folders = [render(args.out / "blocks", block_idx) for block_idx in range(args.blocks)]
