@@ -358,6 +358,7 @@ def test_matches_are_exported_where_the_adjustment_fails(done_site: Site, monkey
     outcome = done_site("run", "--overwrite")
     assert outcome.code == 1
     assert done_site.failures() == [("adjust", "all images")]
+    assert outcome.facts["stages"]["adjust"]["facts"]["images"] == 0  # not those of the adjustment before
     export = done_site.work / "export" / "colmap"
     assert (export / "database.db").is_file()
     assert not (export / "orientation.csv").exists()

@@ -166,6 +166,17 @@ def test_a_fisheye_lens_is_named(tmp_path: Path, focal_35mm: int, fisheye: bool)
     assert any("probably a fisheye lens" in warning for warning in warnings) == fisheye
 
 
+def test_names_of_cameras_that_the_file_has_none_of_are_not_used(tmp_path: Path) -> None:
+    """Our own orientation.csv names cameras as the program calls them."""
+    write_image(tmp_path / "images" / "a.jpg")
+    camera = {"model": "SIMPLE_RADIAL", "width": 40, "height": 30, "params": [50, 20, 15, 0.01]}
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": {"wide": camera}}))
+    (tmp_path / "poses.csv").write_text("image,x,y,z,camera\na.jpg,1,2,9,canon_5.2mm_40x30\n")
+    inputs = read_inputs(tmp_path / "images", tmp_path / "poses.csv", cameras=str(tmp_path / "cameras.json"))
+    assert [image.camera_id for image in inputs.images] == ["wide"]
+    assert any("none of the cameras that the pose list names (canon_5.2mm_40x30)" in w for w in inputs.warnings)
+
+
 def test_a_camera_file_of_a_hundred_thousand_brackets_is_refused(tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text('{"cameras":' + "[" * 100_000)
     with pytest.raises(ConfigError, match="nested too deeply"):

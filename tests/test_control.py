@@ -156,6 +156,17 @@ def test_geographic_points_are_brought_to_the_blocks_crs(tmp_path: Path) -> None
     np.testing.assert_allclose(points[0].position_m[:2], expected, atol=1e-6)
 
 
+def test_names_of_images_are_paths_first(tmp_path: Path) -> None:
+    images = (Image("a--1_jpg", "a/1.jpg", 100, 80, "1"), Image("b--1_jpg", "b/1.jpg", 100, 80, "1"),
+              Image("1_jpg", "1.jpg", 100, 80, "1"), Image("b--2_jpg", "b/2.jpg", 100, 80, "1"))  # fmt: skip
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("EPSG:32633\n1 2 3 4 5 1.jpg p\n1 2 3 4 5 a/1.jpg p\n1 2 3 4 5 2.jpg p\n")
+    ((point,), remarks) = read_control(str(path), images, "EPSG:32633", ORIGIN_M)
+    assert (set(point.pixels), remarks) == ({"1_jpg", "a--1_jpg", "b--2_jpg"}, [])
+    with pytest.raises(ConfigError, match=r"several images are called 1\.jpg: write paths"):
+        read_control(str(path), images[:2], "EPSG:32633", ORIGIN_M)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

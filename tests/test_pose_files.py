@@ -311,6 +311,27 @@ def test_a_crs_with_its_shift_to_wgs84_is_the_crs_itself(tmp_path: Path) -> None
     assert "1 of 2 images have no estimated position there" in found.warnings[0]
 
 
+def test_folders_tell_images_of_one_name_apart(tmp_path: Path) -> None:
+    """Absolute paths of another machine, as ContextCapture writes them."""
+    photo = "<Photo><ImagePath>D:\\flight\\{}\\1.JPG</ImagePath>"
+    photo += "<Pose><Center><x>{}</x><y>2</y><z>3</z></Center></Pose></Photo>"
+    photos = photo.format("100MEDIA", 1) + photo.format("101MEDIA", 2)
+    text = (
+        f"<BlocksExchange><Block><Photogroups><Photogroup>{photos}</Photogroup></Photogroups></Block></BlocksExchange>"
+    )
+    found = read_pose_file(write(tmp_path, "blocks.xml", text))
+    rows, _ = matched_rows(found, ["100MEDIA/1.JPG", "101MEDIA/1.JPG"], "list")
+    assert {name: row.position[0] for name, row in rows.items() if row.position} == {
+        "100MEDIA/1.JPG": 1.0, "101MEDIA/1.JPG": 2.0
+    }  # fmt: skip
+
+
+def test_a_line_of_points_is_no_image(tmp_path: Path) -> None:
+    points = "512 300.5 -1 700 200 17 900 100 5 40.5 41.5 -1"  # ten columns, the last with a point: as an image's line
+    model = write(tmp_path, "sparse/images.txt", f"1 1 0 0 0 0 0 0 1 A.jpg\n{points}\n2 1 0 0 0 5 0 0 1 B.jpg\n\n")
+    assert [row.image for row in read_pose_file(model.parent).rows] == ["A.jpg", "B.jpg"]
+
+
 def test_our_own_exports_are_read_with_their_crs(tmp_path: Path) -> None:
     """orientation.csv counts in the CRS, the COLMAP model from the origin that world.json names."""
     write(tmp_path, "world.json", '{"crs": "EPSG:32633", "origin_m": [391000.0, 5818000.0, 0.0]}')

@@ -242,8 +242,11 @@ def test_replaced_masks_redo_the_images_that_they_mask(done_site):
     with np.load(Workspace(done_site.work).features(done_site.names()[0].replace(".", "_"))) as archive:
         assert archive["keypoints_px"][:, 0].min() > 95
     cv2.imwrite(str(masks / f"{done_site.names()[0]}.png"), 255 - mask)
-    assert done_site("run", "--masks", masks).counts("extract") == (1, IMAGES - 1, 0)
+    outcome = done_site("run", "--masks", masks)
+    assert (outcome.counts("orient"), outcome.counts("extract")) == ((IMAGES, 0, 0), (1, IMAGES - 1, 0))
     assert done_site("run", "--masks", masks).done() == {}
+    # The masks count, not where they lie.
+    assert done_site("orient", "--masks", masks.rename(masks.with_name("moved"))).counts("orient") == (0, IMAGES, 0)
 
 
 def test_overwrite_redoes_everything(done_site):

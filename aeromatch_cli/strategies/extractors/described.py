@@ -27,8 +27,8 @@ def keypoints_field(default: int) -> Any:
     return Field(
         default,
         ge=1,
-        description="Number of descriptors per image over all its views; fewer only where the image, or what halving "
-        "leaves of it, has fewer. A keypoint with two orientations counts twice, as in OpenCV and COLMAP. With "
+        description="Number of descriptors per image over all its views; fewer only where fewer are found, in the "
+        "halved image where it is halved. A keypoint with two orientations counts twice, as in OpenCV and COLMAP. With "
         "enhance.keep_source the source image and the enhanced one have this number each; distant ground "
         "(simulate.far_ground) has as many more for each pixel, this number at most. Larger: more matches, more time.",
     )
