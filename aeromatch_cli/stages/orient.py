@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -196,7 +197,7 @@ def _before(context: Context, kept: set[str], record: Mapping[str, Any]) -> Befo
 
 def _prints(context: Context) -> tuple[dict[str, str], str]:
     """Fingerprints of what was given of every image, and of the settings: what the orientation depends on."""
-    block, settings = context.block, context.settings
+    block, settings, of_file = context.block, context.settings, cache(image_fingerprint)  # one mask may be that of all
     images = {}
     for image in block.images:
         pose = block.poses.get(image.image_id)
@@ -204,7 +205,7 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         if pose is not None:
             place = pose.center_m, pose.world_rotation, pose.sigma_position_m, pose.sigma_angle_deg
         mask = mask_path(settings.block.masks, image.name)
-        taken = context.image_fingerprints[image.image_id], image.time, image_fingerprint(mask) if mask else ""
+        taken = context.image_fingerprints[image.image_id], image.time, of_file(mask) if mask else ""
         images[image.image_id] = fingerprint(
             taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
             context.likely_focals.get(image.camera_id),
