@@ -105,7 +105,8 @@ def understood(words: list[str], *, whole: bool) -> None:
 
 def valid_configuration(given: dict[str, Any]) -> None:
     source = given["config"]
-    if source in (None, *PLACEHOLDERS) or Path(source).suffix in (".yaml", ".yml"):
+    source = "auto" if source is None else source
+    if source in PLACEHOLDERS or Path(source).suffix in (".yaml", ".yml"):
         source = "baseline"  # its own settings are the reader's; what is set beside them must exist
     assert source in preset_names()
     names = ("images", "poses", "cameras", "crs", "ground", "masks")
