@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import Features, FloatArray, Pair
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.stages import extract
@@ -22,7 +23,8 @@ class Preset:
 
     An image's features are made by the extract stage (decoding, enhancement, views, writing and reading of its file
     included), a pair's matches by the preset's matcher and its chain of filters, on verified pairs only. Nothing runs
-    in other processes; libraries use the benchmark's threads.
+    in other processes; libraries use the benchmark's threads. Distant ground, which peers on ground views do not see,
+    has no keypoints of its own, so that the budget is exact.
     """
 
     def __init__(self, scene: Scene, options: Options, *, preset: str, settings: tuple[str, ...]) -> None:
@@ -30,6 +32,8 @@ class Preset:
         work = Path(self._folder.name)
         budget = [] if options.budget == "image" else [f"extract.budget={options.budget}"]
         own = [f"extract.keypoints={options.keypoints}", *budget, *settings]
+        if hasattr(load(preset, own).simulate, "far_ground") and not any("far_ground" in one for one in settings):
+            own.append("simulate.far_ground=false")
         places = scene.images, scene.poses, scene.block, work / "work"
         chosen = prepared(preset, own, *places, seed=options.seed)
         names = {image.image_id: image.name for image in chosen.block.images}
