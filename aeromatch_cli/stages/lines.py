@@ -189,7 +189,7 @@ def _control_words(control: Mapping[str, Any] | None) -> list[str]:
     counts = f"control: {control['control']} control points, {control['check']} check points"
     if control["points"] and len(control["not_measured_in_two_images"]) == control["points"]:
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
-    apart = control["rays_do_not_meet"]
+    apart = control.get("rays_do_not_meet")  # of earlier versions not
     wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
     if control["control_rmse_m"] is None:
         return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare", *wrong]
