@@ -96,7 +96,7 @@ def draw_quality(path: Path, rows: Sequence[Row]) -> None:
         scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         scale.set_major_formatter("{x:g}")
         scale.set_minor_formatter(NullFormatter())
-    axis.set_xlabel("seconds per pair: features, matching, verification")
+    axis.set_xlabel("seconds per pair, orientation left out")
     axis.set_ylabel("correct matches per pair")
     figure.tight_layout()
     _label(axis, points, ours)
