@@ -62,6 +62,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
         failures.append(ScanFailure(name, f"folder cannot be read ({error.strerror}): check its permissions", True))
 
     passed_over = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
+    files_passed_over = {path for path in passed_over if Path(path).is_file()}
     visited = set(passed_over)
     for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(parent)
@@ -81,7 +82,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
             if Path(name).suffix.lower() not in SUFFIXES:
                 continue
             path = Path(parent) / name
-            if os.path.realpath(path) in passed_over:
+            if files_passed_over and os.path.realpath(path) in files_passed_over:
                 continue
             relative = path.relative_to(folder).as_posix()
             failure = _failure_of(path, relative)

@@ -125,11 +125,13 @@ def rows_of(args: argparse.Namespace) -> Iterator[Row]:
                 given = f"-{args.poses}" if ours and args.poses != _NOISY else ""
                 folder = args.out / "runs" / f"{judged.scene.name}-{flight}-{seed}-{method}{given}"
                 path = folder / "rows.json"
-                if not path.is_file() or read_json(path).get("asked") != asked:
+                known = read_json(path) if path.is_file() else {}
+                if known.get("asked") != asked:
                     found = preset_rows(args, judged, method, folder) if ours else peer_rows(args, judged, method)
                     folder.mkdir(parents=True, exist_ok=True)
-                    write_json(path, {"asked": asked, "rows": found})
-                for row in read_json(path)["rows"]:
+                    known = {"asked": asked, "rows": found}
+                    write_json(path, known)
+                for row in known["rows"]:
                     yield {"seed": seed, "flight": flight, "scene": judged.scene.name, "method": method, **row}
     args.seed = first
 
