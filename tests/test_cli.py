@@ -233,6 +233,14 @@ def test_json_is_the_last_line_even_of_errors(site):
         assert invoke(*arguments).facts["exit_code"] == 2
 
 
+def test_the_environment_asks_for_json_as_the_option_does(monkeypatch):
+    monkeypatch.setenv("AEROMATCH_JSON", "1")
+    for arguments in (("run", "--job", "3"), ("run", "baseline", "--jobs", "many")):
+        assert json.loads(invoke(*arguments).stdout.splitlines()[-1])["exit_code"] == 2
+    monkeypatch.setenv("AEROMATCH_JSON", "0")
+    assert invoke("run", "--job", "3").stdout == ""
+
+
 def test_a_defect_is_no_success_and_leaves_a_traceback_in_the_log(site, monkeypatch):
     from aeromatch_cli.stages import run
 

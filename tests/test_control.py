@@ -20,7 +20,7 @@ from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.stages import adjust
-from aeromatch_cli.stages.lines import _control_words
+from aeromatch_cli.stages.lines import control_words
 from aeromatch_cli.synthetic import load_truth
 
 IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
@@ -113,7 +113,7 @@ def test_a_point_whose_rays_meet_behind_the_cameras_is_named_and_left_out(truth:
     assert max(left["control_rmse_m"]) < 1e-6
     assert left["reprojection_error_px"] < 1e-3
     assert json.dumps(left, allow_nan=False)
-    assert _control_words(left)[1].startswith("rays do not meet of p100: ")
+    assert control_words(left)[1].startswith("rays do not meet of p100: ")
 
 
 def test_two_points_determine_nothing(truth: Truth) -> None:

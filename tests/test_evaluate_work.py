@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -142,7 +143,21 @@ def test_a_workspace_judged_by_poses_alone(work: Path, rendered: Path, tmp_path:
     # An image without reference pose is left out, and said so.
     *listed, last = (tmp_path / "poses.csv").read_text().splitlines()
     (tmp_path / "poses.csv").write_text("\n".join(listed) + "\n")
-    assert evaluate_workspace(work, tmp_path, mapping=False).left_out == (last.split(",")[0],)
+    without = evaluate_workspace(work, tmp_path, mapping=False)
+    assert without.left_out == (last.split(",")[0],)
+    assert dict(summary_rows(without))["truth"] == f"reference, {IMAGES - 1} images (1 left out: no reference pose)"
+    # Mapping takes it all the same.
+    mapped = dict(summary_rows(replace(without, consumer=evaluation.consumer)))
+    assert mapped["mapping"] == f"{evaluation.consumer['registered']} of {IMAGES} images in one model"
+
+
+def test_an_export_of_earlier_matches_is_not_mapped(work: Path, rendered: Path, tmp_path: Path) -> None:
+    shutil.copytree(work, tmp_path / "later")
+    report = tmp_path / "later" / "reports" / "filter.json"
+    later_s = report.stat().st_mtime + 3600.0
+    os.utime(report, (later_s, later_s))
+    consumer = evaluate_workspace(tmp_path / "later", rendered).consumer
+    assert consumer == {"skipped": "the export is of earlier matches: run aeromatch export"}
 
 
 def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tmp_path: Path) -> None:

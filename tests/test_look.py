@@ -106,6 +106,9 @@ def test_show_reads_files(done_site: Site) -> None:
     assert "float32" in arrays
     facts = invoke("show", done_site.work / "block.json").stdout
     assert '"crs": "local"' in facts
+    # Other programs' files have no checksum.
+    exported = invoke("show", done_site.work / "export" / "colmap" / "world.json")
+    assert (exported.code, '"origin_m"' in exported.stdout) == (0, True), exported.stderr
 
 
 @pytest.mark.slow
@@ -158,17 +161,24 @@ def test_list_has_every_preset_and_strategy() -> None:
     found = {line.split()[0] for line in lines if line.startswith("  ")}
     assert set(preset_names()) - {"default"} <= found
     assert {name for table in FAMILIES.values() for name in table} <= found
-    assert "  nearest *" in "\n".join(lines)
+    # What `run` takes without a preset's name.
+    for starred in ("nearest", "epipolar", "learned"):
+        assert any(line.startswith(f"  {starred} *") for line in lines)
+    assert not any(line.startswith("  poselib *") for line in lines)
+    filters = invoke("list", "filter", "--json").facts["families"]["filter"]
+    assert [one["name"] for one in filters if one["default"]] == ["epipolar"]
     assert invoke("list", "matcher").code == 2
 
 
 def test_init_writes_settings_for_what_it_sees(tmp_path: Path) -> None:
+    # Longer than a line of YAML.
+    tmp_path = tmp_path / "flights of the afternoon, camera one: oblique views" / "and of the evening"
     images = tmp_path / "photos"
-    images.mkdir()
+    images.mkdir(parents=True)
     for name in ("a.jpg", "b.jpg"):
         Image.new("RGB", (40, 30)).save(images / name)
     (tmp_path / "geo.txt").write_text("EPSG:32633\na.jpg 500000 4600000 100\nb.jpg 500010 4600000 100\n")
-    path = tmp_path / "block.yaml"
+    path = tmp_path.parent.parent / "block.yaml"
     outcome = invoke("init", path, "--images", images)
     assert outcome.code == 0, outcome.stderr
     assert "2 images" in outcome.stdout
@@ -186,6 +196,9 @@ def test_init_writes_settings_for_what_it_sees(tmp_path: Path) -> None:
 def test_show_takes_the_workspace_of_the_environment(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AEROMATCH_WORKSPACE", str(done_site.work))
     assert invoke("show", "--json").facts["workspace"] == str(done_site.work)
+    assert invoke("show", done_site.names()[0], "--json").facts["image"] == done_site.names()[0]
+    # A file of that name, in the folder of the images, is no file of the workspace.
+    monkeypatch.chdir(done_site.images)
     assert invoke("show", done_site.names()[0], "--json").facts["image"] == done_site.names()[0]
 
 

@@ -14,7 +14,7 @@ from PIL import Image as PilImage
 from read_html import Structure, shapes
 
 from aeromatch_cli.blocks.ground import ConstantGround
-from aeromatch_cli.config import Settings
+from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import Block, Camera, Features, Image, Matches, Pair, Pose, Verdict
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.executor import Executor
@@ -23,6 +23,7 @@ from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
 from aeromatch_cli.report import gathering
 from aeromatch_cli.report import page as report
+from aeromatch_cli.report.adjustment import Adjustment, adjustment_notices
 from aeromatch_cli.report.gathering import Gathered, gather
 from aeromatch_cli.report.pair_viewer import pair_table
 from aeromatch_cli.report.previews import chosen_previews
@@ -202,6 +203,41 @@ def test_images_tell_their_views_and_shadow(full):
     assert (of_b.views, of_b.shadow) == (2, 0.34)
 
 
+def test_images_tell_the_views_that_the_steps_of_a_cascade_made(full):
+    cascaded = replace(full, settings=full.settings.model_copy(update={"cascade": load("auto").cascade}))
+    write_json(full.workspace.step("first", "first").views("b"), {"views": [{"name": "ground"}]})
+    write_json(full.workspace.step("learned", "learned").enhanced("b", ".json"), {"shadow_share": 0.2})
+    of_b = gather(cascaded).images[1]
+    assert (of_b.views, of_b.shadow) == (1, 0.2)
+
+
+def test_an_adjustment_of_earlier_matches_is_left_out_and_named(full):
+    told = StageReport("adjust", items=4, done=4)
+    told.facts = {"images": 4, "points": 77, "remarks": ["a remark"], "outside": {}, "control": None}
+    told.write(full.workspace)
+    page = page_of(full)
+    assert "Adjustment and points are older than the matches" in page
+    assert "a remark" not in page
+    assert ">77 in" not in page
+
+
+def test_control_points_that_say_nothing_are_named():
+    control = {"points": 4, "control": 4, "check": 0, "not_measured_in_two_images": ["p3", "p4"], "doubtful": [],
+               "rays_do_not_meet": ["p2"], "control_rmse_m": None, "check_rmse_m": None}  # fmt: skip
+    (notice,) = adjustment_notices([], Adjustment({"control": control}))
+    assert "fewer than 3 are measured in two oriented images" in notice.text
+    assert "rays do not meet of p2" in notice.text
+
+
+def test_a_frame_of_its_own_has_no_metres(full):
+    oriented = StageReport("orient", items=4, done=4)
+    oriented.facts = {"frame": "own"}
+    oriented.write(full.workspace)
+    page = page_of(full)
+    assert "x, arbitrary units" in page
+    assert "metres" not in page.split('id="settings"')[0].replace("no metre", "")
+
+
 def test_page_shows_headline_tables_and_reasons(full):
     page = page_of(full)
     words = Structure.of(page).words()
@@ -343,8 +379,13 @@ def test_shards_are_summed_per_stage(tmp_path):
         path = one.workspace.stage_report("match", f"{index}-of-2")
         counts = {"seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1}
         write_json(path, {"stage": "match", **counts, "facts": {}, "failures": []})
+        write_json(
+            one.workspace.step("first", "first").stage_report("match", f"{index}-of-2"),
+            {"stage": "match", **counts, "facts": {}, "failures": []},
+        )
     (row,) = stage_rows(one.workspace)
-    assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 3.0, 20, 18, 2)
+    # Of the shards' own folders and of the steps of a cascade.
+    assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 6.0, 40, 36, 4)
 
 
 def pair_row(index: int, state: str, matches: int, ids: tuple[str, str] = ("a", "b")) -> PairRow:
@@ -378,7 +419,7 @@ def test_large_block_stays_a_small_page(tmp_path):
         if k + step < 1000
     ]
     rows = [ImageRow(i, f"{i[:-4]}.jpg", "", "full", 4000, 20, 14, 5000, 0.8) for i in ids]
-    page = report.render(large, Gathered(pairs, rows, {}))
+    page = report.render(large, Gathered(pairs, rows, {}), Adjustment())
     Structure.of(page)
     assert len(page.encode()) < 3_000_000
     assert page.count("<tr>") < 3100

@@ -106,6 +106,12 @@ def test_pictures_beside_the_page_are_made_once_and_stale_files_go(large: Contex
     assert sorted(path.name for path in (folder / "pairs").iterdir()) == ["0.js", "1.js"]
 
 
+def test_images_beyond_the_guard_of_pillow_have_thumbnails(full: Context, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    """Pillow refuses more than twice so many pixels; cameras for mapping have frames of 300 megapixels."""
+    monkeypatch.setattr(PilImage, "MAX_IMAGE_PIXELS", 100)
+    assert thumbnails._small(full.image_path(full.block.images[1]), 32).shape[1] <= 32
+
+
 def test_a_thumbnail_is_the_raster_as_stored(full: Context) -> None:  # noqa: F811
     pictures = thumbnails.thumbnails(full)
     assert pictures["b"].shape[:2] == (HEIGHT, WIDTH)  # although viewers turn it

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import sys
 from typing import Annotated, Any
 
@@ -32,7 +33,7 @@ class _Commands(TyperGroup):
             # Commands leave by typer.Exit and have said it already; what else exits with 2 is the parser.
             if (
                 stop.code == ConfigError.exit_code
-                and "--json" in given
+                and ("--json" in given or _stated_by_environment())
                 and not isinstance(stop.__context__, typer.Exit)
             ):
                 typer.echo(json.dumps(_wrong_arguments(stop.__context__) | {"exit_code": stop.code}))
@@ -43,6 +44,11 @@ class _Commands(TyperGroup):
         written = list(args)  # parsing uses them up
         options["obj"] = {ARGUMENTS: written}
         return super().make_context(info_name, args, *rest, **options)
+
+
+def _stated_by_environment() -> bool:
+    """Whether AEROMATCH_JSON asks for a JSON line: words that click takes for yes."""
+    return os.environ.get("AEROMATCH_JSON", "").strip().lower() in {"1", "true", "t", "yes", "y", "on"}
 
 
 def _wrong_arguments(error: BaseException | None) -> dict[str, Any]:

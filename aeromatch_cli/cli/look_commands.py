@@ -70,8 +70,8 @@ def show(
         names = images or []
         given = os.environ.get("AEROMATCH_WORKSPACE")
         root = path or Path(given or Settings().workspace)
-        if path is not None and given and not path.exists():
-            # The first word is an image of the workspace that the environment names.
+        if path is not None and given and not _is_shown(path):
+            # The first word is an image of the workspace that the environment names, perhaps in the images' folder.
             root, names = Path(given), [str(path), *names]
         if len(names) > 2:
             raise ConfigError(f"{len(names)} images: name one, or the two of a pair")
@@ -82,6 +82,11 @@ def show(
         return Result(tuple(found.lines), found.facts)
 
     guarded(call, "show", quiet=quiet, as_json=json_, log_file=None, context=context)
+
+
+def _is_shown(path: Path) -> bool:
+    """Whether it is a workspace or a file of one."""
+    return path.is_dir() or (path.is_file() and path.suffix.lower() in (".npz", ".json", ".csv"))
 
 
 def compare(

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _SHARES = {"orient": 0.3, "pairs": 0.05, "extract": 0.15, "match": 0.25, "filter": 0.03, "refine": 0.05,
            "adjust": 0.13, "consistency": 0.02, "export": 0.01, "report": 0.02}  # fmt: skip
 RUN_STAGES = tuple(_SHARES)
+# A shard ends there: what follows needs the whole block.
+SHARD_STAGES = RUN_STAGES[: RUN_STAGES.index("filter") + 1]
 
 
 def progress_shown(quiet: bool, stages: Sequence[str] = ()) -> Progress:

@@ -34,7 +34,7 @@ from aeromatch_cli.cli.options import (
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
-from aeromatch_cli.cli.progress import RUN_STAGES, progress_shown
+from aeromatch_cli.cli.progress import RUN_STAGES, SHARD_STAGES, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -177,7 +177,8 @@ def stage_command(name: str) -> Callable[..., None]:
                 run=as_texts(run),
                 workspace=_absolute(workspace),
             )
-            shown = progress_shown(quiet, RUN_STAGES if name == "run" else ())
+            course = SHARD_STAGES if shard else RUN_STAGES
+            shown = progress_shown(quiet, course if name == "run" else ())
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)

@@ -15,9 +15,9 @@ from aeromatch_cli.blocks.pose_files.source import Source
 from aeromatch_cli.blocks.poses import read_poses
 from aeromatch_cli.blocks.scan import KINDS, scan_images
 from aeromatch_cli.config.faults import nearest
-from aeromatch_cli.config.load import differences_of_preset, preset_names
+from aeromatch_cli.config.load import differences_of_preset, load, preset_names
 from aeromatch_cli.config.schema import FAMILIES, Settings
-from aeromatch_cli.config.text import first_sentence
+from aeromatch_cli.config.text import first_sentence, scalar
 from aeromatch_cli.errors import ConfigError, InputError
 
 _PRESETS = "presets"
@@ -41,7 +41,7 @@ def listing(family: str = "") -> list[str]:
     for name, strategies in found["families"].items():
         title = f"{name}: --set {name}={strategies[0]['name']}"
         lines += ["", title, *_table({f"{s['name']} *" if s["default"] else s["name"]: s["words"] for s in strategies})]
-    return [*lines, "", f"* default (preset {DEFAULT_PRESET} adds a cascade)"] if not family else lines
+    return lines if family == _PRESETS else [*lines, "", f"* used by default (preset {DEFAULT_PRESET})"]
 
 
 def choices(family: str = "") -> dict[str, Any]:
@@ -55,8 +55,11 @@ def choices(family: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     if family in ("", _PRESETS):
         found["presets"] = [{"name": name, "words": words} for name, words in _purposes().items()]
+    used = load(DEFAULT_PRESET)
     found["families"] = {
-        name: [{"name": key, "words": first_sentence(table[key]), "default": key in _chosen(name)} for key in table]
+        name: [
+            {"name": key, "words": first_sentence(table[key]), "default": key in _names(used, name)} for key in table
+        ]
         for name, table in FAMILIES.items()
         if family in ("", name)
     }
@@ -69,8 +72,9 @@ def _purposes() -> dict[str, str]:
     return {name: differences_of_preset(name)[0] for name in order}
 
 
-def _chosen(family: str) -> set[str]:
-    value = getattr(Settings(), family)
+def _names(settings: Settings, family: str) -> set[str]:
+    """Of the strategies that settings take of a family."""
+    value = getattr(settings, family)
     return {one.name for one in (value if isinstance(value, tuple) else (value,))}
 
 
@@ -160,7 +164,7 @@ def _settings_text(
 ) -> str:
     located = any(fact.latitude_deg is not None for fact in facts)
     chosen = poses[0][0] if poses else "exif" if located else "none"
-    others = "".join(f"  # poses: {_scalar(path)}  # {title}\n" for path, title in poses[1:])
+    others = "".join(f"  # poses: {scalar(path)}  # {title}\n" for path, title in poses[1:])
     seen = "".join(f"#   {line}\n" for line in found)
     return f"""# Settings of aeromatch for one block: aeromatch run FILE. Paths are relative to this file.
 {seen}
@@ -169,11 +173,11 @@ preset: {DEFAULT_PRESET}
 workspace: work
 
 block:
-  images: {_scalar(images)}
+  images: {scalar(images)}
   # A pose file of any program, exif (GPS and angles of the images), or none.
-  poses: {_scalar(chosen)}
+  poses: {scalar(chosen)}
 {others}  # exif, folder (one camera per folder), or a file: COLMAP's cameras.txt, YAML, JSON.
-  cameras: {_scalar(cameras)}
+  cameras: {scalar(cameras)}
   # auto: the UTM zone of the positions, or what the pose file states.
   crs: auto
   # Metres, a DEM file, or auto: the terrain that the pictures show.
@@ -189,12 +193,6 @@ block:
 export: colmap
 # export: colmap+opensfm+geojson
 """
-
-
-def _scalar(text: str) -> str:
-    import yaml
-
-    return yaml.safe_dump(text, default_flow_style=True, allow_unicode=True).splitlines()[0].strip()
 
 
 def whole_settings(tree: Mapping[str, Any]) -> str:

@@ -149,7 +149,7 @@ class Settings(_Section):
     """The whole tree."""
 
     workspace: str = Field("aeromatch-work", min_length=1, description="Folder for every result; made if missing.")
-    seed: int = Field(0, ge=0, description="Seed of everything random.")
+    seed: int = Field(0, ge=0, description="Seed of the estimators that verify pairs.")
     block: BlockSettings = Field(BlockSettings(), description="What was flown: images, poses, cameras, ground.")
     run: RunSettings = Field(RunSettings(), description="How it is run. Nothing here changes a result.")
     orient: _choice(ORIENTERS) = Field(  # type: ignore[valid-type]

@@ -93,7 +93,9 @@ def _indented(lines: Any) -> list[str]:
 def scalar(value: Any) -> str:
     """A setting's value as YAML on one line."""
     plain = list(value) if isinstance(value, tuple) else value
-    return yaml.safe_dump(plain, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+    return (
+        yaml.safe_dump(plain, default_flow_style=True, allow_unicode=True, width=10_000).removesuffix("...\n").strip()
+    )
 
 
 if __name__ == "__main__":

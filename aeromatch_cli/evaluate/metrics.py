@@ -18,7 +18,7 @@ AUC_THRESHOLDS_DEG = (1.0, 3.0, 5.0, 10.0)
 # The estimator behind every pose error, the same for all methods.
 POSE_THRESHOLD_PX, POSE_SEED, _MIN_POSE_MATCHES = 2.0, 0, 8
 _POSE_ITERATIONS = (200, 5000)
-# Below this share of the flying distance a baseline has no direction to be wrong about.
+# A shorter baseline has no direction to be wrong about.
 _NO_BASELINE_M = 1e-9
 
 

@@ -85,8 +85,9 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
     """(metric, value) of the whole block, for people."""
     figures, consumer = total(evaluation.pairs), evaluation.consumer
     share = f"{figures['pairs_verified']:.0f} of {figures['pairs']:.0f}"
+    left_out = f" ({len(evaluation.left_out)} left out: no reference pose)" if evaluation.left_out else ""
     rows = [
-        ("truth", f"{evaluation.truth_kind}, {evaluation.images} images"),
+        ("truth", f"{evaluation.truth_kind}, {evaluation.images} images{left_out}"),
         ("pairs verified", f"{share} ({figures['pairs_not_tried']:.0f} not tried)"),
         (f"pairs with {ENOUGH_CORRECT} correct", _shown(figures[f"pairs_with_{ENOUGH_CORRECT}_correct"])),
         ("kept matches", _shown(figures["kept"])),
@@ -105,9 +106,11 @@ def summary_rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         ("correct in shadow", _shown(figures["correct_in_shadow"])),
         ("wrong at its border", _shown(figures["wrong_at_border"])),
     ]
-    rows += _mapping_rows("mapping", consumer, evaluation.images)
+    # Mapping takes all images of the export, also those without truth.
+    images = evaluation.images + len(evaluation.left_out)
+    rows += _mapping_rows("mapping", consumer, images)
     if "global" in consumer:
-        rows += _mapping_rows("global mapping", consumer["global"], evaluation.images)
+        rows += _mapping_rows("global mapping", consumer["global"], images)
     return rows
 
 

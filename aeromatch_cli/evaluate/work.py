@@ -81,10 +81,19 @@ def evaluate_workspace(
     finally:
         progress.stop()
     consumer: Mapping[str, Any] = {"skipped": "not asked for"}
-    if mapping:
+    if mapping and _export_is_older(workspace):
+        consumer = {"skipped": "the export is of earlier matches: run aeromatch export"}
+    elif mapping:
         consumer = map_both(workspace.export("colmap") / "database.db", truth.images_folder)
     seconds = time.monotonic() - started
     return Evaluation(work, truth_folder, truth.kind, len(images), left_out, tuple(rows), consumer, seconds)
+
+
+def _export_is_older(workspace: Workspace) -> bool:
+    """Whether stages before the export ran after it."""
+    made = workspace.stage_report("export")
+    before = [workspace.stage_report(stage) for stage in ("filter", "refine", "consistency")]
+    return made.is_file() and any(p.is_file() and p.stat().st_mtime > made.stat().st_mtime for p in before)
 
 
 def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockTruth, truth_folder: Path) -> None:

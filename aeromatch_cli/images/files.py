@@ -70,7 +70,7 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
     import cv2
 
-    _check_size(path)
+    check_size(path)
     try:
         data = path.read_bytes()
         if fault := _png_fault(data):
@@ -85,9 +85,9 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-def _check_size(path: Path) -> None:
+def check_size(path: Path) -> None:
     """Raises ItemError for a picture that is too large to decode, by its header: a file of some kilobytes may claim
-    any size."""
+    any size. To be called before Pillow opens a picture, too."""
     from PIL import Image
 
     # Pillow's own guard refuses a mapping camera's frame; nothing is decoded here.

@@ -51,6 +51,14 @@ def new_axes(
         return figure.add_subplot()
 
 
+def name_ground_axes(axes: Any, *, in_world: bool) -> None:
+    """in_world: else in a frame of the pictures' own, where neither north nor a metre is known."""
+    if in_world:
+        axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
+    else:
+        axes.set(xlabel="x, arbitrary units", ylabel="y, arbitrary units")
+
+
 def label_width(values: Iterable[float]) -> float:
     """Points that the axis label and the tick labels of metres need beside a vertical axis that shows these values."""
     return 32.0 + 6.4 * max(len(f"{value:.0f}") for value in values)

@@ -32,6 +32,7 @@ from aeromatch_cli.images.remote import RemoteFile
 from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
 from aeromatch_cli.report.stretches import made_of, stretches
+from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import match_points
@@ -96,8 +97,9 @@ class _Found:
         seen[cells[:, 0], cells[:, 1]] = True
 
 
-def gather(context: Context, draw: Draw | None = None) -> Gathered:
-    """Everything about pairs and images. Raises WorkspaceError where a file is broken."""
+def gather(context: Context, draw: Draw | None = None, spread: Mapping[str, Sequence[int]] | None = None) -> Gathered:
+    """Everything about pairs and images. spread: image_id -> its ninths with a point, empty ones, points of three
+    images. Raises WorkspaceError where a file is broken."""
     found = _Found()
     for stretch in _stretches(context, draw):
         found.add(stretch)
@@ -106,7 +108,7 @@ def gather(context: Context, draw: Draw | None = None) -> Gathered:
     for place, row in enumerate(pairs):
         taken, reasons = steps.get((row.image_id0, row.image_id1), ("", ""))
         pairs[place] = replace(row, steps=taken, step_reasons=reasons)
-    return Gathered(pairs, _image_rows(context, pairs, found), found.drawn)
+    return Gathered(pairs, _image_rows(context, pairs, found, spread or {}), found.drawn)
 
 
 def _stretches(context: Context, draw: Draw | None) -> list[_Found]:
@@ -172,9 +174,9 @@ def _keypoints(context: Context, image_id: str) -> FloatArray | None:
         return None
 
 
-def _image_rows(context: Context, pairs: Sequence[PairRow], found: _Found) -> list[ImageRow]:
-    report = context.workspace.stage_report("consistency")
-    spread = read_json(report)["facts"].get("spread", {}) if report.is_file() else {}
+def _image_rows(
+    context: Context, pairs: Sequence[PairRow], found: _Found, spread: Mapping[str, Sequence[int]]
+) -> list[ImageRow]:
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     tied: Counter[str] = Counter()
     matches: Counter[str] = Counter()
@@ -182,7 +184,7 @@ def _image_rows(context: Context, pairs: Sequence[PairRow], found: _Found) -> li
         if row.state == "verified":
             tied.update((row.image_id0, row.image_id1))
             matches.update({row.image_id0: row.verified, row.image_id1: row.verified})
-    images = []
+    images, made_in = [], makers(context.settings, context.workspace)
     for image in context.block.images:
         if image.image_id not in found.keypoints:
             points = _keypoints(context, image.image_id)
@@ -199,15 +201,15 @@ def _image_rows(context: Context, pairs: Sequence[PairRow], found: _Found) -> li
                 verified_pairs=tied[image.image_id],
                 verified_matches=matches[image.image_id],
                 coverage=None if keypoints is None else 0.0 if seen is None else float(seen.mean()),
-                views=_fact(context.workspace.views(image.image_id), "views", len),
-                shadow=_fact(context.workspace.enhanced(image.image_id, ".json"), "shadow_share", float),
+                views=_fact([one.views(image.image_id) for one in made_in], "views", len),
+                shadow=_fact([one.enhanced(image.image_id, ".json") for one in made_in], "shadow_share", float),
                 **dict(zip(_SPREAD, spread.get(image.image_id, ()), strict=False)),
             )
         )
     return images
 
 
-# The columns of the report of consistency.
+# The columns of `spread`.
 _SPREAD = "ninths", "empty_ninths", "points_of_three"
 
 
@@ -226,10 +228,13 @@ def _lack(row: Mapping[str, str]) -> str:
     return f"in the end: {row['lacks']}" if row["lacks"] else ""
 
 
-def _fact(path: Path, key: str, of: Callable[[Any], T]) -> T | None:
-    """One fact of a JSON file of the workspace, None where the stage that writes it left none."""
-    facts = read_json(path) if path.is_file() else {}
-    return of(facts[key]) if key in facts else None
+def _fact(paths: Sequence[Path], key: str, of: Callable[[Any], T]) -> T | None:
+    """One fact of the first of these JSON files that states it, None where the stage that writes them left none."""
+    for path in paths:
+        facts = read_json(path) if path.is_file() else {}
+        if key in facts:
+            return of(facts[key])
+    return None
 
 
 def _pair_row(context: Context, pair: Pair, entry: VerifiedEntry | None) -> PairRow:

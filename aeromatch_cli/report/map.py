@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.report.figures import COLOURS, evenly_chosen, label_width, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, evenly_chosen, label_width, name_ground_axes, new_axes, svg
 
 MAP_CLASSES = 6
 # Above this many pairs their lines lose the tooltips and are joined into one path per colour; above the second they are
@@ -168,10 +168,9 @@ def _frame(stations: Sequence[Station], footprints: Sequence[FloatArray]) -> Any
 
 def _name_axes(axes: Any, in_world: bool) -> None:
     """Their names, and an arrow to the north where that is known."""
+    name_ground_axes(axes, in_world=in_world)
     if not in_world:
-        axes.set(xlabel="x, arbitrary units", ylabel="y, arbitrary units")
         return
-    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
     arrow = {"arrowstyle": "-|>", "color": COLOURS["ink"]}
     where = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center", "color": COLOURS["ink"]}
     axes.annotate("N", (0.975, 0.985), (0.0, -38.0), arrowprops=arrow, zorder=5, **where)

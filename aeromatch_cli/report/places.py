@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, FloatArray, IntArray
-from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, histogram_axes, label_width, name_ground_axes, new_axes, svg
 
 # Cells along the longer side of the ground, of the overlap count; and of the points, as many as their number allows.
 _FINE, _COARSE = 160, (6, 40)
@@ -25,16 +25,17 @@ _MANY_IMAGES = 20
 
 @dataclass(frozen=True)
 class Ground:
-    """What is drawn of the world: corners (2,) in metres."""
+    """What is drawn of the world: corners (2,) in metres. in_world: else in a frame without north and metres."""
 
     low_m: FloatArray
     high_m: FloatArray
+    in_world: bool = True
 
     @classmethod
-    def of(cls, centers_m: FloatArray, footprints: Sequence[FloatArray]) -> Ground:
+    def of(cls, centers_m: FloatArray, footprints: Sequence[FloatArray], *, in_world: bool = True) -> Ground:
         """Cameras (N, 2) and half a footprint around them: views of the horizon would shrink all else."""
         size = float(np.median([np.ptp(polygon, axis=0).max() for polygon in footprints]))
-        return cls(centers_m.min(axis=0) - 0.5 * size, centers_m.max(axis=0) + 0.5 * size)
+        return cls(centers_m.min(axis=0) - 0.5 * size, centers_m.max(axis=0) + 0.5 * size, in_world)
 
     def cells(self, longest: int) -> tuple[int, int]:
         """Columns and rows."""
@@ -60,12 +61,13 @@ class Ground:
 
 
 def ground_figures(
-    centers_m: FloatArray, footprints: Sequence[FloatArray], adjusted: AdjustedBlock | None
+    centers_m: FloatArray, footprints: Sequence[FloatArray], adjusted: AdjustedBlock | None, *, in_world: bool = True
 ) -> list[tuple[str, str]]:
-    """(SVG, remark) of the overlap count and, of an adjusted block, of its points per place. centers_m: (N, 2)."""
+    """(SVG, remark) of the overlap count and, of an adjusted block, of its points per place. centers_m: (N, 2).
+    in_world: else in a frame of the pictures' own."""
     if not footprints or not len(centers_m):
         return []
-    ground = Ground.of(centers_m, footprints)
+    ground = Ground.of(centers_m, footprints, in_world=in_world)
     count = ground.shown_by(footprints, _FINE)
     seen = count > 0
     share = 100.0 * (count >= _WELL_SEEN).sum() / max(1, seen.sum())
@@ -126,7 +128,7 @@ def _field(ground: Ground, values: FloatArray, known: BoolArray, label: str, mar
         bar.ax.yaxis.set_minor_formatter("")
     else:
         bar.locator = MaxNLocator(integer=True)
-    axes.set(xlabel="x (east), metres", ylabel="y (north), metres")
+    name_ground_axes(axes, in_world=ground.in_world)
     axes.set_title(label, fontsize=10)
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.grid(visible=False)

@@ -116,12 +116,17 @@ class EvaluationFigures:
 
 
 def stage_rows(workspace: Workspace) -> list[StageRow]:
-    """Last run of every stage in the order of the chain; the shards of one stage are summed."""
+    """Last run of every stage in the order of the chain; the shards of one stage are summed, over all steps of a
+    cascade, whose shards report in the folders of the steps."""
     groups: dict[tuple[str, bool], list[dict[str, Any]]] = {}
-    for path in sorted(workspace.reports.glob("*.json")):
-        sharded = re.fullmatch(r".+\.\d+-of-\d+", path.stem) is not None
+    shards: dict[str, set[str]] = {}
+    in_steps = (workspace.root / "steps").glob("*/reports/*-of-*.json")
+    for path in (*sorted(workspace.reports.glob("*.json")), *sorted(in_steps)):
+        shard = re.fullmatch(r".+\.(\d+-of-\d+)", path.stem)
         report = read_json(path)
-        groups.setdefault((str(report["stage"]), sharded), []).append(report)
+        groups.setdefault((str(report["stage"]), shard is not None), []).append(report)
+        if shard:
+            shards.setdefault(str(report["stage"]), set()).add(shard[1])
 
     order = {name: place for place, name in enumerate(STAGE_ORDER)}
     rows = []
@@ -134,7 +139,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         items, done, skipped, failed = (
             sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
         )
-        label = f"{name} ({len(reports)} shards)" if sharded else name
+        label = f"{name} ({len(shards[name])} shards)" if sharded else name
         facts = "" if sharded else _facts_words(reports[0]["facts"])
         rows.append(StageRow(label, seconds, items, done, skipped, failed, facts))
     return rows

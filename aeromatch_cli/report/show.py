@@ -29,6 +29,7 @@ from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import STAGE_ORDER
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
+from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
@@ -108,9 +109,13 @@ class _Work:
     def keypoints_px(self, image_id: str) -> FloatArray:
         return read_final_keypoints(self.workspace.features(image_id), self.workspace.refined(image_id))
 
+    @cached_property
+    def _final(self) -> FinalEntries:
+        return FinalEntries(self.workspace)
+
     def final(self, pair: Pair) -> VerifiedEntry | None:
         found = read_verified_row(self.workspace.verified(pair.image_id0)).get(pair.image_id1)
-        return None if found is None else FinalEntries(self.workspace)(pair.image_id0, found)
+        return None if found is None else self._final(pair.image_id0, found)
 
 
 def show(
@@ -211,9 +216,10 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     for count, name, state, overlap in sorted(rows, key=lambda row: (-row[0], row[1]))[:_LISTED]:
         share = "overlap unknown" if np.isnan(overlap) else f"overlap {100 * overlap:.0f} %"
         lines.append(f"            {name}: {count} matches, {state}, {share}")
-    for what, path in (("enhanced", workspace.enhanced(image_id, ".png")), ("views", workspace.views(image_id))):
-        if path.exists():
-            lines.append(f"{what:<11} {path}")
+    for made in makers(work.settings, workspace):
+        for what, path in (("enhanced", made.enhanced(image_id, ".png")), ("views", made.views(image_id))):
+            if path.exists():
+                lines.append(f"{what:<11} {path}")
     target = out or _own_file(workspace, f"{image_id}.png")
     picture = image_picture(read_pixels(work.picture(image), colour=True), keypoints, matched)
     tiles = [Tile("keypoints: in verified matches green, others red", picture)]
@@ -303,7 +309,7 @@ def _file_lines(path: Path) -> Iterator[str]:
                 array = archive[name]
                 yield f"{name:<28} {array.dtype!s:<10} {array.shape}{_range(array)}"
     elif suffix == ".json":
-        yield from json.dumps(read_json(path), indent=2, ensure_ascii=False).splitlines()
+        yield from json.dumps(_stated(path), indent=2, ensure_ascii=False).splitlines()
     elif suffix == ".csv":
         rows = read_csv(path)
         yield f"{len(rows)} rows"
@@ -313,6 +319,13 @@ def _file_lines(path: Path) -> Iterator[str]:
             yield f"{name:<20} {len(values)} different: {often}"
     else:
         raise ConfigError(f"{path}: show reads .npz, .json and .csv files of a workspace, and workspaces")
+
+
+def _stated(path: Path) -> Any:
+    """Contents of a JSON file: the workspace's own with their checksum, exported ones have none."""
+    with readable(path, ValueError):
+        value = json.loads(path.read_text(encoding="utf-8"))
+    return read_json(path) if isinstance(value, dict) and "checksum" in value else value
 
 
 def _range(array: Any) -> str:

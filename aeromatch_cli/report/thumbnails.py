@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import write_atomically
-from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.images.files import check_size, read_pixels
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink
 from aeromatch_cli.report.previews import data_uri, jpeg, to_colour8, turned
@@ -168,6 +168,7 @@ def _small(path: Path, side_px: int) -> NDArray[np.uint8]:
     if path.suffix.lower() in _JPEG_SUFFIXES:
         from PIL import Image as PilImage
 
+        check_size(path)
         try:
             with PilImage.open(path) as picture:
                 if picture.mode in ("RGB", "L"):

@@ -43,8 +43,7 @@ _FEW_KEYPOINTS = 0.1
 def run(context: Context) -> StageReport:
     """Write adjusted.npz, adjusted.json and orientation.csv where they are not up to date."""
     report = StageReport("adjust", items=len(context.block.images))
-    recipe = context.settings.orient
-    groups = orient.groups(context) if isinstance(recipe, FirstPass) else []
+    recipe, groups = context.settings.orient, _groups(context)
     if not groups:
         report.items, report.facts = 0, {"images": 0, "remarks": [_NOTHING] if isinstance(recipe, FirstPass) else []}
         _remove(context)
@@ -72,12 +71,29 @@ def run(context: Context) -> StageReport:
 
 def adjusted_block(context: Context) -> AdjustedBlock | None:
     """What is on file for the present results; None without orientation, or where no image could be adjusted."""
-    groups = orient.groups(context) if isinstance(context.settings.orient, FirstPass) else []
-    made_now = replace(context, overwrite=False)
-    if not groups or _on_file(made_now).get("fingerprint") != _fingerprint(context, groups):
+    if not _is_current(context, _groups(context)):
         return None
     found = read_adjusted(context.workspace.adjusted)
     return found if found.poses else None
+
+
+def is_current(context: Context) -> bool:
+    """Whether the adjustment on file is of the pairs whose results are up to date; also where there is none of these,
+    False."""
+    groups = _groups(context)
+    try:
+        return bool(groups) and _is_current(with_current_pairs(context)[0], groups)
+    except InputError:  # no pair has results
+        return False
+
+
+def _groups(context: Context) -> Sequence[Group]:
+    return orient.groups(context) if isinstance(context.settings.orient, FirstPass) else []
+
+
+def _is_current(context: Context, groups: Sequence[Group]) -> bool:
+    made_now = replace(context, overwrite=False)
+    return bool(groups) and _on_file(made_now).get("fingerprint") == _fingerprint(context, groups)
 
 
 def current_fingerprint(context: Context) -> str:

@@ -38,6 +38,7 @@ from aeromatch_cli.strategies.matchers.lightglue.matcher import LightGlue
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.simulators.plane import PlaneViews
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows, Step
+from aeromatch_cli.workspace import Workspace
 
 # The first step of every cascade.
 FIRST = "first"
@@ -193,6 +194,14 @@ def _untied(left: Mapping[Key, str], enough: Iterable[Key]) -> dict[Key, str]:
         settled.setdefault(id0, set()).add(id1)
         settled.setdefault(id1, set()).add(id0)
     return {key: reason for key, reason in left.items() if not settled.get(key[0], set()) & settled.get(key[1], set())}
+
+
+def makers(settings: Settings, workspace: Workspace) -> list[Workspace]:
+    """Where views and features are made: the workspace itself, or a cascade's first step and those with their own."""
+    if not settings.cascade:
+        return [workspace]
+    names = FIRST, *(recipe.name for recipe in settings.cascade if recipe.own_features)
+    return [workspace.step(name, name) for name in names]
 
 
 def further(context: Context) -> list[StepContext]:

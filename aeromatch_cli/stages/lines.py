@@ -145,7 +145,7 @@ def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     if len(facts["groups"]) > 1:
         sizes = ", ".join(str(group["images"]) for group in facts["groups"])
         words.append(f"{len(facts['groups'])} groups of images, each oriented by itself: {sizes}")
-    words += _control_words(facts["control"])
+    words += control_words(facts["control"])
     words += facts["remarks"]
     outside = list(facts["outside"].items())
     words += [f"not oriented: {names.get(image_id, image_id)}: {reason}" for image_id, reason in outside[:10]]
@@ -182,7 +182,7 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     return [f"          {words}; {facts['verified_matches']} verified matches are left{right}", *lines]
 
 
-def _control_words(control: Mapping[str, Any] | None) -> list[str]:
+def control_words(control: Mapping[str, Any] | None) -> list[str]:
     """Errors at surveyed points."""
     if control is None:
         return []

@@ -1,0 +1,134 @@
+"""report: what the bundle adjustment found, as the page says it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.files import read_json
+from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.orientation.control import offset_words
+from aeromatch_cli.report.rows import ImageRow
+from aeromatch_cli.stages import adjust
+from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.lines import control_words
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something a person must see. level: "bad" or "warn". items: names, MAX_LISTED of them shown."""
+
+    level: str
+    title: str
+    text: str
+    items: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """What the stages adjust and consistency state of the present matches; nothing where they state it of earlier ones.
+    in_world: else the frame is the pictures' own, and no length in it is a metre."""
+
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    judged: Mapping[str, Any] = field(default_factory=dict)
+    outdated: bool = False
+    in_world: bool = True
+
+    @property
+    def spread(self) -> Mapping[str, Sequence[int]]:
+        """image_id -> ninths with a point, empty ones, points of three images and more."""
+        return dict(self.judged.get("spread", {}))
+
+
+def read_adjustment(context: Context) -> Adjustment:
+    facts = stage_facts(context, "adjust")
+    in_world = stage_facts(context, "orient").get("frame") != "own"
+    if facts.get("points") and not adjust.is_current(context):
+        return Adjustment(outdated=True, in_world=in_world)
+    return Adjustment(facts, stage_facts(context, "consistency"), in_world=in_world)
+
+
+def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | None:
+    """The adjusted block with the points that final matches hold; None where the last adjustment found none."""
+    path = context.workspace.final_or_adjusted
+    return read_adjusted(path) if adjustment.facts.get("points") and path.is_file() else None
+
+
+def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> list[Notice]:
+    """Images that the bundle adjustment does not hold, images whose adjusted poses their matches contradict, and what
+    else it found."""
+    if adjustment.outdated:
+        text = "Run aeromatch adjust, or aeromatch run: what they tell is of earlier matches, and is left out here."
+        return [Notice("warn", "Adjustment and points are older than the matches", text)]
+    names, adjusted = {row.image_id: row.name for row in images}, adjustment.facts
+    found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
+    control = adjusted.get("control")
+    if control and (control["control_rmse_m"] is None or control.get("rays_do_not_meet")):
+        # What the section below cannot show.
+        found.append(Notice("warn", "Note on the control points", ". ".join(control_words(control))))
+    outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
+    doubtful = adjustment.judged.get("doubtful", ())
+    if outside:
+        text = "Their matches are exported, but they have no adjusted pose and see no point."
+        found.insert(0, Notice("bad", counted(len(outside), "image", "images") + " not oriented", text, outside))
+    if doubtful:
+        title = counted(len(doubtful), "adjusted pose is doubtful", "adjusted poses are doubtful")
+        text = "Too many verified matches of these images contradict their adjusted poses."
+        found.insert(0, Notice("bad", title, text, tuple(names.get(i, i) for i in doubtful)))
+    return found
+
+
+def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
+    """Figures of the bundle adjustment, and of the control points."""
+    facts = adjustment.facts
+    if not facts.get("points"):
+        return []
+    length = "m" if adjustment.in_world else "units of the frame"
+    found = [
+        ("Oriented images", f"{facts['images']:,}"),
+        ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
+        ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
+    ]
+    units = ("sigma_position_m", length), ("sigma_angle_deg", "degrees")
+    sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
+    if sigmas:
+        found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
+    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts.get("cameras", {}).items()}
+    if cameras:
+        found.append(("Cameras after the adjustment", camera_words(cameras)))
+    control = facts["control"]
+    if control and control["control_rmse_m"]:
+        found.append(("Control points", f"{control['control']}; {offset_words(control)}"))
+        found.append(("Control points after a similarity", f"RMSE {_metres(control['control_rmse_m'])}"))
+        if control["check_rmse_m"]:
+            kind = f"{control['check']} check points" if control["check"] else "Control points, each left out once"
+            found.append((f"{kind}, after it", f"RMSE {_metres(control['check_rmse_m'])}"))
+        if control["doubtful"]:
+            found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
+    return found
+
+
+def _metres(errors_m: Sequence[float]) -> str:
+    return " / ".join(f"{error:.3f}" for error in errors_m) + " m (x / y / z)"
+
+
+def counted(count: int, one: str, several: str) -> str:
+    return f"{count:,} {one if count == 1 else several}"
+
+
+def camera_words(cameras: Mapping[str, Camera]) -> str:
+    """One camera a line: its model, size and parameters."""
+    words = []
+    for camera_id, camera in sorted(cameras.items()):
+        params = ", ".join(f"{value:g}" for value in camera.params)
+        words.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
+    more = [f"and {len(words) - 10} more"] if len(words) > 10 else []
+    return "\n".join(words[:10] + more)
+
+
+def stage_facts(context: Context, stage: str) -> dict[str, Any]:
+    """What a stage left in its report."""
+    path = context.workspace.stage_report(stage)
+    return dict(read_json(path)["facts"]) if path.is_file() else {}
