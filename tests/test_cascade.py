@@ -13,11 +13,14 @@ from conftest import IMAGES, Site
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdict
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.formats.features import read_joined, read_keypoints
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_row
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
+from aeromatch_cli.stages import extract, filter  # noqa: A004
 from aeromatch_cli.stages.cascade import _tried, _untied, keypoints_of, strategies_of
 from aeromatch_cli.stages.evidence import Evidence
+from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.union import joined_keypoints, joined_matches
 from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows
@@ -231,6 +234,65 @@ def test_guided_search_takes_the_first_steps_keypoints_and_replaces_its_matches(
 def _report(site: Site, step: str, stage: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((site.work / "steps" / step / "reports" / f"{stage}.json").read_text())
     return found
+
+
+@pytest.mark.slow
+def test_a_pair_that_a_step_cannot_verify_is_a_failure_that_the_next_run_mends(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = ("--set", "cascade=guided", "--set", "cascade.guided.below_matches=100000")
+    judge = filter._judge
+
+    def broken(task: Any, pair: Any, entry: Any) -> Any:
+        if "steps" in task.workspace.root.parts and task.image_id0 == "suburb_0001_jpg":
+            raise ItemError("on purpose")
+        return judge(task, pair, entry)
+
+    monkeypatch.setattr(filter, "_judge", broken)
+    outcome = site("run", *settings)
+    assert outcome.code == 1, outcome.stderr
+    assert {item.partition(" ")[0] for stage, item in site.failures() if stage == "match"} == {"suburb_0001_jpg"}
+    assert "on purpose" in outcome.stderr
+    monkeypatch.undo()
+    mended = site("run", *settings)
+    assert mended.code == 0, mended.stderr
+    assert site.failures() == []
+    verified = {path.name: path.read_bytes() for path in (site.work / "verified").glob("*.npz")}
+    other = site.another_workspace("whole")
+    assert site("run", *settings, "--workspace", other).code == 0
+    assert {path.name: path.read_bytes() for path in (other / "verified").glob("*.npz")} == verified
+
+
+@pytest.mark.slow
+def test_a_failure_in_one_step_counts_no_image_as_less_than_none(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ("--set", "cascade=shadow", "--set", "cascade.shadow.below_matches=100000")
+    settings += ("--set", "cascade.shadow.keypoints=200")
+    made = extract.run_task
+
+    def broken(task: Any) -> Any:
+        if task.path.parent.parent.name == "shadow" and task.image_id == "suburb_0002_jpg":
+            raise ItemError("on purpose")
+        return made(task)
+
+    monkeypatch.setattr(extract, "run_task", broken)
+    outcome = site("run", *settings)
+    assert outcome.code == 1, outcome.stderr
+    # Its keypoints are those of the first step.
+    assert outcome.counts("extract") == (IMAGES, 0, 1)
+
+
+@pytest.mark.slow
+def test_a_shard_of_a_cascade_makes_its_own_images_first_and_no_others_than_its_pairs(site: Site) -> None:
+    settings = ("--set", "cascade=shadow", "--set", "cascade.shadow.below_matches=100000", "--set", "orient=none")
+    settings += ("--set", "cascade.shadow.keypoints=200", "--set", "pairs=sequential", "--set", "pairs.window=1")
+    for part in ("1/3", "2/3"):
+        assert site("run", *settings, "--shard", part).code == 0
+    shard = Shard.parse("2/3")
+    with (site.work / "pairs.csv").open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if shard.owns(row["image_id0"])]
+    wanted = {row[key] for row in rows for key in ("image_id0", "image_id1")}
+    report = json.loads((site.work / "steps" / "shadow" / "reports" / "extract.2-of-3.json").read_text())
+    assert report["items"] == len(wanted) < IMAGES
 
 
 @pytest.mark.slow

@@ -24,6 +24,10 @@ def test_changed_settings_and_the_first_stage_that_reads_them_are_named(tmp_path
     assert auto.endswith("from pairs on")
     jobs = load("baseline", ["extract.keypoints=4000", "run.jobs=7"], {"images": str(tmp_path)})
     assert changed_words(config, jobs) == ""
+    surveyed = load("baseline", ["extract.keypoints=4000"], {"images": str(tmp_path), "gcp": str(tmp_path / "g.txt")})
+    assert changed_words(config, surveyed).endswith("from adjust on")
+    seeded = load("baseline", ["extract.keypoints=4000", "seed=3"], {"images": str(tmp_path)})
+    assert changed_words(config, seeded).endswith("from filter on")
     config.write_text("{", encoding="utf-8")
     assert changed_words(config, now) == ""
 

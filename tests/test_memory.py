@@ -9,8 +9,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.stages.memory import budget_mb, jobs_within, worker_mb
-from aeromatch_cli.stages.pairs import runs_network
+from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network, worker_mb
 
 
 def image(width: int, height: int) -> Image:

@@ -63,10 +63,11 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
 
 - `fingerprint`: of the inputs and settings. `images`: fingerprint of what was given of every image. `settings`: of the
   rest. `files`: SHA-256 of the other files.
-- `facts`: `method` (`given`: the given poses explain the matches; `pictures`: a mapper oriented the block),
+- `facts`: `poses_from` (`given poses`: they explain the matches; `pictures`: a mapper oriented the block),
   `images_matched`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`,
-  `turned_back`: images that the mapper had turned over), `by_one_pair`
+  `turned_back`: images that the mapper had turned over), `calibrated` (cameras whose
+  parameters a mapper found), `stopped` (why mapping failed; it is tried again), `by_one_pair`
   (images placed by one pair and their position), `further_first_passes` (where the block fell into parts, or positions
   did not fit: `with` what, images of the largest model before, `images`, and of the new one, `images_then`, and whether
   that was `used`), `wrong_attitudes`

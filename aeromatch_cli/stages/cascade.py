@@ -133,10 +133,10 @@ def run(context: Context) -> list[StepContext]:
         own = step.context
         own.workspace.create()
         # All images in the first step: what failed there is told of those, too, that are in no pair.
-        ids = match.images_of_rows(own) if step.name == FIRST else step.images
+        ids = match.images_of_rows(own) if step.name == FIRST else match.paired_images(own)
         # Features of the first step are made once, also where everything is made anew.
         making = own if step.own_features else replace(own, overwrite=False)
-        reports = [extract.run(making, ids), match.run(own), filter.run(own)]
+        reports = [extract.run_own_first(making, ids), match.run(own), filter.run(own)]
         for report in reports:
             report.part = own.part
         done.append(replace(step, reports=tuple(reports)))

@@ -13,8 +13,9 @@ from aeromatch_cli.errors import ConfigError
 
 # Most settings that are named.
 _NAMED = 4
-# Section of the settings -> the first stage that reads it; others, as `run`, change no result.
+# Section of the settings, or setting -> the first stage that reads it; others, as `run`, change no result.
 _FIRST_STAGE = {
+    "block.gcp": "adjust",
     "block": "orient",
     "orient": "orient",
     "pairs": "pairs",
@@ -43,18 +44,19 @@ def changed_words(config: Path, settings: Settings) -> str:
     changed = [
         (key, old, new)
         for key, new, old in differing(yaml.safe_load(dump(settings)), before)
-        if _section(key) in _FIRST_STAGE and _resolved(old) != _resolved(new)
+        if _stage(key) and _resolved(old) != _resolved(new)
     ]
     if not changed:
         return ""
     named = ", ".join(f"{key} {said_value(old)} -> {said_value(new)}" for key, old, new in changed[:_NAMED])
     more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
-    first = min((_FIRST_STAGE[_section(key)] for key, *_ in changed), key=_ORDER.index)
+    first = min((_stage(key) for key, *_ in changed), key=_ORDER.index)
     return f"{named}{more}: what depends on it is made again, from {first} on"
 
 
-def _section(key: str) -> str:
-    return key.partition(".")[0]
+def _stage(key: str) -> str:
+    """The first that reads a setting; "" where it changes no result."""
+    return _FIRST_STAGE.get(key) or _FIRST_STAGE.get(key.partition(".")[0], "")
 
 
 def _resolved(value: Any) -> Any:

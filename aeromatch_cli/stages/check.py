@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.data import Features, Image, Pair
+from aeromatch_cli.data import Features, Pair
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
-from aeromatch_cli.stages.memory import worker_mb
+from aeromatch_cli.stages.memory import command_mb, runs_network
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
@@ -122,7 +122,7 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     sampled = _sample(context)
     ids = {image_id for pair in sampled for image_id in (pair.image_id0, pair.image_id1)}
     trials = [_Trial(extract.make_task(context, image), image.image_id in ids) for image in images]
-    largest_px = max(_pixels(image, trial) for image, trial in zip(images, trials, strict=True))
+    largest_px = max(map(_pixels, trials))
     outcomes = context.executor.run(_try_image, trials, "check")
     failures = tuple((i.name, o.error) for i, o in zip(images, outcomes, strict=True) if o.value is None)
     timed = {
@@ -192,13 +192,14 @@ def _sample(context: Context) -> list[Pair]:
     return [context.pairs[(2 * k + 1) * len(context.pairs) // (2 * count)] for k in range(count)]
 
 
-def _pixels(image: Image, trial: _Trial) -> int:
-    """What an image is worked on as: its own pixels, or those of all its views."""
+def _pixels(trial: _Trial) -> int:
+    """What an image is worked on as: its own pixels, reduced as the settings ask, or those of all its views."""
     views = simulate.views_of(trial.task.views)
     enhancing = trial.task.views.enhance
     if enhancing.enhancer.keep_source and not enhancing.skipped:
         views *= 2
-    return max(image.width_px * image.height_px, sum(view.width_px * view.height_px for view in views))
+    working = enhancing.source.working_camera
+    return max(working.width_px * working.height_px, sum(view.width_px * view.height_px for view in views))
 
 
 def _time_pairs(context: Context, sampled: Sequence[Pair], timed: Mapping[str, _Tried]) -> list[_Tried]:
@@ -226,6 +227,7 @@ def _estimate(
 ) -> dict[str, Any]:
     """largest_px: of the image, or its views, that needs most memory. images, pairs: the sampled ones."""
     count, jobs = len(context.block.images), context.executor.jobs
+    stored_px = max(image.width_px * image.height_px for image in context.block.images)
     seconds_image = _mean([tried.seconds for tried in images.values()])
     seconds_pair = _mean([tried.seconds for tried in pairs])
     descriptors = max((len(tried.features.descriptors) for tried in images.values() if tried.features), default=0)
@@ -242,7 +244,9 @@ def _estimate(
         "seconds_per_image": round(seconds_image, 3) if images else None,
         "seconds_per_pair": round(seconds_pair, 4),
         "seconds": round(seconds, 1) if images else None,
-        "memory_mb": round(worker_mb(largest_px / 1e6) * jobs),
+        "memory_mb": round(
+            command_mb(jobs, largest_px / 1e6, network=runs_network(context.settings), stored=stored_px / 1e6)
+        ),
         "disk_mb": round(disk / 1e6, 1),
         "disk_free_mb": round(shutil.disk_usage(_existing(context.workspace.root)).free / 1e6),
     }

@@ -45,6 +45,7 @@ def run(context: Context) -> StageReport:
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None and _judges_pairs(context):
+        context, _ = with_current_pairs(context)
         adjusted = AdjustedBlock.empty()
     if adjusted is None or not isinstance(recipe, BlockConsistency):
         report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}

@@ -73,10 +73,14 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
     return fingerprint(matcher, context.searched_by, library_version("poselib"), sides, overlap)
 
 
+def paired_images(context: Context) -> set[str]:
+    """Every image whose features the rows of this shard need."""
+    return {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
+
+
 def images_of_rows(context: Context) -> set[str]:
-    """Every image whose features the rows of this shard need, and the images of the shard itself."""
-    paired = {i for pairs in context.rows().values() for p in pairs for i in (p.image_id0, p.image_id1)}
-    return paired | {image.image_id for image in context.images()}
+    """The same, and the images of the shard itself."""
+    return paired_images(context) | {image.image_id for image in context.images()}
 
 
 def make_tasks(context: Context) -> list[MatchTask]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
+from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 
@@ -31,6 +32,12 @@ def worker_mb(megapixels: float, *, network: bool = False, stored: float = 0.0) 
     return _BASE_MB + pixels + (_NETWORK_MB if network else 0.0)
 
 
+def command_mb(jobs: int, megapixels: float, *, network: bool = False, stored: float = 0.0) -> float:
+    """Peak of a command with its workers, as for `worker_mb`; a single worker is the command's own process."""
+    each = worker_mb(megapixels, network=network, stored=stored)
+    return _PARENT_MB + (jobs * each if jobs > 1 else each - _BASE_MB)
+
+
 def budget_mb(text: str) -> float | None:
     """Megabytes of "8GB", "512MB", "8 GiB"; None for no budget. Raises ConfigError."""
     if not text.strip():
@@ -40,6 +47,11 @@ def budget_mb(text: str) -> float | None:
     if match is None or unit is None or not float(match[1]) > 0.0:
         raise ConfigError(f"memory {text!r}: write a number with its unit, MB or GB, such as 8GB or 6000MB")
     return float(match[1]) * unit
+
+
+def runs_network(settings: Settings) -> bool:
+    """Whether some worker may run one."""
+    return settings.extract.network or settings.match.network or any(step.own_features for step in settings.cascade)
 
 
 def jobs_within(

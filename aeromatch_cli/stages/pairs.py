@@ -20,7 +20,7 @@ from aeromatch_cli.stages import orient
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import orientation_lines
-from aeromatch_cli.stages.memory import budget_mb, jobs_within
+from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
@@ -118,11 +118,6 @@ def _with_ground(context: Context, found: BlockRead) -> Context:
     if block.ground is None and found.ground_hint is not None:
         block = replace(block, ground=found.ground_hint[0], ground_source=found.ground_hint[1])
     return replace(context, block=with_gsd(block, found.gsd_before_m))
-
-
-def runs_network(settings: Settings) -> bool:
-    """Whether some worker may run one."""
-    return settings.extract.network or settings.match.network or any(step.own_features for step in settings.cascade)
 
 
 def _within_memory(settings: Settings, executor: Executor, block: Block) -> list[str]:

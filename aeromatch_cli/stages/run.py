@@ -39,6 +39,7 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
+from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import Workspace, locked
 
@@ -296,14 +297,10 @@ def _current_page(workspace: Workspace, *, settings: bool = True) -> StageReport
 
 
 def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
-    """Of a shard, images of other shards come after its own: by then another machine may have done them."""
     if context.settings.cascade:
         context, reports = _cascaded(context)
         return context, reports if context.shard is not None else [*reports, filter.run(context)]
-    features = extract.run(context)
-    if context.shard is not None:
-        others = match.images_of_rows(context) - {image.image_id for image in context.images()}
-        features = extract.run(replace(context, overwrite=False), others, features)
+    features = extract.run_own_first(context, match.images_of_rows(context))
     return context, [features, match.run(context), filter.run(context)]
 
 
@@ -331,6 +328,7 @@ def _result(
         lines.append(f"report    {workspace.report} is of an earlier run: `aeromatch report` makes it anew")
     if command in ("run", "export") and not part:
         lines += [f"export    {workspace.export(e.name)}" for e in settings.export]
+        lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
     if failures:
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
     facts = {
@@ -339,6 +337,13 @@ def _result(
         "failures": len(failures),
     }
     return Result(tuple(lines), facts, failures)
+
+
+def _left(workspace: Workspace, settings: Settings) -> list[Path]:
+    """Folders of exporters that the settings no longer name."""
+    wanted = {exporter.name for exporter in settings.export}
+    folders = sorted(workspace.exports.parent.glob("*"))
+    return [folder for folder in folders if folder.name in EXPORTERS and folder.name not in wanted]
 
 
 def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:

@@ -50,7 +50,8 @@ class StageReport:
     def write(self, context_workspace: Workspace, shard: Shard | None = None) -> StageReport:
         """Close the clock, write the report and gather failures.csv from all stages.
 
-        A stage that made nothing, and fails where it failed before, leaves that report, with its timing.
+        A stage that made nothing, and fails where it failed before, leaves that report, with its timing; not where a
+        shard has failed since, which this one supersedes.
         """
         self.seconds = round(time.perf_counter() - self.started, 3)
         value = {
@@ -65,19 +66,12 @@ class StageReport:
             "failures": [list(failure) for failure in self.failures],
         }
         path = context_workspace.stage_report(self.stage, shard.label if shard else "")
-        if not self._says_nothing_new(path):
+        if not self._says_nothing_new(path) or (shard is None and _shard_failed_since(path)):
             write_json(path, value)
         gather_failures(context_workspace)
         for item, reason in self.failures if self.stage != "orient" else ():  # its first pass has named them
             log.warning("%s: %s: %s", self.stage, item, reason)
         return self
-
-    def absorb(self, earlier: StageReport, workspace: Workspace) -> StageReport:
-        """Count what an earlier pass of the same command did as done by this one, and write the sum."""
-        self.done = min(self.items - len(self.failures), self.done + earlier.done)
-        self.skipped = self.items - len(self.failures) - self.done
-        self.started -= earlier.seconds
-        return self.write(workspace)
 
     def _says_nothing_new(self, path: Path) -> bool:
         if self.done or not path.is_file():
@@ -88,6 +82,13 @@ class StageReport:
         failures = [list(failure) for failure in self.failures]
         known = [old.get(key) for key in ("failures", "fingerprint", "facts")]
         return known == [failures, self.fingerprint, self.facts]
+
+
+def _shard_failed_since(path: Path) -> bool:
+    """Whether a shard's report of the stage of this whole report is newer and names failures."""
+    made_ns = path.stat().st_mtime_ns
+    shards = path.parent.glob(f"{path.stem}.*-of-*.json")
+    return any(one.stat().st_mtime_ns > made_ns and read_json(one).get("failures") for one in shards)
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:

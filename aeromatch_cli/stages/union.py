@@ -112,28 +112,30 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     report = StageReport("extract", items=len(context.block.images))
     _count_seconds(report, steps, ["extract"])
     report.failures = _failures(steps, "extract")
-    tasks = []
+    tasks, joined = [], 0
     usable = _usable(steps)
     for image in context.block.images:
         image_id = image.image_id
         own = [step for step, ready in usable if image_id in ready]
+        joined += bool(own)
         wanted = context.union.features[image_id]
         if own and (context.overwrite or known_fingerprint(context.workspace.features(image_id)) != wanted):
             paths = tuple((step.name, step.context.workspace.features(image_id)) for step in own)
             tasks.append(KeypointsTask(image_id, paths, context.workspace, wanted))
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
-    report.skipped = report.items - report.done - len(report.failures)
+    # An image that fails in one step has the keypoints of the others.
+    report.skipped = joined - len(tasks)
     report.facts = {"images_by_step": {step.name: len(step.images) for step in steps if step.own_features}}
     report.fingerprint = fingerprint(sorted(context.union.features.values()))
     return report.write(context.workspace)
 
 
-def _failures(steps: Sequence[StepContext], stage: str) -> list[tuple[str, str]]:
-    """Of all steps, each item once."""
+def _failures(steps: Sequence[StepContext], *stages: str) -> list[tuple[str, str]]:
+    """Of these stages of all steps, each item once."""
     found: dict[str, str] = {}
     for step in steps:
         for one, item, reason in gather_failures(step.context.workspace):
-            if one == stage:
+            if one in stages:
                 found.setdefault(item, reason if step.name == cascade.FIRST else f"{step.name}: {reason}")
     return sorted(found.items())
 
@@ -204,9 +206,11 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
         if context.overwrite or row_fingerprints(context.workspace.matches(task.image_id0)) != dict(task.pairs)
     ]
     counts = run_stage(context, report, join_row, todo, [task.image_id0 for task in todo])
-    report.done = sum(len(task.pairs) for task in todo)
-    report.skipped = report.items - report.done
-    report.failures += _failures(steps, "match")
+    failed = {image_id0 for image_id0, _ in report.failures}
+    report.done = sum(len(task.pairs) for task in todo if task.image_id0 not in failed)
+    report.skipped = report.items - sum(len(task.pairs) for task in todo)
+    # Pairs that a step could not verify take no further step, and the last filter sees but what the others found.
+    report.failures += _failures(steps, "match", "filter")
     if len(counts) < len(tasks):
         counts = [_matches_on_file(task) for task in tasks]
     outcomes = cascade.outcomes(context, steps)

@@ -19,7 +19,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, unplaced, write
 from aeromatch_cli.strategies.exporters.styles import qml
 
 _LOCAL_FRAME = 'LOCAL_CS["local frame of the block",UNIT["metre",1]]'
@@ -40,6 +40,7 @@ class Links:
     def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
         positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
         positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
+        positions = {i: center_m for i, center_m in positions.items() if i not in unplaced(contents)}
         ties: Counter[str] = Counter()
         for id0, id1, rows in found.pairs:
             ties.update({id0: len(rows), id1: len(rows)})
@@ -51,7 +52,7 @@ class GeoJson(Strategy):
     """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches, and beside each its
     style for QGIS."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

@@ -29,7 +29,7 @@ class GeoPackage(Strategy):
     """Writes block.gpkg: camera positions, footprints and pairs with their verified matches, and styles for QGIS; needs
     pyogrio."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["geopackage"] = "geopackage"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:

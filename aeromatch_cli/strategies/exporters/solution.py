@@ -30,7 +30,7 @@ class Solution:
     def of(cls, contents: ExportContents) -> Solution:
         block, adjusted = contents.block, contents.adjusted
         if adjusted is not None:
-            aside = {} if contents.geographic is None else adjusted.frames
+            aside = unplaced(contents)
             poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items() if i not in aside}
             return cls(block.images, adjusted.cameras, poses)
         given = {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
@@ -38,6 +38,13 @@ class Solution:
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]
+
+
+def unplaced(contents: ExportContents) -> frozenset[str]:
+    """Images of a block with a CRS whose group no position has placed in it: their coordinates are not of that CRS."""
+    if contents.geographic is None or contents.adjusted is None:
+        return frozenset()
+    return frozenset(contents.adjusted.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +73,8 @@ class Matched:
 def matched(contents: ExportContents, *, adjusted_tracks: bool = False) -> Matched:
     """Tracks of all verified matches; two keypoints of one image in a track contradict each other and end it.
 
-    adjusted_tracks: those of the adjusted block instead, where there is one, with their points.
+    adjusted_tracks: those of the adjusted block instead, where there is one, with their points; points of images that
+    are not placed in the block's CRS have no place.
     """
     ids = [image.image_id for image in contents.block.images]
     place = {image_id: number for number, image_id in enumerate(ids)}
@@ -84,7 +92,10 @@ def matched(contents: ExportContents, *, adjusted_tracks: bool = False) -> Match
         table = np.concatenate([np.zeros((0, 3), np.int64), *rows])
         order = np.lexsort((table[:, 1], table[:, 0], table[:, 2]))
         image_idx, keypoint, track = table[order].T
-        return Matched(pairs, ids, track, image_idx, keypoint, contents.adjusted.points_m, counts)
+        points_m = contents.adjusted.points_m.copy()
+        for image_id in unplaced(contents) & found.keys():
+            points_m[found[image_id][:, 1]] = np.nan
+        return Matched(pairs, ids, track, image_idx, keypoint, points_m, counts)
     image_idx, keypoint, track = _joined(pairs, place)
     points = np.full((int(track.max(initial=-1)) + 1, 3), np.nan)
     return Matched(pairs, ids, track, image_idx, keypoint, points, counts)

@@ -93,7 +93,7 @@ class Search(Strategy):
     )
 
     def reads(self) -> frozenset[str]:
-        """Nothing of the geometry, unless guided."""
+        """Nothing of the geometry, unless guided. What a first scan undistorts by is in the features' fingerprints."""
         return self.needs if self.guided else frozenset()
 
     def __call__(self, features0: Features, features1: Features, geometry: PairGeometry) -> Matches:
