@@ -10,10 +10,9 @@ have found.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ import numpy as np
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import FloatArray, Pair
 from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
@@ -42,6 +42,8 @@ from aeromatch_cli.workspace import Workspace
 
 # The first step of every cascade.
 FIRST = "first"
+# Whose keypoints are held, of each step: images are paired with neighbours, which most blocks list near each other.
+_IMAGES_AT_HAND = 1024
 # Of features that so small a share of the pairs asks for, the pairs go without whose images a third one ties.
 _RARE = 0.02
 # Why a pair takes a step that it does not need.
@@ -236,39 +238,47 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
 
 def evidence_of(steps: Sequence[StepContext]) -> dict[Key, Evidence]:
     """What the steps have found together of those of the pairs that the last of their steps has judged."""
-    # By pair and the step that has made the features: of several steps with the same ones the last counts.
-    places: dict[Key, dict[str, tuple[FloatArray, FloatArray]]] = {}
-    candidates: Counter[Key] = Counter()
-    judged: set[Key] = set()
-    read_first = _keypoint_reader(steps[0])
-    for step in steps:
-        read = read_first if step is steps[0] else _keypoint_reader(step)
-        judged -= step.reasons.keys()
-        for pair, entry in filter.verified_pairs(step.context):
-            key = pair.image_id0, pair.image_id1
-            if key in step.reasons:
-                judged.add(key)
-                candidates[key] = max(candidates[key], entry.matches_in)
-                found = entry.matches.indices if entry.verdict.state == "verified" else entry.matches.indices[:0]
-                both = read(key[0])[found[:, 0]], read(key[1])[found[:, 1]]
-                places.setdefault(key, {})[step.features_of] = both
-    pairs = ((pair.image_id0, pair.image_id1, pair) for pair in steps[0].context.pairs)
-    return {
-        (id0, id1): _evidence(
-            steps[0].context,
-            pair,
-            [*places[id0, id1].values()],
-            keypoints=min(len(read_first(id0)), len(read_first(id1))),
-            candidates=candidates[id0, id1],
-        )
-        for id0, id1, pair in pairs
-        if (id0, id1) in judged
-    }
+    judged = [_InOrder(filter.verified_pairs(step.context)) for step in steps]
+    readers = [_keypoint_reader(step) for step in steps]
+    found = {}
+    for pair in steps[0].context.pairs:
+        key = pair.image_id0, pair.image_id1
+        # By the step that has made the features: of several steps with the same ones the last counts.
+        places: dict[str, tuple[FloatArray, FloatArray]] = {}
+        candidates, known = 0, False
+        for step, entries, read in zip(steps, judged, readers, strict=True):
+            entry = entries.of(key)
+            if key not in step.reasons:
+                continue
+            known = entry is not None
+            if entry is not None:
+                candidates = max(candidates, entry.matches_in)
+                rows = entry.matches.indices if entry.verdict.state == "verified" else entry.matches.indices[:0]
+                places[step.features_of] = read(key[0])[rows[:, 0]], read(key[1])[rows[:, 1]]
+        if known:
+            fewer = min(len(readers[0](image_id)) for image_id in key)
+            found[key] = _evidence(steps[0].context, pair, [*places.values()], keypoints=fewer, candidates=candidates)
+    return found
+
+
+class _InOrder:
+    """Judged pairs of one step, asked for in the order of all pairs: those of a large block are never held at once."""
+
+    def __init__(self, judged: Iterable[tuple[Pair, VerifiedEntry]]) -> None:
+        self._rest = iter(judged)
+        self._next = next(self._rest, None)
+
+    def of(self, key: Key) -> VerifiedEntry | None:
+        """None where the step has not judged the pair."""
+        if self._next is None or (self._next[0].image_id0, self._next[0].image_id1) != key:
+            return None
+        entry, self._next = self._next[1], next(self._rest, None)
+        return entry
 
 
 def _keypoint_reader(step: StepContext) -> Callable[[str], FloatArray]:
-    """Places of an image's keypoints, read once."""
-    return cache(lambda image_id: read_keypoints(step.context.workspace.features(image_id))[0])
+    """Places of an image's keypoints."""
+    return lru_cache(_IMAGES_AT_HAND)(lambda image_id: read_keypoints(step.context.workspace.features(image_id))[0])
 
 
 def _evidence(
