@@ -159,6 +159,10 @@ class Workspace:
         """Where its keypoints were measured anew."""
         return self.root / "refined" / f"{image_id}.npz"
 
+    def measured(self, image_id: str) -> Path:
+        """The measurements themselves, as they are before they are carried from image to image."""
+        return self.root / "refined" / "measured" / f"{image_id}.npz"
+
     @property
     def refined_files(self) -> Path:
         """Record of these files."""

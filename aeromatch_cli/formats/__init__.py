@@ -133,6 +133,14 @@ detector, by which the errors that colours show were found.
 - `keypoints_px` (K, 2) float32: of all keypoints of features/<id>.npz; `measured` (K,) bool: those that stand for their
   points, or were brought onto one that does. `fingerprint`: that of the features. `files.json` is the record of all.
 
+### refined/measured/<id>.npz
+
+Measurements of one image's keypoints by those of others, kept so that only what has changed is measured again. They may
+be deleted.
+
+- `shifts_px` (N, 2) float32, stored pixels; `held` (N,) bool: whether they hold; `matrices` (N, 2, 2) float32: pixels
+  of the image from those of the other one. `fingerprint`: of all that they depend on.
+
 ### orientation/dropped.npz
 
 Verified matches that contradict the adjusted block or are not likely to be right, of D pairs. Whoever reads results

@@ -15,80 +15,36 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, Pair, PairGeometry
 from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
 from aeromatch_cli.formats.refined import write_refined
-from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
-from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.enhance import source_of
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.measuring import (
+    ByImage,
+    CutTask,
+    Measured,
+    MeasureTask,
+    cut_patches,
+    kept_measurements,
+    measure,
+    measurement_fingerprint,
+    patches_of,
+)
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, REACH_PX, LeastSquares, Patches
+from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 
 VERSION = 1
-_PATCHES = "patches"
 # Images whose keypoints are measured before patches are given up that no later image needs.
 _IMAGES_AT_ONCE = 128
-
-
-@dataclass(frozen=True, eq=False)
-class CutTask:
-    """An image, the stored pixels (N, 2) around which patches are wanted, and the file that gets them."""
-
-    source: Source
-    points_px: FloatArray
-    path: Path
-
-
-@dataclass(frozen=True, eq=False)
-class ByImage:
-    """Keypoints of one image that are measured by those of another: patches (N,) of either, their places (N, 2), and
-    what is known of both images, the other one first."""
-
-    image_id: str
-    patches: IntArray
-    own_patches: IntArray
-    places_px: FloatArray
-    own_places_px: FloatArray
-    geometry: PairGeometry
-
-
-@dataclass(frozen=True, eq=False)
-class MeasureTask:
-    """All keypoints of one image that are measured by others."""
-
-    image_id: str
-    by: tuple[ByImage, ...]
-    recipe: LeastSquares
-    folder: Path
-    scales: Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """Of keypoints (N,): shifts (N, 2), whether they hold, pixels from those of the other image (N, 2, 2)."""
-
-    shifts_px: FloatArray
-    held: BoolArray
-    matrices: FloatArray
-
-    @classmethod
-    def nothing(cls, count: int) -> Measured:
-        matrices = np.zeros((count, 2, 2), np.float32)
-        return cls(np.zeros((count, 2), np.float32), np.zeros(count, dtype=bool), matrices)
-
-    def set(self, rows: IntArray, values: Measured) -> None:
-        self.shifts_px[rows], self.held[rows] = values.shifts_px, values.held
-        self.matrices[rows] = np.nan_to_num(values.matrices)
 
 
 def run(context: Context) -> StageReport:
@@ -106,9 +62,7 @@ def run(context: Context) -> StageReport:
         report.skipped, report.facts = report.items - len(report.failures), record["facts"]
         return report.write(context.workspace)
     report.failures.clear()
-    _remove(folder)
-    with translated_os_errors(folder):
-        folder.mkdir(parents=True)
+    _make_room(context)
     with context.executor.step("refine"):
         table = _Table.of(context)
     found = _measured(context, table, recipe, report)
@@ -152,16 +106,31 @@ def current_fingerprint(context: Context) -> str:
     state = [sorted(block.cameras.items()), sorted(block.poses.items()), heights]
     sources = [source_of(context, image).fingerprint for image in block.images]
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
-    return fingerprint(VERSION, recipe, library_version("opencv-python-headless"), state, sources, pairs)
+    return fingerprint(*_versions(), recipe, state, sources, pairs)
+
+
+def _versions() -> tuple[int, str]:
+    return VERSION, library_version("opencv-python-headless")
+
+
+def _make_room(context: Context) -> None:
+    """Nothing is left that a record of an earlier run vouches for; measurements of images of the block stay, unless all
+    is to be made anew."""
+    workspace = context.workspace
+    folder, kept = workspace.refined_files.parent, workspace.measured("").parent
+    if context.overwrite:
+        _remove(folder)
+    with translated_os_errors(folder):
+        kept.mkdir(parents=True, exist_ok=True)
+        ids = {image.image_id for image in context.block.images}
+        for path in [*folder.iterdir(), *(path for path in kept.iterdir() if path.stem not in ids)]:
+            if path != kept:
+                path.unlink()
 
 
 def _remove(folder: Path) -> None:
     with translated_os_errors(folder):
         shutil.rmtree(folder, ignore_errors=not folder.is_dir())
-
-
-def _patches(folder: Path, image_id: str) -> Path:
-    return folder / f"{image_id}.{_PATCHES}.npy"
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,107 +203,63 @@ def _comparable(geometry: PairGeometry) -> bool:
     return geometry.ground_z_m is not None and all(p is not None and p.world_rotation is not None for p in poses)
 
 
-def cut_patches(task: CutTask) -> int:
-    """Write the patches of an image; how many there are. Those near its edge, or near what a mask hides, are empty:
-    nothing is measured there."""
-    pixels, valid = read_source(task.source, colour=False)
-    places = in_working_frame(task.points_px.astype(np.float64), task.source.scale)
-    side = 2 * PATCH_HALF_PX + 1
-    padded = np.pad(pixels, PATCH_HALF_PX, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
-    middles = np.clip(np.rint(places).astype(np.int64), 0, np.array(pixels.shape[1::-1]) - 1)
-    patches = windows[middles[:, 1], middles[:, 0]]
-    patches[~_far_inside(pixels.shape, valid, middles)] = 0
-    write_atomically(task.path, lambda stream: np.save(stream, patches))
-    return len(patches)
-
-
-def _far_inside(shape: tuple[int, ...], valid: BoolArray | None, places: IntArray) -> BoolArray:
-    """Which places (N, 2), x and y, have nothing invalid within the reach of a window."""
-    import cv2
-
-    inside = (places >= REACH_PX) & (places < np.array(shape[1::-1]) - REACH_PX)
-    if valid is None:
-        return np.asarray(inside.all(axis=1))
-    whole = cv2.erode(valid.astype(np.uint8), np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8))
-    return np.asarray(inside.all(axis=1) & (whole[places[:, 1], places[:, 0]] > 0))
-
-
-def in_working_frame(points_px: FloatArray, scale: float) -> FloatArray:
-    """Stored pixels (N, 2) in the raster that is worked on, half-pixel correct."""
-    return points_px if scale >= 1.0 else apply_homography(resize_matrix(scale), points_px)
-
-
 def _measured(context: Context, table: _Table, recipe: LeastSquares, report: StageReport) -> Measured:
-    """Of all keypoints of the block. Patches are there as long as they are needed: those of 10,000 images would fill a
-    disk."""
+    """Of all keypoints of the block; those of images for which nothing has changed are on file. Patches are there as
+    long as they are needed: those of 10,000 images would fill a disk."""
     folder = context.workspace.refined_files.parent
     by = {image_id: table.measured_by(image_id) for image_id in table.names}
-    batches = [list(by)[at : at + _IMAGES_AT_ONCE] for at in range(0, len(by), _IMAGES_AT_ONCE)]
+    found, todo = Measured.nothing(len(table.trees.parent)), list[str]()
+    for image_id in table.names:
+        task = _task(context, table, recipe, image_id, by[image_id])
+        kept = kept_measurements(task) if task.by else None
+        if kept is not None:
+            found.set(table.first[image_id] + task.rows, kept)
+        elif task.by:
+            todo.append(image_id)
+    batches = [todo[at : at + _IMAGES_AT_ONCE] for at in range(0, len(todo), _IMAGES_AT_ONCE)]
     needed = [sorted({*batch, *(other for image_id in batch for other in by[image_id])}) for batch in batches]
     last = {image_id: number for number, names in enumerate(needed) for image_id in names}
-    found, cut = Measured.nothing(len(table.trees.parent)), set[str]()
+    cut = set[str]()
     for number, batch in enumerate(batches):
         new = [image_id for image_id in needed[number] if image_id not in cut]
-        cuts = [CutTask(table.sources[i], table.places_px[i], _patches(folder, i)) for i in new]
+        cuts = [CutTask(table.sources[i], table.places_px[i], patches_of(folder, i)) for i in new]
         part = f"{number + 1} of {len(batches)} parts: " if len(batches) > 1 else ""
         context = replace(context, part=part)
         run_stage(context, report, cut_patches, cuts, new)
         cut.update(new)
-        tasks = [_task(context, table, recipe, image_id, by[image_id]) for image_id in batch]
+        tasks = [_task(context, table, recipe, image_id, by[image_id]).with_patches() for image_id in batch]
         tasks = [task for task in tasks if task.by]
         outcomes = context.executor.run(measure, tasks, part + report.stage)
         for task, outcome in zip(tasks, outcomes, strict=True):
             if outcome.value is None:
                 report.failures.append((task.image_id, outcome.error))
                 continue
-            own = np.concatenate([one.own_patches for one in task.by])
-            found.set(table.first[task.image_id] + own, outcome.value)
+            found.set(table.first[task.image_id] + task.rows, outcome.value)
         for image_id in needed[number]:
             if last[image_id] == number:
-                _patches(folder, image_id).unlink(missing_ok=True)
+                patches_of(folder, image_id).unlink(missing_ok=True)
     return found
 
 
 def _task(
     context: Context, table: _Table, recipe: LeastSquares, image_id: str, by: Mapping[str, tuple[IntArray, IntArray]]
 ) -> MeasureTask:
-    """Of one image, by those of the images whose patches are there."""
-    folder, parts = context.workspace.refined_files.parent, []
-    scales: dict[str, float] = {}
+    """Of one image, by all others that measure some of its keypoints."""
+    parts = []
     for other, (numbers, own_numbers) in by.items():
-        if not (_patches(folder, other).is_file() and _patches(folder, image_id).is_file()):
-            continue  # its picture could not be read
-        scales |= {i: table.sources[i].scale for i in (other, image_id)}
         places = table.places_px[other][numbers], table.places_px[image_id][own_numbers]
         parts.append(ByImage(other, numbers, own_numbers, *places, _geometry(context, other, image_id)))
-    return MeasureTask(image_id, tuple(parts), recipe, folder, scales)
+    sources = [table.sources[i] for i in (image_id, *by)]
+    scales = {i: source.scale for i, source in zip((image_id, *by), sources, strict=True)}
+    own = measurement_fingerprint(recipe, _versions(), parts, [source.fingerprint for source in sources])
+    folder, path = context.workspace.refined_files.parent, context.workspace.measured(image_id)
+    return MeasureTask(image_id, tuple(parts), recipe, folder, scales, path, own)
 
 
 def _geometry(context: Context, first: str, second: str) -> PairGeometry:
     nowhere = float("nan")
     geometry = context.geometry(Pair(min(first, second), max(first, second), nowhere, nowhere, ""))
     return geometry if first < second else geometry.turned()
-
-
-def measure(task: MeasureTask) -> Measured:
-    """The keypoints of one image, in the order of the task."""
-    own: NDArray[np.uint8] = np.load(_patches(task.folder, task.image_id), mmap_mode="r")
-    parts = []
-    for one in task.by:
-        other = np.load(_patches(task.folder, one.image_id), mmap_mode="r")
-        scale, own_scale = task.scales[one.image_id], task.scales[task.image_id]
-        places, own_places = one.places_px.astype(np.float64), one.own_places_px.astype(np.float64)
-        matrices = level_affinities(one.geometry, places, own_places)
-        first = _with_places(other[one.patches], in_working_frame(places, scale))
-        second = _with_places(own[one.own_patches], in_working_frame(own_places, own_scale))
-        shifts, held = task.recipe(first, second, matrices * (own_scale / scale))
-        parts.append((shifts / own_scale, held, matrices))
-    return Measured(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-
-def _with_places(pixels: NDArray[np.uint8], places_px: FloatArray) -> Patches:
-    return Patches(pixels, places_px - np.rint(places_px))
 
 
 def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquares) -> dict[str, Any]:
