@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import pytest
@@ -182,6 +182,7 @@ def test_overlap_view_angle_and_coverage_on_flat_ground(flat: RenderedTruth) -> 
     assert score.correct == 3
     assert score.coverage == 2 / 256
     assert flat.overlap_at_most("a", "b") == pytest.approx(0.7, abs=0.05)
+    assert flat.near("a", ["b"]).all()
 
 
 def test_shadow_is_counted_inside_and_along_its_border(flat: RenderedTruth) -> None:
@@ -206,9 +207,12 @@ def test_sky_is_no_shadow(flat: RenderedTruth) -> None:
 
 
 def test_a_pair_that_shares_nothing_is_judged_all_the_same() -> None:
-    by = judged_by(make_scene(), a=ABOVE, b=Exterior(190.0, 0.0, 60.0, 0.0, 0.0, 0.0))
+    b = Exterior(190.0, 0.0, 60.0, 0.0, 0.0, 0.0)
+    by = judged_by(make_scene(), a=ABOVE, b=b, far=replace(b, x_m=260.0))
     found = by.conditions("a", "b")
     assert (found.overlap, by.overlap_at_most("a", "b")) == (0.0, 0.0)
+    assert by.near("a", ["a", "far"]).tolist() == [True, False]
+    assert by.near("b", []).tolist() == []
     assert np.isnan(found.view_angle_deg)
     assert (found.difficulty, found.hard) == ("unknown", False)
     score = judge(by, columns(20.0), columns(20.0))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.evaluate.reference import load_reference
 from aeromatch_cli.evaluate.rendered import RenderedTruth
@@ -28,6 +28,8 @@ class BlockTruth(Protocol):
 
     @property
     def images_folder(self) -> Path | None: ...
+
+    def near(self, name: str, others: Sequence[str]) -> BoolArray: ...
 
     def overlap_at_most(self, name0: str, name1: str) -> float: ...
 

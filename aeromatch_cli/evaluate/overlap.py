@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
+from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.texture import Texture, read_texture
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.footprints import view_angles_deg
@@ -17,6 +18,9 @@ from aeromatch_cli.geometry.footprints import view_angles_deg
 # Samples per image, on an even grid: several for each cell of the coverage grid, whatever the image's size.
 _SAMPLES = 16384
 _COARSE = 16  # every so many of them for a first look
+_MARGIN = 0.25  # of the extent of what an image shows
+# 0.7 MB and 32 kB each.
+_IMAGES_KEPT, _PAIRS_KEPT = 256, 1024
 
 
 class Sight(Protocol):
@@ -77,24 +81,43 @@ def sample_grid(camera: Camera, count: int = _SAMPLES) -> FloatArray:
 
 
 class OverlapFinder:
-    """Overlaps of one block, each computed once."""
+    """Overlaps of one block, each computed once as long as it is asked for now and then."""
 
     def __init__(self, sight: Sight, images_folder: Path | None) -> None:
         self._sight, self._images_folder = sight, images_folder
         self._samples: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._found: dict[tuple[str, str], _Seen] = {}
         self._textures: dict[str, Texture] = {}
+        self._boxes: dict[str, FloatArray] = {}
 
     def between(self, name0: str, name1: str) -> Overlap:
         """The overlap of two images."""
         first, second = sorted((name0, name1))
-        if (first, second) not in self._found:
-            self._found[first, second] = self._find(first, second)
-        found = self._found[first, second]
+        found = recent(self._found, (first, second), lambda: self._find(first, second), _PAIRS_KEPT)
         masks = {first: found.seen0, second: found.seen1}
         samples0_px, samples1_px = (self._of(name)[0][masks[name]] for name in (name0, name1))
         share = max(float(mask.mean()) for mask in masks.values())
         return Overlap(samples0_px, samples1_px, share, found.view_angle_deg)
+
+    def near(self, name: str, others: Sequence[str]) -> BoolArray:
+        """Which of the others (N,) show ground whose box meets that of an image; the rest share nothing with it."""
+        low, high = self._box(name)
+        boxes = np.array([self._box(other) for other in others]).reshape(-1, 2, 2)
+        return np.asarray(((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1))
+
+    def _box(self, name: str) -> FloatArray:
+        """(2, 2) lowest and highest x and y of the ground that an image shows, with a margin, as samples do not reach
+        its edges; of an image without ground everywhere."""
+        if name not in self._boxes:
+            grid_px = sample_grid(self._sight.cameras[name])[::_COARSE]
+            ground_m = self._sight.surface_points(name, grid_px)[:, :2]
+            ground_m = ground_m[np.isfinite(ground_m).all(axis=1)]
+            self._boxes[name] = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+            if len(ground_m):
+                low, high = ground_m.min(axis=0), ground_m.max(axis=0)
+                margin = _MARGIN * (high - low)
+                self._boxes[name] = np.array([low - margin, high + margin])
+        return self._boxes[name]
 
     def at_most(self, name0: str, name1: str) -> float:
         """An upper estimate of the overlap, from a coarse grid, with nothing in the way."""
@@ -129,13 +152,13 @@ class OverlapFinder:
 
     def _of(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Samples (S, 2) of an image and the world points (S, 3) they show."""
-        if name not in self._samples:
-            grid_px = sample_grid(self._sight.cameras[name])
-            self._samples[name] = grid_px, self._sight.surface_points(name, grid_px)
-        return self._samples[name]
+        return recent(self._samples, name, lambda: self._sampled(name), _IMAGES_KEPT)
+
+    def _sampled(self, name: str) -> tuple[FloatArray, FloatArray]:
+        grid_px = sample_grid(self._sight.cameras[name])
+        return grid_px, self._sight.surface_points(name, grid_px)
 
     def _texture_of(self, name: str) -> Texture:
         assert self._images_folder is not None
-        if name not in self._textures:
-            self._textures[name] = read_texture(self._images_folder / name)
-        return self._textures[name]
+        path = self._images_folder / name
+        return recent(self._textures, name, lambda: read_texture(path), _IMAGES_KEPT)

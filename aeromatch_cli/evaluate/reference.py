@@ -7,7 +7,7 @@ not measure exactness. A mistake along the epipolar line goes unseen.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,6 +75,10 @@ class ReferenceTruth:
     def cameras(self) -> Mapping[str, Camera]:
         """Camera of every image, by name."""
         return self._sight.cameras
+
+    def near(self, name: str, others: Sequence[str]) -> BoolArray:
+        """Which of the others (N,) may show some of the same ground; the rest share nothing."""
+        return self._overlaps.near(name, others)
 
     def overlap_at_most(self, name0: str, name1: str) -> float:
         """An upper estimate of the overlap: a quick way to pass over pairs that share nothing."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.metrics import coverage, pose_error_deg, thin
 from aeromatch_cli.evaluate.overlap import OverlapFinder, place_on
+from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX, Conditions, PairScore
 from aeromatch_cli.evaluate.surfaces import surfaces
 from aeromatch_cli.synthetic.write import IN_SHADOW_BELOW
@@ -82,6 +83,10 @@ class RenderedTruth:
     def cameras(self) -> Mapping[str, Camera]:
         """Camera of every image, by name."""
         return self.truth.cameras
+
+    def near(self, name: str, others: Sequence[str]) -> BoolArray:
+        """Which of the others (N,) may show some of the same ground; the rest share nothing."""
+        return self._overlaps.near(name, others)
 
     def overlap_at_most(self, name0: str, name1: str) -> float:
         """An upper estimate of the overlap, occlusion ignored: a quick way to pass over pairs that share nothing."""
@@ -198,11 +203,10 @@ class RenderedTruth:
         return _at(self._light(name).at_border, points_px)
 
     def _light(self, name: str) -> _Light:
-        light = self._lights.pop(name, None) or _light_of(self.truth.sun(name), self.truth.surface(name))
-        self._lights[name] = light  # last in, so that the first is the one not used for longest
-        if len(self._lights) > _LIGHTS_KEPT:
-            self._lights.pop(next(iter(self._lights)))
-        return light
+        return recent(self._lights, name, lambda: self._lit(name), _LIGHTS_KEPT)
+
+    def _lit(self, name: str) -> _Light:
+        return _light_of(self.truth.sun(name), self.truth.surface(name))
 
 
 def _light_of(sun: NDArray[np.uint8], surface: NDArray[np.uint32]) -> _Light:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
+from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
@@ -31,6 +31,8 @@ MIN_OVERLAP = 0.20
 # The quick estimate is of a coarse grid: pairs somewhat below are looked at properly.
 _QUICK_OVERLAP = 0.15
 _NAMED = 5
+# Whose keypoints are at hand: pairs go by the order of their images.
+_IMAGES_KEPT = 256
 _NOTHING: FloatArray = np.zeros((0, 2))
 
 
@@ -70,13 +72,17 @@ def evaluate_workspace(
     if not entries:
         raise InputError(f"no pair of {work} has a verdict: run `aeromatch run`, or match and filter, first")
     keypoints = _Keypoints(workspace)
-    candidates = list(combinations(sorted(images, key=lambda image: image.image_id), 2))
+    ordered = sorted(images, key=lambda image: image.image_id)
     rows = []
-    progress.start("evaluate", len(candidates))
+    progress.start("evaluate", len(ordered))
     try:
-        for image0, image1 in candidates:
-            row = _judge(truth, image0, image1, entries.get((image0.image_id, image1.image_id)), keypoints)
-            rows += [row] if row is not None else []
+        for number, image0 in enumerate(ordered):
+            rest = ordered[number + 1 :]
+            near = truth.near(image0.name, [image.name for image in rest])
+            for image1, meets in zip(rest, near, strict=True):
+                entry = entries.get((image0.image_id, image1.image_id))
+                row = _judge(truth, image0, image1, entry, keypoints) if meets or entry is not None else None
+                rows += [row] if row is not None else []
             progress.advance()
     finally:
         progress.stop()
@@ -110,17 +116,15 @@ def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockT
 
 
 class _Keypoints:
-    """Keypoints of the images of a workspace, read once; none where an image has no features."""
+    """Keypoints of the images of a workspace; none where an image has no features."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
         self._read: dict[str, FloatArray] = {}
 
     def __getitem__(self, image_id: str) -> FloatArray:
-        if image_id not in self._read:
-            paths = self._workspace.features(image_id), self._workspace.refined(image_id)
-            self._read[image_id] = read_final_keypoints(*paths)
-        return self._read[image_id]
+        paths = self._workspace.features(image_id), self._workspace.refined(image_id)
+        return recent(self._read, image_id, lambda: read_final_keypoints(*paths), _IMAGES_KEPT)
 
 
 def _judged(
