@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
@@ -48,23 +48,11 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
             several = alike[PurePosixPath(row.image.lower()).name] > 1
             found = [name for name in found if rows.get(name, row).image not in exact]
             found = [name for name in found if not several or _shared_folders(row.image, name)]
-        if len(found) > 1:
-            most = max(_shared_folders(row.image, name) for name in found)
-            found = [name for name in found if _shared_folders(row.image, name) == most]
-        if len(found) > 1:
-            raise ConfigError(
-                f"{source}, line {row.line}, column image: {row.image!r} may be {found[0]} or {found[1]}: write the "
-                "path relative to the images folder"
-            )
-        if not found:
+        image = _only(row, found, rows, source)
+        if image is None:
             absent.append(row.image)
-        elif found[0] in rows:
-            raise ConfigError(
-                f"{source}, line {row.line}, column image: {row.image!r} and {rows[found[0]].image!r} (line "
-                f"{rows[found[0]].line}) both mean the image {found[0]}: keep one of the two lines"
-            )
         else:
-            rows[found[0]] = row
+            rows[image] = row
     if names and not rows:
         raise ConfigError(
             f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
@@ -78,6 +66,24 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
     if unnamed:
         remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
     return rows, remarks
+
+
+def _only(row: PoseRow, found: Sequence[str], rows: Mapping[str, PoseRow], source: str) -> str | None:
+    """The image that a line means, of those that it may: of several the one most of whose folders are named, too.
+    Raises ConfigError where two images fit as well, or another line means that image, too."""
+    most = max((_shared_folders(row.image, name) for name in found), default=0)
+    found = [name for name in found if len(found) == 1 or _shared_folders(row.image, name) == most]
+    if len(found) > 1:
+        raise ConfigError(
+            f"{source}, line {row.line}, column image: {row.image!r} may be {found[0]} or {found[1]}: write the "
+            "path relative to the images folder"
+        )
+    if found and found[0] in rows:
+        raise ConfigError(
+            f"{source}, line {row.line}, column image: {row.image!r} and {rows[found[0]].image!r} (line "
+            f"{rows[found[0]].line}) both mean the image {found[0]}: keep one of the two lines"
+        )
+    return found[0] if found else None
 
 
 def _numbered(names: Sequence[str], numbers: Collection[int]) -> dict[int, list[str]]:

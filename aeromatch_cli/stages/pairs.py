@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,12 +49,7 @@ def prepare(
     workspace cannot be written.
     """
     report = StageReport("pairs")
-    workspace = Workspace(Path(settings.workspace).absolute())
-    _check_settings(settings)
-    if dry:
-        workspace.check_version()
-    else:
-        workspace.create()
+    workspace = _opened(settings, dry=dry)
     found = read_block(settings, workspace, executor)
     as_given = summarise(found.block)
     given_lines = [*([f"poses            {found.recognised}"] if found.recognised else []), *as_given.given_lines()]
@@ -67,14 +62,8 @@ def prepare(
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
     context = _with_ground(context, found)
-    wanted = _fingerprint(context)
-    pairs = None if overwrite or dry else _stored_pairs(workspace, wanted)
-    if pairs is not None:
-        report.items = report.skipped = len(pairs)
-    else:
-        with executor.step("pairs"):
-            pairs = settings.pairs(context.block)
-        report.items = report.done = len(pairs)
+    report.fingerprint = _fingerprint(context)
+    pairs = _listed(context, report, anew=overwrite or dry)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
     oriented_lines = orientation_lines(oriented.facts, found.block, context.block)
     said_later = [*oriented.facts.get("remarks", []), *(w for w in summary.warnings if w not in known)]
@@ -86,7 +75,6 @@ def prepare(
         "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
     }
     report.failures = list(found.failures)
-    report.fingerprint = wanted
     context = replace(context, pairs=tuple(pairs))
     if not dry:
         _write(context, pairs_csv)
@@ -98,6 +86,28 @@ def prepare(
         log.warning("warning: %s", warning)
     _check_pairs(context)
     return context, oriented, report
+
+
+def _opened(settings: Settings, *, dry: bool) -> Workspace:
+    workspace = Workspace(Path(settings.workspace).absolute())
+    _check_settings(settings)
+    if dry:
+        workspace.check_version()
+    else:
+        workspace.create()
+    return workspace
+
+
+def _listed(context: Context, report: StageReport, *, anew: bool) -> Sequence[Pair]:
+    """The pairs on file where they are those of the report's fingerprint, else chosen now; counted in the report."""
+    pairs = None if anew else _stored_pairs(context.workspace, report.fingerprint)
+    if pairs is not None:
+        report.items = report.skipped = len(pairs)
+        return pairs
+    with context.executor.step("pairs"):
+        chosen = context.settings.pairs(context.block)
+    report.items = report.done = len(chosen)
+    return chosen
 
 
 def _check_pairs(context: Context) -> None:
