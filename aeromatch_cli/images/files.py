@@ -146,14 +146,22 @@ def write_png(stream: Any, pixels: NDArray[Any]) -> None:
 
 
 def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
-    """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError, also where its
-    shape is another one: it would be stretched over other ground."""
+    """(H, W) bool, True = use: where any band but alpha is not 0; a mask of another size is resized by nearest
+    neighbour. Raises ItemError, also where its shape is another one: it would be stretched over other ground."""
     import cv2
 
+    # As it is stored: of 16 bits, gray from the decoder would be 0 below 256, and of colours where they are faint. But
+    # a JPEG's colours are noise around zero.
+    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
     try:
-        mask = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        stored = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
     except ItemError as error:
         raise ItemError(f"mask: {error}") from None
+    # Alpha is no part of it: programs that paint masks leave it opaque everywhere.
+    bands = [stored] if stored.ndim == 2 else [stored[..., index] for index in range(min(3, stored.shape[2]))]
+    mask: NDArray[Any] = np.zeros(stored.shape[:2], np.uint8)
+    for band in bands:
+        mask |= band != 0
     if mask.shape != (height_px, width_px):
         height, width = mask.shape
         if abs(width * height_px - height * width_px) > max(width_px, height_px) * _MASK_ROUNDING_PX:

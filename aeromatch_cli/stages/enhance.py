@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import whole_record, write_atomically, write_record
-from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
+from aeromatch_cli.fingerprints import fingerprint, image_fingerprint, mask_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
 from aeromatch_cli.images.source import Source, read_source
@@ -77,7 +77,7 @@ def source_of(context: Context, image: Image) -> Source:
         PIPELINE_VERSION,
         library_version("opencv-python-headless"),
         context.image_fingerprints[image.image_id],
-        image_fingerprint(mask) if mask else "",
+        mask_fingerprint(mask) if mask else "",
         scale,
         context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
     ]
