@@ -17,6 +17,7 @@ from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import gdal
 from aeromatch_cli.images.depth import in_16_bits, to_gray8
+from aeromatch_cli.images.masks import both_valid, without_frames
 from aeromatch_cli.images.png import SIGNATURE, chunks
 
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
@@ -26,6 +27,8 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
+# Where a PNG says how many bits its numbers have.
+_PNG_BITS = 24
 # A reduced mask has the shape of its image but for rounding to whole pixels.
 _MASK_ROUNDING_PX = 1.0
 
@@ -41,8 +44,8 @@ def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
 def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
     """The same, and where it is valid (H, W) by what the file says (None = everywhere); what is not is 0.
 
-    Invalid are transparent pixels, those of the nodata value in all bands, and NaN. A file that calls every pixel
-    invalid is not believed: some writers leave alpha empty.
+    Invalid are transparent pixels, those of the nodata value in all bands, NaN, and frames of zeros. A file that calls
+    every pixel invalid is not believed: some writers leave alpha empty.
     """
     import cv2
 
@@ -64,7 +67,18 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
     pixels = in_16_bits(pixels, valid)
     if valid is not None:
         pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
-    return pixels if colour else to_gray8(pixels), valid
+    # Frames are zeros as stored: stretched to 8 bits, the darkest pixels of a picture are 0 too.
+    shown = pixels if colour else to_gray8(pixels)
+    return shown, both_valid(valid, without_frames(shown if pixels.dtype == np.uint8 else pixels))
+
+
+def has_more_bits(path: Path) -> bool:
+    """Whether a picture has other numbers than bytes, by its header; False where that cannot be read."""
+    if path.suffix.lower() in gdal.SUFFIXES:
+        return gdal.has_more_bits(path)
+    with path.open("rb") as stream:
+        head = stream.read(_PNG_BITS + 1)
+    return head.startswith(SIGNATURE) and head[_PNG_BITS:] == b"\x10"
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

@@ -43,6 +43,15 @@ def stored_size(path: Path) -> tuple[int, int]:
         return int(source.width), int(source.height)
 
 
+def has_more_bits(path: Path) -> bool:
+    """Whether the first band has other numbers than bytes, from the header; False where that cannot be read."""
+    try:
+        with _opened(path) as source:
+            return bool(source.dtypes[0] != "uint8")
+    except ItemError:
+        return False
+
+
 def read_bands(path: Path, part: tuple[int, int, int, int] | None = None) -> tuple[NDArray[Any], BoolArray | None]:
     """(H, W) or (H, W, 3) of whole or floating numbers as stored, and where the file has values (None = everywhere).
 

@@ -33,9 +33,6 @@ _reduced: OrderedDict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = 
 # parts or whole. Only what is decoded whole and has 8 bits stays as it is.
 _GLANCE, _TOP = 0.0625, 255.0
 _KNOWN = 0.999  # of the area of a reduced pixel
-# Pictures of these always have 8 bits. What others may have enters fingerprints of what was compared, with this number.
-JPEG = frozenset({".jpg", ".jpeg"})
-DEPTH_VERSION = 1
 
 
 class StoredRaster:
@@ -122,7 +119,7 @@ class StoredRaster:
 
     def _decoded(self) -> Picture:
         # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
-        straight = self._source.path.suffix.lower() in JPEG
+        straight = self._source.path.suffix.lower() in (".jpg", ".jpeg")
         pixels, valid = read_source(self._source, colour=not straight)
         gray = _gray(pixels)
         if gray.dtype == np.uint8:

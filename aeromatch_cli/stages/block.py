@@ -24,7 +24,7 @@ from aeromatch_cli.data import Block, ControlPoint, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
-from aeromatch_cli.fingerprints import image_fingerprint
+from aeromatch_cli.fingerprints import picture_fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
@@ -191,6 +191,6 @@ def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:
     """What a picture's header says, or why it is unusable, and the fingerprint of the file."""
     path = on_disk(picture)
     try:
-        return exif_or_reason(path), image_fingerprint(path)
+        return exif_or_reason(path), picture_fingerprint(path)
     except OSError as error:
         raise ItemError(f"cannot be read ({error.strerror or error}): was it moved or deleted?") from None

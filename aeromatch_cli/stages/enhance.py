@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import whole_record, write_atomically, write_record
-from aeromatch_cli.fingerprints import fingerprint, image_fingerprint, mask_fingerprint
+from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint, picture_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
 from aeromatch_cli.images.source import Source, read_source
@@ -102,7 +102,7 @@ def check_unchanged(source: Source) -> None:
     another one must not be taken for its result."""
     path = source.path
     try:
-        same = image_fingerprint(path) == source.taken
+        same = picture_fingerprint(path) == source.taken
     except OSError as error:
         raise ItemError(f"{path} is gone since the command began ({error.strerror}): put it back, run again") from None
     if not same:

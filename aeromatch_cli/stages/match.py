@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
 from aeromatch_cli.errors import ItemError
@@ -14,7 +14,7 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.images.source import Source
-from aeromatch_cli.images.stored import DEPTH_VERSION, JPEG, StoredRaster
+from aeromatch_cli.images.stored import StoredRaster
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
@@ -70,10 +70,7 @@ def _pair_fingerprint(context: Context, pair: Pair) -> str:
         for i in (pair.image_id0, pair.image_id1)
     ]
     overlap = str(pair.overlap) if matcher.reads_pixels else ""  # where it is small, poses are not doubted
-    names = [context.image_by_id[i].name for i in (pair.image_id0, pair.image_id1)]
-    deep = matcher.reads_pixels and not all(PurePosixPath(name).suffix.lower() in JPEG for name in names)
-    depth = (DEPTH_VERSION,) if deep else ()
-    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides, overlap, *depth)
+    return fingerprint(matcher, context.searched_by, library_version("poselib"), sides, overlap)
 
 
 def images_of_rows(context: Context) -> set[str]:
