@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.images.files import has_more_bits
+from aeromatch_cli.images.files import beyond_bytes
 from aeromatch_cli.strategies import Strategy
 
 _PROBE_BYTES = 1 << 20
@@ -21,7 +21,8 @@ _SQLITE_MODE, _SQLITE_COUNTERS = slice(18, 20), (slice(24, 28), slice(92, 100))
 _PNG, _JPEG, _PNG_KIND = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", slice(24, 26)
 _PNG_GRAY = frozenset({b"\1\0", b"\2\0", b"\4\0", b"\x08\0", b"\x08\4"})
 _MASKS_BY_BANDS = " bands"
-# The same for pictures of other depths than 8 bits; raised when what is made of these alone changes.
+# The same for pictures of other depths than 8 bits, or with a table of colours; raised when what is made of these
+# alone changes.
 _DEEP_PICTURES = 1
 
 
@@ -90,7 +91,7 @@ def image_fingerprint(path: Path) -> str:
 def picture_fingerprint(path: Path) -> str:
     """The same of a picture of the block. Raises OSError."""
     found = image_fingerprint(path)
-    return fingerprint(found, _DEEP_PICTURES) if has_more_bits(path) else found
+    return fingerprint(found, _DEEP_PICTURES) if beyond_bytes(path) else found
 
 
 def mask_fingerprint(path: Path) -> str:

@@ -72,10 +72,11 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
     return shown, both_valid(valid, without_frames(shown if pixels.dtype == np.uint8 else pixels))
 
 
-def has_more_bits(path: Path) -> bool:
-    """Whether a picture has other numbers than bytes, by its header; False where that cannot be read."""
+def beyond_bytes(path: Path) -> bool:
+    """Whether a picture has other numbers than bytes, or a TIFF's table of colours, by its header; False where that
+    cannot be read."""
     if path.suffix.lower() in gdal.SUFFIXES:
-        return gdal.has_more_bits(path)
+        return gdal.beyond_bytes(path)
     with path.open("rb") as stream:
         head = stream.read(_PNG_BITS + 1)
     return head.startswith(SIGNATURE) and head[_PNG_BITS:] == b"\x10"
