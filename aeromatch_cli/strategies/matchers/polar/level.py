@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.geometry.frames import resize_matrix
 
 # A slight blur takes the noise's highest frequencies, which linear interpolation would treat unevenly.
 _BLUR_PX = 0.8
@@ -40,11 +39,6 @@ class Level:
     @property
     def values(self) -> NDArray[np.float32]:
         return self.planes[..., 0]
-
-    @property
-    def from_frame(self) -> FloatArray:
-        """(3, 3) level px from frame px."""
-        return resize_matrix(self.scale)
 
     def sample(self, places_px: FloatArray) -> tuple[NDArray[np.float32], BoolArray]:
         """Planes (N, 3) at places (N, 2) in level px, bilinear, and which places are known (N,)."""
