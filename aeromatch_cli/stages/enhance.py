@@ -14,6 +14,7 @@ from aeromatch_cli.files import whole_record, write_atomically, write_record
 from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint, picture_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
+from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
@@ -68,8 +69,7 @@ def source_of(context: Context, image: Image) -> Source:
     """The picture of one image, with the fingerprint of everything that its pixels depend on."""
     block = context.settings.block
     camera = context.block.camera(image)
-    longest = max(image.width_px, image.height_px)
-    scale = min(1.0, block.max_size_px / longest) if block.max_size_px else 1.0
+    scale = scale_within(block.max_size_px, image.width_px, image.height_px)
     mask = mask_path(block.masks, image.name)
     pose = context.pose(image.image_id)
     sky = sees_sky(camera, pose)
