@@ -163,9 +163,9 @@ class Block:
     images: sorted by image_id. cameras: camera_id -> Camera. poses: image_id -> Pose; images without any position
     are absent. crs: authority code of the world frame, or "local". origin_m: (3,) what was subtracted from the
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
-    distance of the ground views, or None where no image has an attitude. tied: pairs (image_id0, image_id1) that a
-    first pass has matched; similar: pairs that look alike, where that was asked for. outside: images without an
-    attitude that `orient` has confirmed or found.
+    distance of the images, or None where no image has an attitude; reduced_gsd_m: of them as they are worked on, None
+    where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
+    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
     """
 
     images: tuple[Image, ...]
@@ -179,6 +179,12 @@ class Block:
     tied: tuple[tuple[str, str], ...] = ()
     similar: tuple[tuple[str, str], ...] = ()
     outside: frozenset[str] = frozenset()
+    reduced_gsd_m: float | None = None
+
+    @property
+    def views_gsd_m(self) -> float | None:
+        """The common ground sampling distance of the ground views, or None as gsd_m."""
+        return self.gsd_m if self.gsd_m is None or self.reduced_gsd_m is None else self.reduced_gsd_m
 
     def camera(self, image: Image) -> Camera:
         return self.cameras[image.camera_id]

@@ -304,7 +304,7 @@ def test_openmvg_has_views_poses_features_and_matches(contents, truth: Truth, tm
 def test_openmvg_refuses_two_images_of_one_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(image, name=f"{image.name[0:6]}/same.jpg") for image in truth.block.images]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(ItemError, match="several images are called same"):
+    with pytest.raises(ItemError, match="several are called same"):
         EXPORTERS["openmvg"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "v")  # type: ignore[operator]
 
 

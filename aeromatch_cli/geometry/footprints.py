@@ -193,9 +193,12 @@ def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FAC
     return found
 
 
-def common_gsd_m(footprints: Mapping[str, Footprint]) -> float | None:
-    """The block's ground sampling distance: the median over its images, or None where no image sees ground."""
-    return float(np.median([footprint.gsd_m for footprint in footprints.values()])) if footprints else None
+def common_gsd_m(footprints: Mapping[str, Footprint], scales: Mapping[str, float] | None = None) -> float | None:
+    """The block's ground sampling distance: the median over its images, or None where no image sees ground. scales:
+    image_id -> what the image is reduced to; None for none."""
+    if not footprints:
+        return None
+    return float(np.median([item.gsd_m / (scales[i] if scales else 1.0) for i, item in footprints.items()]))
 
 
 def view_angles_deg(centers0_m: FloatArray, centers1_m: FloatArray, points_m: FloatArray) -> FloatArray:

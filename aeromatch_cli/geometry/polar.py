@@ -43,11 +43,6 @@ class PolarGrid:
         """(R,)."""
         return (np.arange(len(self.counts)) + 0.5) * self.step_px
 
-    @property
-    def first(self) -> IntArray:
-        """(R,) the first sample of every ring."""
-        return _first(self.counts)
-
 
 def polar_grid(radius_px: float, step_px: float = 1.0) -> PolarGrid:
     """Rings to the radius, whose samples stand for step_px squared each. Raises ValueError for less than one ring."""
@@ -63,63 +58,5 @@ def polar_grid(radius_px: float, step_px: float = 1.0) -> PolarGrid:
     return PolarGrid(float(step_px), counts, ring_idx, offsets)
 
 
-def resampled(
-    pixels: FloatArray, grid: PolarGrid, center_px: FloatArray, turn_rad: float = 0.0, scale: float = 1.0
-) -> FloatArray:
-    """Values (S,) of a picture (H, W), bilinear, at center + scale R(turn) offset; NaN outside of it."""
-    cosine, sine = scale * np.cos(turn_rad), scale * np.sin(turn_rad)
-    places = grid.offsets_px @ np.array([[cosine, sine], [-sine, cosine]]) + center_px
-    return bilinear(pixels, places)
-
-
-def bilinear(pixels: FloatArray, places_px: FloatArray) -> FloatArray:
-    """Values (N,) of a picture (H, W) at places (N, 2), pixel centres at whole numbers; NaN outside of them."""
-    height, width = pixels.shape
-    x, y = places_px[:, 0], places_px[:, 1]
-    inside = (x >= 0.0) & (x <= width - 1.0) & (y >= 0.0) & (y <= height - 1.0)
-    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-    left = np.minimum(x.astype(np.int64), max(width - 2, 0))
-    top = np.minimum(y.astype(np.int64), max(height - 2, 0))
-    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    dx, dy = x - left, y - top
-    upper = pixels[top, left] * (1.0 - dx) + pixels[top, right] * dx
-    lower = pixels[bottom, left] * (1.0 - dx) + pixels[bottom, right] * dx
-    return np.where(inside, upper * (1.0 - dy) + lower * dy, np.nan)
-
-
-def shifted(values: FloatArray, grid: PolarGrid, turn_rad: float) -> FloatArray:
-    """Values (S,) as the grid turned by turn_rad reads them: each ring shifted along itself, linear between samples."""
-    counts, first = grid.counts[grid.ring_idx], grid.first[grid.ring_idx]
-    return _along(values, first, counts, np.arange(len(values)) - first + turn_rad / (2.0 * np.pi) * counts)
-
-
-def as_picture(values: FloatArray, grid: PolarGrid, size_px: tuple[int, int], center_px: FloatArray) -> FloatArray:
-    """The inverse of `resampled`: values (S,) as a picture (height, width) of size (width, height), linear along and
-    between the rings; NaN beyond the outermost ring.
-    """
-    width, height = size_px
-    y, x = np.mgrid[0:height, 0:width].astype(np.float64)
-    x, y = (x - center_px[0]).ravel(), (y - center_px[1]).ravel()
-    turns = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
-    place = np.hypot(x, y) / grid.step_px - 0.5
-    inner = np.clip(np.floor(place), 0, max(len(grid.counts) - 2, 0)).astype(np.int64)
-    outer = np.minimum(inner + 1, len(grid.counts) - 1)
-    # Within the innermost ring there is nothing to interpolate towards.
-    share = np.clip(place - inner, 0.0, 1.0)
-    low, high = (
-        _along(values, grid.first[ring], grid.counts[ring], turns * grid.counts[ring]) for ring in (inner, outer)
-    )
-    known = place <= len(grid.counts) - 1
-    return np.where(known, low * (1.0 - share) + high * share, np.nan).reshape(height, width)
-
-
 def _first(counts: IntArray) -> IntArray:
     return np.cumsum(counts) - counts
-
-
-def _along(values: FloatArray, first: IntArray, counts: IntArray, place: FloatArray) -> FloatArray:
-    """Values (N,) at places (N,), in samples, along the rings that start at first (N,)."""
-    low = np.floor(place)
-    share = place - low
-    index = low.astype(np.int64)
-    return values[first + index % counts] * (1.0 - share) + values[first + (index + 1) % counts] * share

@@ -48,7 +48,8 @@ def in_16_bits(pixels: NDArray[Any], valid: BoolArray | None = None) -> NDArray[
     low = min(low, 0.0)
     with np.errstate(over="ignore"):  # an outlier may be beyond float32 once it is scaled
         scaled = np.rint((known.astype(exact) - low) * (_TOP_16_BIT / ((high - low) or 1.0)))
-    return np.where(there, np.clip(scaled, 0, _TOP_16_BIT), 0).astype(np.uint16)
+    # What is not 0 stays above it, however dark or cold: zeros may be a frame.
+    return np.where(there, np.clip(scaled, known != 0, _TOP_16_BIT), 0).astype(np.uint16)
 
 
 def to_gray8(pixels: NDArray[Any]) -> NDArray[np.uint8]:

@@ -17,6 +17,7 @@ from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import gdal
 from aeromatch_cli.images.depth import in_16_bits, to_gray8
+from aeromatch_cli.images.masks import both_valid, without_frames
 from aeromatch_cli.images.png import SIGNATURE, chunks
 
 # A byte 0xff that is neither escaped (0x00), nor a restart (0xd0-0xd7), nor padding of another 0xff; and what it may
@@ -26,6 +27,8 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
+# Where a PNG says how many bits its numbers have.
+_PNG_BITS = 24
 # A reduced mask has the shape of its image but for rounding to whole pixels.
 _MASK_ROUNDING_PX = 1.0
 
@@ -41,8 +44,8 @@ def read_pixels(path: Path, *, colour: bool) -> NDArray[Any]:
 def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
     """The same, and where it is valid (H, W) by what the file says (None = everywhere); what is not is 0.
 
-    Invalid are transparent pixels, those of the nodata value in all bands, and NaN. A file that calls every pixel
-    invalid is not believed: some writers leave alpha empty.
+    Invalid are transparent pixels, those of the nodata value in all bands, NaN, and frames of zeros. A file that calls
+    every pixel invalid is not believed: some writers leave alpha empty.
     """
     import cv2
 
@@ -64,7 +67,19 @@ def read_raster(path: Path, *, colour: bool) -> tuple[NDArray[Any], BoolArray | 
     pixels = in_16_bits(pixels, valid)
     if valid is not None:
         pixels[~valid] = 0  # like a black frame, whatever the value was: no stretch counts it, no edge is higher
-    return pixels if colour else to_gray8(pixels), valid
+    # Frames are zeros as stored: stretched to 8 bits, the darkest pixels of a picture are 0 too.
+    shown = pixels if colour else to_gray8(pixels)
+    return shown, both_valid(valid, without_frames(shown if pixels.dtype == np.uint8 else pixels))
+
+
+def beyond_bytes(path: Path) -> bool:
+    """Whether a picture has other numbers than bytes, or a TIFF's table of colours, by its header; False where that
+    cannot be read."""
+    if path.suffix.lower() in gdal.SUFFIXES:
+        return gdal.beyond_bytes(path)
+    with path.open("rb") as stream:
+        head = stream.read(_PNG_BITS + 1)
+    return head.startswith(SIGNATURE) and head[_PNG_BITS:] == b"\x10"
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:
@@ -146,14 +161,22 @@ def write_png(stream: Any, pixels: NDArray[Any]) -> None:
 
 
 def read_mask(path: Path, width_px: int, height_px: int) -> BoolArray:
-    """(H, W) bool, True = use; a mask of another size is resized by nearest neighbour. Raises ItemError, also where its
-    shape is another one: it would be stretched over other ground."""
+    """(H, W) bool, True = use: where any band but alpha is not 0; a mask of another size is resized by nearest
+    neighbour. Raises ItemError, also where its shape is another one: it would be stretched over other ground."""
     import cv2
 
+    # As it is stored: of 16 bits, gray from the decoder would be 0 below 256, and of colours where they are faint. But
+    # a JPEG's colours are noise around zero.
+    flag = cv2.IMREAD_GRAYSCALE if path.suffix.lower() in (".jpg", ".jpeg") else cv2.IMREAD_UNCHANGED
     try:
-        mask = _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        stored = _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
     except ItemError as error:
         raise ItemError(f"mask: {error}") from None
+    # Alpha is no part of it: programs that paint masks leave it opaque everywhere.
+    bands = [stored] if stored.ndim == 2 else [stored[..., index] for index in range(min(3, stored.shape[2]))]
+    mask: NDArray[Any] = np.zeros(stored.shape[:2], np.uint8)
+    for band in bands:
+        mask |= band != 0
     if mask.shape != (height_px, width_px):
         height, width = mask.shape
         if abs(width * height_px - height * width_px) > max(width_px, height_px) * _MASK_ROUNDING_PX:

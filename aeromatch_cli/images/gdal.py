@@ -6,7 +6,7 @@ The only file that knows its band order.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +24,8 @@ _CACHE_MB = 128
 
 TIFF = frozenset({".tif", ".tiff"})
 SUFFIXES = TIFF | {".jp2", ".j2k"}
+# GDAL's name of a band whose numbers stand for colours of a table.
+_PALETTE = "palette"
 # OpenCV decodes no more (CV_IO_MAX_IMAGE_PIXELS). The largest aerial cameras have half as many.
 MAX_PIXELS = 1 << 30
 
@@ -43,11 +45,21 @@ def stored_size(path: Path) -> tuple[int, int]:
         return int(source.width), int(source.height)
 
 
+def beyond_bytes(path: Path) -> bool:
+    """Whether the first band has other numbers than bytes, or bytes that stand for colours of a table, from the header;
+    False where that cannot be read."""
+    try:
+        with _opened(path) as source:
+            return bool(source.dtypes[0] != "uint8" or source.colorinterp[0].name == _PALETTE)
+    except ItemError:
+        return False
+
+
 def read_bands(path: Path, part: tuple[int, int, int, int] | None = None) -> tuple[NDArray[Any], BoolArray | None]:
     """(H, W) or (H, W, 3) of whole or floating numbers as stored, and where the file has values (None = everywhere).
 
     part: left, top, width, height of what is read, None for everything. The first three bands of four or more, the
-    first of two; a band of transparency is none of them. Raises ItemError.
+    first of two; a band of transparency is none of them. Of one band with a table of colours, these. Raises ItemError.
     """
     with _opened(path) as source:
         if part is None:
@@ -113,11 +125,27 @@ def _read_strip(path: Path, source: Any, part: tuple[int, int, int, int]) -> tup
     if "per_dataset" in flags and "alpha" not in flags:
         mask = source.read_masks(1, window=window) > 0
         known = mask if known is None else known & mask
-    pixels = np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.array(planes[0])
+    if source.colorinterp[shown[0] - 1].name == _PALETTE and planes.dtype.kind == "u":
+        pixels, known = _coloured(planes[0], known, source.colormap(shown[0]))
+    else:
+        pixels = np.ascontiguousarray(np.moveaxis(planes, 0, 2)) if len(planes) == 3 else np.array(planes[0])
     if not extra:
         return pixels, _Known(known, None, alpha_is_mask=False)
     named = source.colorinterp[extra - 1].name == "alpha"
     return pixels, _Known(known, last[0] > 0, alpha_is_mask=named or _is_mask(last[0]))
+
+
+def _coloured(
+    numbers: NDArray[Any], known: BoolArray | None, colours: Mapping[int, tuple[int, int, int, int]]
+) -> tuple[NDArray[np.uint8], BoolArray | None]:
+    """(H, W, 3) colours that numbers (H, W) stand for, and where they have values: also not where transparent."""
+    table = np.zeros((int(np.iinfo(numbers.dtype).max) + 1, 4), np.uint8)
+    table[list(colours)] = list(colours.values())
+    opaque = table[:, 3] > 0
+    if not opaque[list(colours)].all():
+        there = opaque[numbers]
+        known = there if known is None else known & there
+    return table[numbers, :3], known
 
 
 def may_have_a_mask(path: Path) -> bool:

@@ -76,3 +76,10 @@ def without_frames(pixels: NDArray[Any]) -> BoolArray | None:
     np.equal(flat, 0, out=black[1:-1, 1:-1], casting="unsafe")
     cv2.floodFill(black, None, (0, 0), 2, flags=4)
     return np.asarray(black[1:-1, 1:-1] != 2)
+
+
+def both_valid(first: BoolArray | None, second: BoolArray | None) -> BoolArray | None:
+    """Where two masks (H, W) are both valid; None = everywhere."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second

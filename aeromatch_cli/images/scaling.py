@@ -56,6 +56,11 @@ def shrink_in_strips(
     return np.asarray(shrink(np.concatenate(strips), min(1.0, scale * whole)), np.float32)
 
 
+def scale_within(max_size_px: int, width_px: int, height_px: int) -> float:
+    """What reduces a picture to a longer side of max_size_px, 0 for any: at most 1."""
+    return min(1.0, max_size_px / max(width_px, height_px)) if max_size_px else 1.0
+
+
 def shrink_camera(camera: Camera, scale: float) -> Camera:
     """The camera of the picture that `shrink` makes."""
     if scale >= 1.0:

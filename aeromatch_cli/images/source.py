@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.files import read_mask, read_raster
-from aeromatch_cli.images.masks import below_horizon, without_frames
+from aeromatch_cli.images.masks import below_horizon, both_valid
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import shrink, shrink_camera
 
@@ -59,16 +59,10 @@ def read_source(source: Source, *, colour: bool) -> tuple[NDArray[Any], BoolArra
             f"{source.camera.width_px}x{source.camera.height_px}; give the right --cameras"
         )
     valid = read_mask(source.mask, width, height) if source.mask else None
-    valid = _combine(_combine(valid, recorded), without_frames(pixels))
+    valid = both_valid(valid, recorded)
     pixels = shrink(pixels, source.scale)
     if valid is not None:
         valid = shrink(valid.astype(np.uint8) * 255, source.scale) > 254
     if source.sky_rotation is not None:
-        valid = _combine(valid, below_horizon(source.working_camera, source.sky_rotation))
+        valid = both_valid(valid, below_horizon(source.working_camera, source.sky_rotation))
     return pixels, valid
-
-
-def _combine(first: BoolArray | None, second: BoolArray | None) -> BoolArray | None:
-    if first is None or second is None:
-        return second if first is None else first
-    return first & second

@@ -19,7 +19,8 @@ from aeromatch_cli.images.masks import without_frames
 from aeromatch_cli.images.scaling import shrink_in_strips
 from aeromatch_cli.images.source import Source, read_source
 
-Picture = tuple[NDArray[Any], BoolArray | None]
+# Gray as decoded, where it is valid, and what its values are multiplied with.
+Picture = tuple[NDArray[Any], BoolArray | None, float]
 T = TypeVar("T")
 
 # What a worker keeps, by the fingerprint of all that it depends on: a row compares one image with a handful of others.
@@ -28,7 +29,8 @@ _wholes: OrderedDict[str, Picture] = OrderedDict()
 _units: OrderedDict[str, float | None] = OrderedDict()
 _reduced: OrderedDict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = OrderedDict()
 # A TIFF is looked at on this scale first: for a frame, and for its largest value, which becomes _TOP, so that it makes
-# no difference whether reflectances up to 1 are stored or gray values up to 65535.
+# no difference whether reflectances up to 1 are stored or gray values up to 65535, nor whether a picture is read by
+# parts or whole. Only what is decoded whole and has 8 bits stays as it is.
 _GLANCE, _TOP = 0.0625, 255.0
 _KNOWN = 0.999  # of the area of a reduced pixel
 
@@ -48,18 +50,18 @@ class StoredRaster:
         unit = self._unit()
         if unit is not None:
             return self._part((left, top, width, height), unit)
-        pixels, valid = self._whole()
+        pixels, valid, gain = self._whole()
         part = (slice(top, top + height), slice(left, left + width))
-        return pixels[part].astype(np.float32), None if valid is None else valid[part]
+        return pixels[part].astype(np.float32) * np.float32(gain), None if valid is None else valid[part]
 
     def _made(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
         unit = self._unit()
         if unit is not None:
             return self._of_parts(scale, unit)
-        pixels, valid = self._whole()
+        pixels, valid, gain = self._whole()
         relative = min(1.0, scale / self.finest)
         size = pixels.shape[1], pixels.shape[0]
-        small = shrink_in_strips(lambda top, count: pixels[top : top + count], size, relative)
+        small = shrink_in_strips(lambda top, count: pixels[top : top + count], size, relative) * np.float32(gain)
         if valid is None:
             return small, None
         share = shrink_in_strips(lambda top, count: valid[top : top + count], size, relative)
@@ -82,7 +84,7 @@ class StoredRaster:
         small, valid = self._of_parts(_GLANCE, 1.0)
         if without_frames(small) is not None or (valid is not None and not valid.any()):
             return None
-        return _TOP / max(float(np.abs(small).max()), 1e-30)
+        return _gain(small)
 
     def _of_parts(self, scale: float, unit: float) -> tuple[FloatArray, BoolArray | None]:
         known: list[BoolArray | None] = []
@@ -112,14 +114,24 @@ class StoredRaster:
         return gray, valid
 
     def _whole(self) -> Picture:
-        """(H, W) gray at the working scale and where it is valid."""
+        """(H, W) gray at the working scale, where it is valid, and the gain of its values."""
         return _kept(_wholes, self._source.fingerprint, _KEPT, self._decoded)
 
     def _decoded(self) -> Picture:
         # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
         straight = self._source.path.suffix.lower() in (".jpg", ".jpeg")
         pixels, valid = read_source(self._source, colour=not straight)
-        return _gray(pixels), valid
+        gray = _gray(pixels)
+        if gray.dtype == np.uint8:
+            return gray, valid, 1.0
+        size = gray.shape[1], gray.shape[0]
+        relative = min(1.0, _GLANCE / self.finest)
+        return gray, valid, _gain(shrink_in_strips(lambda top, count: gray[top : top + count], size, relative))
+
+
+def _gain(small: NDArray[np.float32]) -> float:
+    """What brings the largest value of a picture, of which this is a glance, to _TOP."""
+    return _TOP / max(float(np.abs(small).max()), 1e-30)
 
 
 def _gray(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import distort
 from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.warps import area_scale, ground_beyond
@@ -23,13 +24,17 @@ _FAR_STEP_PX = 8
 # Shrinking below this scale needs an area filter first, or the view aliases.
 _ALIASING_SCALE = 0.75
 
+# OpenCV's remap reads and makes no longer pictures.
+_LONGEST_PX = 32_766
+
 
 def render_view(
     pixels: NDArray[Any], valid: BoolArray | None, camera: Camera, view: View
 ) -> tuple[NDArray[Any], BoolArray | None]:
     """Picture (H, W) or (H, W, C) of a view and where it saw something (None = everywhere).
 
-    pixels, valid: the source raster of `camera` and its mask. Minified views are filtered against aliasing.
+    pixels, valid: the source raster of `camera` and its mask. Minified views are filtered against aliasing. Raises
+    ItemError where the source is too long to be read.
     """
     import cv2
 
@@ -41,6 +46,12 @@ def render_view(
     if scale < _ALIASING_SCALE:
         pixels = shrink(pixels, scale)
         map_x, map_y = (map_x + 0.5) * scale - 0.5, (map_y + 0.5) * scale - 0.5
+    longest = max(pixels.shape[:2])
+    if longest > _LONGEST_PX:
+        raise ItemError(
+            f"an image {longest:,} px long is too long to be seen from elsewhere: "
+            f"reduce it with --max-size {_LONGEST_PX}"
+        )
     kernel = _smoothing_kernel(view, inside, scale if scale < _ALIASING_SCALE else 1.0)
     if kernel is not None:
         pixels = cv2.filter2D(pixels, -1, kernel, borderType=cv2.BORDER_REPLICATE)

@@ -13,12 +13,8 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from aeromatch_cli.errors import ConfigError, WorkspaceError
-
-if TYPE_CHECKING:
-    pass
 from aeromatch_cli.nets.files import SUFFIXES, WeightsCheck, WeightsEntry, sha256_of_file
 
 _INDEX_NAME = "index.json"

@@ -24,11 +24,12 @@ from aeromatch_cli.data import Block, ControlPoint, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
-from aeromatch_cli.fingerprints import image_fingerprint
+from aeromatch_cli.fingerprints import picture_fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints, common_gsd_m
 from aeromatch_cli.images.masks import mask_path
 from aeromatch_cli.images.remote import RemoteFile, is_remote, list_remote, on_disk
+from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.stages.ground import given_ground, ground_fingerprint
 from aeromatch_cli.workspace import FORMAT_VERSION, Workspace
 
@@ -42,8 +43,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised: as in `read.BlockInputs`. gsd_before_m: what the workspace had, or None. ground_hint: the ground below
-    relative altitudes, and its source.
+    recognised: as in `read.BlockInputs`. gsd_before_m: gsd_m and reduced_gsd_m that the workspace had, or None.
+    ground_hint: the ground below relative altitudes, and its source.
     """
 
     block: Block
@@ -56,7 +57,7 @@ class BlockRead:
     failures: tuple[tuple[str, str], ...]
     recognised: str
     remote: Mapping[str, RemoteFile]
-    gsd_before_m: float | None
+    gsd_before_m: tuple[float | None, float | None]
     ground_hint: tuple[Ground, str] | None
 
 
@@ -91,19 +92,31 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
         recognised=inputs.recognised,
         remote=remote,
-        gsd_before_m=before.get("gsd_m") if before.get("ground_fingerprint") == ground_fingerprint(settings) else None,
+        gsd_before_m=(before.get("gsd_m"), before.get("reduced_gsd_m"))
+        if before.get("ground_fingerprint") == ground_fingerprint(settings)
+        else (None, None),
         ground_hint=None
         if inputs.ground_hint_z_m is None or inputs.ground_is_stated
         else (ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source),
     )
 
 
-def with_gsd(block: Block, before_m: float | None) -> Block:
-    """The block with its common ground sampling distance: the one that the workspace had, while that still fits."""
-    gsd_m = common_gsd_m(block_footprints(block))
-    if gsd_m and before_m and abs(gsd_m / before_m - 1.0) < _GSD_TOLERANCE:
-        gsd_m = before_m
-    return replace(block, gsd_m=gsd_m)
+def with_gsd(block: Block, before_m: tuple[float | None, float | None], max_size_px: int) -> Block:
+    """The block with its common ground sampling distances: those that the workspace had, while they still fit.
+
+    before_m: of the images, and of reduced ones. max_size_px: longer side to which images are reduced, 0 for never.
+    """
+    footprints = block_footprints(block)
+    scales = {i.image_id: scale_within(max_size_px, i.width_px, i.height_px) for i in block.images}
+    gsd_m = _while_it_fits(common_gsd_m(footprints), before_m[0])
+    reduced = any(scales[image_id] < 1.0 for image_id in footprints)
+    reduced_gsd_m = _while_it_fits(common_gsd_m(footprints, scales), before_m[1]) if reduced else None
+    return replace(block, gsd_m=gsd_m, reduced_gsd_m=reduced_gsd_m)
+
+
+def _while_it_fits(gsd_m: float | None, before_m: float | None) -> float | None:
+    fits = gsd_m and before_m and abs(gsd_m / before_m - 1.0) < _GSD_TOLERANCE
+    return before_m if fits else gsd_m
 
 
 def block_record(block: Block, given: Block, settings: Settings) -> dict[str, Any]:
@@ -117,6 +130,7 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
         "ground_source": block.ground_source,
         "ground_z_m": block.ground.z_m if isinstance(block.ground, ConstantGround) else None,
         "gsd_m": block.gsd_m,
+        "reduced_gsd_m": block.reduced_gsd_m,
         "ground_fingerprint": ground_fingerprint(settings),
     }
 
@@ -191,6 +205,6 @@ def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:
     """What a picture's header says, or why it is unusable, and the fingerprint of the file."""
     path = on_disk(picture)
     try:
-        return exif_or_reason(path), image_fingerprint(path)
+        return exif_or_reason(path), picture_fingerprint(path)
     except OSError as error:
         raise ItemError(f"cannot be read ({error.strerror or error}): was it moved or deleted?") from None

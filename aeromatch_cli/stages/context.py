@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Camera, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.images.remote import RemoteFile, on_disk
+from aeromatch_cli.images.scaling import scale_within, shrink_camera
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.strategies import Matcher
@@ -112,6 +113,11 @@ class Context:
         """Ground height where an image looks (below it, without attitude), None without ground or position."""
         return _ground_heights(self.block).get(image_id)
 
+    def working_camera(self, image: Image) -> Camera:
+        """The camera of the picture that is worked on (--max-size)."""
+        scale = scale_within(self.settings.block.max_size_px, image.width_px, image.height_px)
+        return shrink_camera(self.block.camera(image), scale)
+
     @property
     def image_by_id(self) -> Mapping[str, Image]:
         return _image_index(self.block)
@@ -141,7 +147,7 @@ class Context:
         for other_id, overlap in self._paired.get(image_id, ()):
             pose = self.pose(other_id)
             if pose is not None and pose.world_rotation is not None:
-                camera = self.block.camera(self.image_by_id[other_id])
+                camera = self.working_camera(self.image_by_id[other_id])
                 found.append(Neighbour(camera, pose, overlap, self.ground_z_m(other_id)))
         return tuple(found)
 
@@ -187,7 +193,7 @@ class Context:
         if "sigma" in needs:
             parts["sigma"] = (pose.sigma_position_m, pose.sigma_angle_deg) if pose else None
         if "ground" in needs:
-            parts["ground"] = (self.ground_z_m(image_id), self.block.gsd_m)
+            parts["ground"] = (self.ground_z_m(image_id), self.block.views_gsd_m)
         if "neighbours" in needs:
             parts["neighbours"] = [
                 (n.camera, n.pose.center_m, n.pose.world_rotation, n.overlap, n.ground_z_m)

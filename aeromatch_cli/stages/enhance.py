@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import whole_record, write_atomically, write_record
-from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
+from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint, picture_fingerprint
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
+from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
@@ -68,8 +69,7 @@ def source_of(context: Context, image: Image) -> Source:
     """The picture of one image, with the fingerprint of everything that its pixels depend on."""
     block = context.settings.block
     camera = context.block.camera(image)
-    longest = max(image.width_px, image.height_px)
-    scale = min(1.0, block.max_size_px / longest) if block.max_size_px else 1.0
+    scale = scale_within(block.max_size_px, image.width_px, image.height_px)
     mask = mask_path(block.masks, image.name)
     pose = context.pose(image.image_id)
     sky = sees_sky(camera, pose)
@@ -77,7 +77,7 @@ def source_of(context: Context, image: Image) -> Source:
         PIPELINE_VERSION,
         library_version("opencv-python-headless"),
         context.image_fingerprints[image.image_id],
-        image_fingerprint(mask) if mask else "",
+        mask_fingerprint(mask) if mask else "",
         scale,
         context.geometry_fingerprint(image.image_id, frozenset({"camera", "pose"})) if sky else "",
     ]
@@ -102,7 +102,7 @@ def check_unchanged(source: Source) -> None:
     another one must not be taken for its result."""
     path = source.path
     try:
-        same = image_fingerprint(path) == source.taken
+        same = picture_fingerprint(path) == source.taken
     except OSError as error:
         raise ItemError(f"{path} is gone since the command began ({error.strerror}): put it back, run again") from None
     if not same:

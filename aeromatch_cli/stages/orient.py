@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, Ground
 from aeromatch_cli.files import read_json, translated_os_errors, whole_record, write_bytes, write_record, write_text
-from aeromatch_cli.fingerprints import fingerprint, image_fingerprint
+from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.images.masks import mask_path
@@ -197,7 +196,7 @@ def _before(context: Context, kept: set[str], record: Mapping[str, Any]) -> Befo
 
 def _prints(context: Context) -> tuple[dict[str, str], str]:
     """Fingerprints of what was given of every image, and of the settings: what the orientation depends on."""
-    block, settings, of_file = context.block, context.settings, cache(image_fingerprint)  # one mask may be that of all
+    block, settings = context.block, context.settings
     images = {}
     for image in block.images:
         pose = block.poses.get(image.image_id)
@@ -205,7 +204,7 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
         if pose is not None:
             place = pose.center_m, pose.world_rotation, pose.sigma_position_m, pose.sigma_angle_deg
         mask = mask_path(settings.block.masks, image.name)
-        taken = context.image_fingerprints[image.image_id], image.time, of_file(mask) if mask else ""
+        taken = context.image_fingerprints[image.image_id], image.time, mask_fingerprint(mask) if mask else ""
         images[image.image_id] = fingerprint(
             taken, image.camera_id, block.camera(image), place, context.angles.get(image.image_id),
             context.likely_focals.get(image.camera_id),

@@ -127,7 +127,7 @@ def _with_ground(context: Context, found: BlockRead) -> Context:
     block = context.block
     if block.ground is None and found.ground_hint is not None:
         block = replace(block, ground=found.ground_hint[0], ground_source=found.ground_hint[1])
-    return replace(context, block=with_gsd(block, found.gsd_before_m))
+    return replace(context, block=with_gsd(block, found.gsd_before_m, context.settings.block.max_size_px))
 
 
 def _within_memory(settings: Settings, executor: Executor, block: Block) -> list[str]:

@@ -50,7 +50,7 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     own = fingerprint(enhancing.fingerprint, enhancing.skipped, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)
-    return SimulateTask(enhancing, pose, ground_z_m, context.block.gsd_m, neighbours, as_taken, simulator, own)
+    return SimulateTask(enhancing, pose, ground_z_m, context.block.views_gsd_m, neighbours, as_taken, simulator, own)
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:

@@ -6,7 +6,8 @@ the block's CRS.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 from xml.sax.saxutils import escape
@@ -35,8 +36,11 @@ class BlocksExchange(Strategy):
             found = matched(contents, adjusted_tracks=True)
             keypoints = keypoints_of(contents)
             origin_m, crs = np.array(contents.block.origin_m), contents.block.crs
+            of_camera: dict[str, list[tuple[int, Image]]] = defaultdict(list)
+            for place, image in enumerate(solution.images):
+                of_camera[image.camera_id].append((place, image))
             groups = "".join(
-                _group(number, camera, [i for i in solution.images if i.camera_id == camera_id], solution, origin_m)
+                _group(number, camera, of_camera[camera_id], solution, origin_m)
                 for number, (camera_id, camera) in enumerate(sorted(solution.cameras.items()))
             )
             system = "" if crs == _LOCAL else "<SRSId>0</SRSId>"
@@ -55,14 +59,16 @@ class BlocksExchange(Strategy):
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
 
 
-def _group(number: int, camera: Camera, images: list[Image], solution: Solution, origin_m: FloatArray) -> str:
+def _group(
+    number: int, camera: Camera, images: Sequence[tuple[int, Image]], solution: Solution, origin_m: FloatArray
+) -> str:
+    """images: of the camera, with their places among all."""
     values = parameters(camera)
     lens = "".join(
         f"<{tag}>{values.get(key, 0.0):.12g}</{tag}>"
         for tag, key in (("K1", "k1"), ("K2", "k2"), ("K3", ""), ("P1", "p1"), ("P2", "p2"))
     )
-    places = {image.image_id: place for place, image in enumerate(solution.images)}
-    photos = "".join(_photo(places[image.image_id], image, solution, origin_m) for image in images)
+    photos = "".join(_photo(place, image, solution, origin_m) for place, image in images)
     return (
         f"<Photogroup><Name>{number}</Name><ImageDimensions><Width>{camera.width_px}</Width><Height>{camera.height_px}"
         "</Height></ImageDimensions><CameraModelType>Perspective</CameraModelType>"

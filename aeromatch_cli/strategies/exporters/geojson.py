@@ -7,9 +7,6 @@ block's own frame and say so in the member `crs` of GeoJSON 2008, by which GDAL 
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -19,33 +16,11 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, unplaced, write
+from aeromatch_cli.strategies.exporters.links import WEAK_MATCHES, Links
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
 from aeromatch_cli.strategies.exporters.styles import qml
 
 _LOCAL_FRAME = 'LOCAL_CS["local frame of the block",UNIT["metre",1]]'
-# Images with fewer verified matches hang loosely on the block.
-WEAK_MATCHES = 50
-
-
-@dataclass(frozen=True, eq=False)
-class Links:
-    """positions: image_id -> centre in the world. ties: image_id -> verified matches. lines: pairs of placed images,
-    with their matches."""
-
-    positions: Mapping[str, FloatArray]
-    ties: Counter[str]
-    lines: Sequence[tuple[tuple[str, str], int]]
-
-    @classmethod
-    def of(cls, contents: ExportContents, solution: Solution, found: Matched) -> Links:
-        positions = {i: pose.center_m for i, pose in contents.block.poses.items()}
-        positions |= {i: center_m for i, (_, center_m) in solution.poses.items()}
-        positions = {i: center_m for i, center_m in positions.items() if i not in unplaced(contents)}
-        ties: Counter[str] = Counter()
-        for id0, id1, rows in found.pairs:
-            ties.update({id0: len(rows), id1: len(rows)})
-        placed = [((a, b), len(rows)) for a, b, rows in found.pairs if a in positions and b in positions]
-        return cls(positions, ties, placed)
 
 
 class GeoJson(Strategy):

@@ -16,7 +16,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.geojson import WEAK_MATCHES, Links
+from aeromatch_cli.strategies.exporters.links import WEAK_MATCHES, Links
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of
 from aeromatch_cli.strategies.exporters.styles import qml
 

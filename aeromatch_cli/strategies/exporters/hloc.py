@@ -16,7 +16,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
+from aeromatch_cli.strategies.exporters.solution import Solution, called, matched, summary_of, write, write_world
 
 
 class Hloc(Strategy):
@@ -27,9 +27,11 @@ class Hloc(Strategy):
     name: Literal["hloc"] = "hloc"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without h5py."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without h5py, ItemError where two
+        names are one in a pair's."""
         h5py = _h5py()
         solution = Solution.of(contents)
+        called(solution.images, _in_key, "hloc's names of pairs have - for / in those of images")
         names = {image.image_id: image.name for image in solution.images}
         with whole_folder(folder) as partial:
             write_world(partial, contents.block)
@@ -57,7 +59,11 @@ class Hloc(Strategy):
 
 def pair_key(name0: str, name1: str) -> str:
     """hloc's name of a pair's group."""
-    return "/".join(name.replace("/", "-") for name in (name0, name1))
+    return "/".join(_in_key(name) for name in (name0, name1))
+
+
+def _in_key(name: str) -> str:
+    return name.replace("/", "-")
 
 
 def _pose_lines(solution: Solution) -> list[str]:

@@ -18,7 +18,14 @@ from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, keypoints_of, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import (
+    Solution,
+    called,
+    keypoints_of,
+    matched,
+    summary_of,
+    write,
+)
 
 _ORI = "Ori-aeromatch"
 
@@ -26,16 +33,16 @@ _ORI = "Ori-aeromatch"
 class MicMac(Strategy):
     """Writes Homol/ (tie points of every pair, both ways) and Ori-aeromatch/ (orientations and calibrations)."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["micmac"] = "micmac"
     binary: bool = Field(
         False, description="Write Homol as .dat, MicMac's default, instead of .txt (ExpTxt=1 in its commands)."
     )
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where two names are one in it."""
         solution = Solution.of(contents)
-        names = {image.image_id: image.name.replace("/", "_") for image in solution.images}
+        names = called(solution.images, lambda name: name.replace("/", "_"), "MicMac's names of images have _ for /")
         with whole_folder(folder) as partial:
             found, keypoints = matched(contents), keypoints_of(contents)
             for id0, id1, rows in found.pairs:

@@ -14,11 +14,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
+from aeromatch_cli.strategies.exporters.solution import Solution, called, matched, summary_of, write, write_world
 
 # cereal's marks: a plain view, a new object, a new kind of object.
 _PLAIN, _NEW, _NEW_KIND = 1073741824, 2147483648, 2147483649
@@ -36,19 +35,18 @@ class OpenMvg(Strategy):
         """Replace `folder`. WorkspaceError where it cannot be written, ItemError where two images have one name without
         suffix."""
         solution = Solution.of(contents)
-        stems = [PurePosixPath(image.name).stem for image in solution.images]
-        if len(set(stems)) < len(stems):
-            twice = next(stem for stem in stems if stems.count(stem) > 1)
-            raise ItemError(f"openMVG names features by file names, and several images are called {twice}: rename them")
+        how = "openMVG names features by file names without suffix"
+        stems = called(solution.images, lambda name: PurePosixPath(name).stem, how)
         numbers = {image.image_id: number for number, image in enumerate(solution.images)}
         with whole_folder(folder) as partial:
             write_world(partial, contents.block)
             found = matched(contents)
             keypoints = 0
-            for image, stem in zip(solution.images, stems, strict=True):
+            for image in solution.images:
                 places = np.asarray(contents.keypoints_px(image.image_id), np.float64).reshape(-1, 2)
                 keypoints += len(places)
-                write(partial / "matches" / f"{stem}.feat", "".join(f"{x:.4f} {y:.4f} {_SCALE}\n" for x, y in places))
+                lines = "".join(f"{x:.4f} {y:.4f} {_SCALE}\n" for x, y in places)
+                write(partial / "matches" / f"{stems[image.image_id]}.feat", lines)
             blocks = (
                 f"{numbers[id0]} {numbers[id1]}\n{len(rows)}\n" + "".join(f"{i} {j}\n" for i, j in rows)
                 for id0, id1, rows in found.pairs

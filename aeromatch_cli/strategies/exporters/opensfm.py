@@ -10,19 +10,17 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
-from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, Image
-from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import parameters
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, called, matched, summary_of, write
 
 _TRACKS_HEAD = "OPENSFM_TRACKS_VERSION_v2\n"
 _FEATURES_VERSION = 3
@@ -42,9 +40,7 @@ class OpenSfm(Strategy):
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ItemError where file names are not different."""
         solution = Solution.of(contents)
-        names = {image.image_id: PurePosixPath(image.name).name for image in solution.images}
-        if twice := [name for name, count in Counter(names.values()).items() if count > 1]:
-            raise ItemError(f"OpenSfM calls images by file names, and several are called {twice[0]}: rename them")
+        names = called(solution.images, lambda name: PurePosixPath(name).name, "OpenSfM calls images by file names")
         with whole_folder(folder) as partial:
             found = matched(contents)
             places = {i.image_id: _normalised(contents, i) for i in solution.images}

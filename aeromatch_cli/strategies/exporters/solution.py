@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary
 
 
@@ -155,3 +156,16 @@ def write(path: Path, text: str) -> None:
     """With the folders above it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
+
+
+def called(images: Iterable[Image], name_of: Callable[[str], str], how: str) -> dict[str, str]:
+    """image_id -> what a format calls an image, by its name. Raises ItemError, which says how, where two images would
+    be called the same: one's files would replace the other's."""
+    names: dict[str, str] = {}
+    first: dict[str, str] = {}
+    for image in images:
+        name = names[image.image_id] = name_of(image.name)
+        if name in first:
+            raise ItemError(f"{how}, and several are called {name}, {first[name]} and {image.name}: rename them")
+        first[name] = image.name
+    return names

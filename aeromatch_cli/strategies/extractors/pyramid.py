@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.errors import ItemError
 
 PATCH_PX = 32
 # A patch shows this many keypoint sizes: a keypoint of 5 px has a patch of 32 stored pixels.
@@ -18,7 +19,7 @@ PER_OCTAVE = 2
 STEP = 2.0 ** (-1.0 / PER_OCTAVE)
 _SMALLEST_PX = 32
 # cv2.remap addresses rows by 16 bits.
-_PER_CALL = 512
+_PER_CALL, _LONGEST_PX = 512, 32_766
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ def cut_patches(
 
     sizes_px: (N,) diameters of the keypoints; a patch shows SUPPORT of them from its first pixel's edge to its last's.
     angles_deg: (N,) of the direction, x towards y, that lies along a patch's rows. Bilinear, of the coarsest level that
-    is no coarser than the patch; beyond the picture its edge is repeated.
+    is no coarser than the patch; beyond the picture its edge is repeated. Raises ItemError where that is too long.
     """
     import cv2
 
@@ -74,6 +75,11 @@ def cut_patches(
     which = _levels_for(levels, steps_px)
     for index in np.unique(which):
         level = levels[int(index)]
+        if max(level.gray.shape) > _LONGEST_PX:
+            raise ItemError(
+                f"an image {max(level.gray.shape):,} px long is too long for patches around keypoints: "
+                f"reduce it with --max-size {_LONGEST_PX}"
+            )
         for chunk in _chunks(np.flatnonzero(which == index)):
             cosine, sine = (steps_px[chunk] * f(angles[chunk]) for f in (np.cos, np.sin))
             places = np.stack(

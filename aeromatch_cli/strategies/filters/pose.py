@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray, Camera, Candidates, FloatArray, PairGeometry, Pose, Verdict
-from aeromatch_cli.geometry.cameras import calibration_matrix, undistort
+from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px
+from aeromatch_cli.geometry.prediction import homogeneous
 from aeromatch_cli.strategies import Strategy
 
 _SMALLEST_BASELINE_M = 1e-6
@@ -86,6 +87,4 @@ def predicted_sigma_px(
 
 def _rays(camera: Camera, pose: Pose, undistorted_px: FloatArray) -> FloatArray:
     """World directions (N, 3) of undistorted pixels (N, 2), of depth 1 in the camera."""
-    homogeneous = np.concatenate([undistorted_px, np.ones((len(undistorted_px), 1))], axis=1)
-    rays: FloatArray = homogeneous @ np.linalg.inv(calibration_matrix(camera)).T @ pose.world_rotation
-    return rays
+    return np.asarray(homogeneous(camera, undistorted_px) @ np.asarray(pose.world_rotation))

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray
-from aeromatch_cli.geometry.frames import resize_matrix
 
 # A slight blur takes the noise's highest frequencies, which linear interpolation would treat unevenly.
 _BLUR_PX = 0.8
@@ -17,7 +16,9 @@ _EVEN_PX = 5.0
 _NOISE = 0.02  # of a picture's deviation: contrast below is none
 _BORDER_PX = 2.0  # of the picture that blur and gradients have spoilt
 _FAR_PX = 1e6
-_ROW = 256  # OpenCV's remap takes pictures of places, not lists
+# OpenCV's remap takes pictures of places, not lists, and of fewer than 32,767 rows: the windows of 11,506 grid points
+# have more.
+_ROW, _ROWS = 256, 16_384
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +39,6 @@ class Level:
     @property
     def values(self) -> NDArray[np.float32]:
         return self.planes[..., 0]
-
-    @property
-    def from_frame(self) -> FloatArray:
-        """(3, 3) level px from frame px."""
-        return resize_matrix(self.scale)
 
     def sample(self, places_px: FloatArray) -> tuple[NDArray[np.float32], BoolArray]:
         """Planes (N, 3) at places (N, 2) in level px, bilinear, and which places are known (N,)."""
@@ -113,5 +109,8 @@ def bilinear_at(picture: NDArray[Any], places_px: FloatArray) -> NDArray[np.floa
         np.clip(places_px, -_FAR_PX, _FAR_PX, out=places[:count], casting="unsafe")
     places[~np.isfinite(places)] = -_FAR_PX
     maps = places.reshape(rows, _ROW, 2)
-    found = cv2.remap(picture, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(found.reshape(-1, *found.shape[2:])[:count])
+    found = np.empty((rows, _ROW, *picture.shape[2:]), np.float32)
+    for first in range(0, rows, _ROWS):
+        part = maps[first : first + _ROWS]
+        cv2.remap(picture, part[..., 0], part[..., 1], cv2.INTER_LINEAR, dst=found[first : first + _ROWS])
+    return found.reshape(-1, *found.shape[2:])[:count]

@@ -49,6 +49,9 @@ _CREDIBLE = 0.4
 # What a prior allows in the end: so much more than its reach, a share of the longer side, and what relief makes.
 _STRETCH, _ROUGH = 1.25, 0.01
 _ROUGH_TURN_RAD, _ROUGH_LOG_SCALE = np.deg2rad(5.0), 0.1
+# What is searched at most, however little a prior says: beyond half a turn turns repeat, and canvases grow with the
+# range of scales. A pair that differs by more than a factor of two shares hardly any texture.
+_WIDEST_TURN_RAD, _WIDEST_LOG_SCALE = np.pi, np.log(2.0)
 # On the finest level: a similarity that is off by more, in the mean, holds in a part of the overlap only.
 _BENT_PX = 0.5
 _ASTRAY_PX = 5.0  # on the finest level, from what the one before says
@@ -99,8 +102,8 @@ class Prior:
 
     def search(self, scale: float, turn_step_deg: float, scale_ratio: float) -> Search:
         """For pictures reduced to `scale`."""
-        turns = int(np.ceil(np.rad2deg(self.turn_rad) / turn_step_deg))
-        scales = int(np.ceil(self.log_scale / np.log(scale_ratio)))
+        turns = int(np.ceil(np.rad2deg(min(self.turn_rad, _WIDEST_TURN_RAD)) / turn_step_deg))
+        scales = int(np.ceil(min(self.log_scale, _WIDEST_LOG_SCALE) / np.log(scale_ratio)))
         return Search(
             np.deg2rad(turn_step_deg) * np.arange(-turns, turns + 1),
             scale_ratio ** np.arange(-scales, scales + 1.0),
