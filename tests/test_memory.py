@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from conftest import Site
+from conftest import UNORIENTED, Site
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.executor import Executor
-from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network, worker_mb
+from aeromatch_cli.stages.memory import budget_mb, command_mb, jobs_within, runs_network, worker_mb
 
 
 def image(width: int, height: int) -> Image:
@@ -58,6 +58,24 @@ def test_workers_fit_the_budget() -> None:
 ])  # fmt: skip
 def test_networks_count_wherever_they_run(preset: str, words: tuple[str, ...], network: bool) -> None:
     assert runs_network(load(preset, words)) is network
+
+
+def test_a_command_needs_memory_for_itself_and_its_workers() -> None:
+    each = worker_mb(12.0, network=True, stored=48.0)
+    assert command_mb(4, 12.0, network=True, stored=48.0) == pytest.approx(400.0 + 4.0 * each)
+    # A single worker is the command's own process, whose libraries count once.
+    assert command_mb(1, 12.0, network=True, stored=48.0) == pytest.approx(400.0 + each - 350.0)
+
+
+@pytest.mark.slow
+def test_check_counts_networks_and_reduced_images(site: Site) -> None:
+    told = {
+        words: site("check", *UNORIENTED, *words, "--jobs", "2").facts["estimate"]["memory_mb"]
+        for words in ((), ("--max-size", "100"), ("--set", "match=lightglue"))
+    }
+    plain, reduced, network = told.values()
+    assert reduced < plain
+    assert network - plain == pytest.approx(2 * 900.0, abs=2)
 
 
 def test_an_executor_keeps_to_its_limit() -> None:

@@ -75,8 +75,7 @@ def jobs_within(
     each = f"each needs about {need:.0f} MB for images of {megapixels:.0f} megapixels"
     if most >= 1:
         return most, f"memory: {most} of {jobs} workers, as {each}"
-    # A single worker is this process itself.
-    alone = worker_mb(megapixels, stored=stored) - _BASE_MB + _PARENT_MB
+    alone = command_mb(1, megapixels, stored=stored)
     if alone > budget:
         raise ConfigError(
             f"memory: {largest.name} has {stored:.1f} megapixels, and this program needs about {alone:.0f} MB for it; "
