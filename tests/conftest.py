@@ -9,8 +9,9 @@ import shutil
 import signal
 import sqlite3
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ import pytest
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.synthetic import block, render_block, truth
+from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.scene import build_scene
 
 IMAGES, WIDTH, HEIGHT = 5, 320, 240
 # Quick settings: few keypoints, one process.
@@ -60,6 +63,24 @@ def one_thread_each() -> None:
     cv2.setNumThreads(1)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def scenes_built_once() -> Iterator[Callable[[], None]]:
+    """Tests judge the same few blocks again and again: a scene is built for the first of them, which takes most of a
+    second. Commands do not keep scenes, a large one is a gigabyte. Gives what forgets them, for a test that must build
+    again."""
+    build, cast = lru_cache(maxsize=2)(build_scene), lru_cache(maxsize=2)(RayCaster)
+
+    def forget() -> None:
+        for kept in (build, cast, block._scene, block._stage):
+            kept.cache_clear()
+
+    with pytest.MonkeyPatch.context() as patched:
+        for module in (block, truth):
+            patched.setattr(module, "build_scene", build)
+            patched.setattr(module, "RayCaster", cast)
+        yield forget
 
 
 def invoke(*arguments: object) -> Outcome:
