@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 from aeromatch_cli.errors import ConfigError
 
-# A scheduler that is busy answers within this time.
+# Where a scheduler listens, it takes the connection within the first time; one that is busy answers within the second.
+_CONNECT_S = 10.0
 _ANSWER_S = 30.0
 T = TypeVar("T")
 
@@ -26,7 +27,7 @@ def connected(client: Callable[..., Any], scheduler: str, jobs: int) -> Any:
         # Port 0: one that is free. Two runs on one machine have their own.
         return client(None, n_workers=jobs, threads_per_worker=1, dashboard_address="127.0.0.1:0")
     try:
-        return _within(_ANSWER_S, lambda: client(scheduler, timeout="10s"))
+        return _within(_ANSWER_S, lambda: client(scheduler, timeout=_CONNECT_S))
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"no dask scheduler answers at {scheduler}: start one (`dask scheduler`), or leave out --scheduler "

@@ -13,11 +13,12 @@ import tempfile
 import time
 import zipfile
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from chaos_faults import OF_FILES, OF_RUNS, PASSING, RUNS, Site, ended
+from chaos_faults import OF_FILES, OF_RUNS, PASSING, RUNS, Fault, Site, ended
 from conftest import contents
 
 from aeromatch_cli.synthetic import render_block
@@ -50,8 +51,13 @@ def _compared(work: Path) -> dict[str, Any]:
     return {name: content for name, content in contents(work).items() if not PASSING & set(Path(name).parts)}
 
 
-def injected(kind: str, seed: int, calm: Calm, preset: str = "") -> str:
-    """One fault; "" where all is as it should be, else what is not."""
+def mended(site: Site) -> None:
+    """The next run, in a process of its own: a fault may make it hang."""
+    ended(site.start())
+
+
+def injected(kind: str | Fault, seed: int, calm: Calm, preset: str = "", mend: Callable[[Site], None] = mended) -> str:
+    """One fault, by its name or of a finished workspace; "" where all is as it should be, else what is not."""
     rng = random.Random(seed)
     preset = preset or rng.choice(list(RUNS))
     seconds, expected = calm.expected(preset)
@@ -59,10 +65,10 @@ def injected(kind: str, seed: int, calm: Calm, preset: str = "") -> str:
     site = Site(calm.block, calm.folder / "disturbed" / preset, preset, seconds)
     shutil.rmtree(site.work, ignore_errors=True)
     try:
-        if kind in OF_FILES:
+        if not isinstance(kind, str) or kind in OF_FILES:
             shutil.copytree(calm.work(preset), site.work)
-        KINDS[kind](site, rng)
-        ended(site.start())
+        (KINDS[kind] if isinstance(kind, str) else kind)(site, rng)
+        mend(site)
         found = _compared(site.work)
         different = sorted(n for n in {*found, *expected} if not _same(found.get(n), expected.get(n)))
         assert not different, f"other files than of an undisturbed run: {', '.join(different[:5])}"

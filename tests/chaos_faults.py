@@ -274,7 +274,8 @@ def _begun(site: Site, rng: random.Random) -> subprocess.Popen[str]:
     process = site.start()
     while process.poll() is None and not list(site.work.rglob("features/*.npz")):
         time.sleep(0.05)
-    site.wait(rng)
+    # After a longer wait it has often ended.
+    time.sleep(rng.uniform(0.0, 0.2 * site.seconds))
     return process
 
 
@@ -295,10 +296,12 @@ def _input_replaced(site: Site, rng: random.Random) -> None:
     image, other = rng.sample(sorted((site.block / "images").iterdir()), 2)
     aside = image.with_name(f".{image.name}.aside")
     process = _begun(site, rng)
+    still_running = process.poll() is None
     shutil.copy2(image, aside)
     shutil.copy(other, image)
     try:
         ended(process, (0, 1))
+        assert still_running, "the run had ended before its input was replaced"
     finally:
         aside.replace(image)
 
@@ -320,7 +323,10 @@ def _chosen(site: Site, rng: random.Random) -> Path:
 
 
 def _byte_flipped(site: Site, rng: random.Random) -> None:
-    path = _chosen(site, rng)
+    flip_byte(_chosen(site, rng), rng)
+
+
+def flip_byte(path: Path, rng: random.Random) -> None:
     data = bytearray(path.read_bytes())
     if data:
         data[rng.randrange(len(data))] ^= rng.randrange(1, 256)

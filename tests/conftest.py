@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import json
+import os
 import shutil
 import signal
 import sqlite3
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,9 @@ import pytest
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.synthetic import block, render_block, truth
+from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.scene import build_scene
 
 IMAGES, WIDTH, HEIGHT = 5, 320, 240
 # Quick settings: few keypoints, one process.
@@ -60,6 +65,24 @@ def one_thread_each() -> None:
     cv2.setNumThreads(1)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def scenes_built_once() -> Iterator[Callable[[], None]]:
+    """Tests judge the same few blocks again and again: a scene is built for the first of them, which takes most of a
+    second. Commands do not keep scenes, a large one is a gigabyte. Gives what forgets them, for a test that must build
+    again."""
+    build, cast = lru_cache(maxsize=2)(build_scene), lru_cache(maxsize=2)(RayCaster)
+
+    def forget() -> None:
+        for kept in (build, cast, block._scene, block._stage):
+            kept.cache_clear()
+
+    with pytest.MonkeyPatch.context() as patched:
+        for module in (block, truth):
+            patched.setattr(module, "build_scene", build)
+            patched.setattr(module, "RayCaster", cast)
+        yield forget
 
 
 def invoke(*arguments: object) -> Outcome:
@@ -125,28 +148,45 @@ class Site:
         return self.root / name
 
 
+def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """The folder of a session, made by whichever process of pytest-xdist needs it first; the others wait for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    finished = folder.with_name(f"{name}.made")
+    with folder.with_name(f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # of a process that dies it is taken
+        if not finished.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            finished.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five overlapping images with poses; tests copy it and leave this one alone."""
-    folder = tmp_path_factory.mktemp("rendered")
-    render_block(folder, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=IMAGES)
-    return folder
+
+    def make(folder: Path) -> None:
+        render_block(folder, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=IMAGES)
+
+    return _made_once(tmp_path_factory, "rendered", make)
+
+
+def _finished(rendered: Path, folder: Path, settings: tuple[str, ...] = ()) -> None:
+    assert _copied(rendered, folder, settings)("run").code == 0
 
 
 @pytest.fixture(scope="session")
 def finished(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site on which `run` has been through once; tests copy it."""
-    site = _copied(rendered, tmp_path_factory.mktemp("finished"))
-    assert site("run").code == 0
-    return site.root
+    return _made_once(tmp_path_factory, "finished", lambda folder: _finished(rendered, folder))
 
 
 @pytest.fixture(scope="session")
 def finished_unoriented(rendered: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same without orientation."""
-    site = _copied(rendered, tmp_path_factory.mktemp("unoriented"), UNORIENTED)
-    assert site("run").code == 0
-    return site.root
+    return _made_once(tmp_path_factory, "unoriented", lambda folder: _finished(rendered, folder, UNORIENTED))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import IMAGES, Site
+from conftest import IMAGES, UNORIENTED, Site
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import Camera, Matches, Pair, PairGeometry, Pose, Verdict
@@ -24,6 +24,8 @@ from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.union import joined_keypoints, joined_matches
 from aeromatch_cli.strategies.extractors.described import Described
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows
+
+SETTINGS = UNORIENTED
 
 CAMERA = Camera("SIMPLE_PINHOLE", 800, 600, (800.0, 399.5, 299.5))
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -138,7 +140,8 @@ def test_of_matches_that_contradict_or_lie_together_the_verified_one_stays() -> 
 
 @pytest.mark.slow
 def test_a_cascade_ends_in_one_result(site: Site) -> None:
-    """All pairs take the second step; keypoints and matches of both are one result, made once."""
+    """All pairs take the second step; keypoints and matches of both are one result, made once. With orientation."""
+    site = Site(site.root)
     settings = ("--set", "cascade=shadow", "--set", "cascade.shadow.below_matches=100000")
     settings += ("--set", "cascade.shadow.keypoints=300")
     outcome = site("run", *settings)

@@ -14,41 +14,14 @@ from pathlib import Path
 import pytest
 from conftest import heed_interrupts
 from dask_cluster import Processes, dask_cluster, dask_worker
-from make_slow import slow_square
+from make_slow import Task, slow_square, work
 
 from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.cli.progress import TerminalProgress
-from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
+from aeromatch_cli.errors import ConfigError, WorkspaceError
 from aeromatch_cli.executor import Executor, Outcome, guarded
 from aeromatch_cli.fingerprints import stable_hash
 from aeromatch_cli.workers import available_cores
-
-
-@dataclass(frozen=True)
-class Task:
-    """What to do with a number: square | fail | defect | memory | disk | die | die-once."""
-
-    number: int
-    action: str = "square"
-    marks: str = ""
-
-
-def work(task: Task) -> int:
-    if task.marks:
-        with Path(task.marks, str(task.number)).open("a") as stream:
-            stream.write("x")
-    if task.action == "fail":
-        raise ItemError(f"image {task.number} is corrupt")
-    if task.action == "defect":
-        raise IndexError("an unforeseen thing")
-    if task.action == "memory":
-        raise MemoryError
-    if task.action == "disk":
-        raise WorkspaceError("disk full")
-    if task.action == "die" or (task.action == "die-once" and len(Path(task.marks, str(task.number)).read_text()) == 1):
-        os._exit(1)
-    time.sleep(0.002 * (task.number % 3))
-    return task.number**2
 
 
 def threads(_: int) -> tuple[int, int, str]:
@@ -97,7 +70,7 @@ def test_one_failing_task_leaves_the_others(pool: Executor) -> None:
         found = executor.run(work, tasks, "x")
         assert [one.value for one in found] == [1, None, None, None, 25]
         assert found[1].error == "image 2 is corrupt"
-        assert found[2].error.startswith("unexpected IndexError at test_executor.py:")
+        assert found[2].error.startswith("unexpected IndexError at make_slow.py:")
         assert found[2].error.endswith("an unforeseen thing")
         assert "out of memory" in found[3].error
 
@@ -133,7 +106,9 @@ def test_a_full_disk_stops_everything(tmp_path: Path, kind: str) -> None:
     tasks = [Task(0, "disk"), *(Task(number, marks=str(tmp_path)) for number in range(1, 1000))]
     with pytest.raises(WorkspaceError, match="disk full"), Executor(kind, 2) as executor:
         executor.run(work, tasks, "x")
-    assert len(list(tmp_path.iterdir())) < 250
+    begun = len(list(tmp_path.iterdir()))
+    # Workers have some in hand when the first one fails.
+    assert begun == 0 if kind == "serial" else begun < 250
 
 
 def test_workers_use_one_thread(pool: Executor) -> None:
@@ -244,12 +219,30 @@ def test_a_killed_dask_worker_loses_no_task(cluster: tuple[str, Processes]) -> N
     address, workers = cluster
     with Executor("dask", scheduler=address) as executor:
         assert [o.value for o in executor.run(slow_square, [3], "first")] == [9]
-        killer = threading.Timer(1.0, workers[0].kill)
+        deadline = time.monotonic() + 30
+        while (came := names(executor)) != {"plain", "gpu"} and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert came == {"plain", "gpu"}
+        done: list[int] = []
+
+        def kill() -> None:
+            while executor._tried < 2 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            done.append(executor._tried)
+            workers[0].kill()
+
+        killer = threading.Thread(target=kill)
         killer.start()
-        outcomes = executor.run(slow_square, list(range(20)), "squares")
+        outcomes = executor.run(slow_square, list(range(10)), "squares")
         killer.join()
-    assert [outcome.value for outcome in outcomes] == [number**2 for number in range(20)]
+    assert [outcome.value for outcome in outcomes] == [number**2 for number in range(10)]
+    assert 2 <= done[0] < 8  # the killed worker had its task, and others waited
     assert workers[0].wait(10) != 0
+
+
+def names(executor: Executor) -> set[str]:
+    """Of the dask workers that have come."""
+    return {str(worker["name"]) for worker in executor._client.scheduler_info()["workers"].values()}
 
 
 def worker_name(number: int) -> str:
@@ -340,18 +333,28 @@ def test_a_scheduler_without_workers_is_said_and_waited_for(caplog: pytest.LogCa
         for worker in workers:
             worker.kill()
             worker.wait()
-        late = threading.Timer(3.0, lambda: workers.append(dask_worker(address, "--name", "late")))
+        waiting = f"the dask scheduler {address} has no workers: waiting for one"
+
+        def come() -> None:
+            deadline = time.monotonic() + 30
+            while waiting not in caplog.text and time.monotonic() < deadline:
+                time.sleep(0.05)
+            workers.append(dask_worker(address, "--name", "late"))
+
+        late = threading.Thread(target=come)
         late.start()
         with Executor("dask", scheduler=address) as executor:
             assert executor.run(slow_square, [3], "x")[0].value == 9
-        assert f"the dask scheduler {address} has no workers: waiting for one" in caplog.text
+        late.join()
+        assert waiting in caplog.text
         workers[-1].kill()
         workers[-1].wait()
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_does_not_answer_is_named() -> None:
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
+    monkeypatch.setattr("aeromatch_cli.dask_client._CONNECT_S", 1.0)
     with pytest.raises(ConfigError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9: start one"):
         Executor("dask", scheduler="tcp://127.0.0.1:9").run(slow_square, [1], "x")
 

@@ -104,6 +104,8 @@ def test_the_summary_counts_and_names_what_is_there(name: str, contents, truth: 
 def test_a_block_without_adjustment_is_exported_too(name: str, truth: Truth, tmp_path: Path) -> None:
     summary = EXPORTERS[name]()(truth.contents(), tmp_path / name)  # type: ignore[operator]
     assert summary.files
+    assert [path for path in summary.files if path.stat().st_size == 0] == []
+    assert summary.verified_matches == sum(len(pair.verified) for pair in truth.pairs)
 
 
 def test_tracks_join_verified_matches_and_end_where_one_image_is_seen_twice(truth: Truth) -> None:

@@ -8,13 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import HEIGHT, IMAGES, WIDTH
+from conftest import HEIGHT, IMAGES, UNORIENTED, WIDTH, Site
 from make_images import write_bands, write_jpeg_2000
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.workspace import Workspace
 
 pytestmark = pytest.mark.slow
+
+SETTINGS = UNORIENTED
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 
@@ -36,7 +38,13 @@ def test_equal_names_in_two_folders(site):
     assert site("run").code == 2
 
 
+def oriented(site: Site) -> Site:
+    """The same with orientation, which has its own use of names, copies and poses."""
+    return Site(site.root)
+
+
 def test_unicode_and_blanks_in_names(site):
+    site = oriented(site)
     names = [f"Flug über Łódź {index} #1.JPG" for index in range(IMAGES)]
     for old, new in zip(site.names(), names, strict=True):
         (site.images / old).rename(site.images / new)
@@ -48,6 +56,7 @@ def test_unicode_and_blanks_in_names(site):
 
 
 def test_the_same_picture_twice(site):
+    site = oriented(site)
     shutil.copy(site.image(0), site.images / "copy.jpg")
     site.rewrite_poses(lambda rows: [*rows, {**rows[0], "image": "copy.jpg"}])
     outcome = site("run")
@@ -100,6 +109,7 @@ def test_images_that_do_not_fit_their_camera(site):
 
 
 def test_images_without_any_pose(site):
+    site = oriented(site)
     outcome = site("run", "--poses", "none")
     assert outcome.code == 0
     assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100

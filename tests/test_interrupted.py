@@ -85,6 +85,8 @@ def test_workers_do_not_outlive_a_killed_parent(done_site):
     work = done_site.root / "orphans"
     process = start(done_site, work)
     wait_for_files(process, work, 10)
+    assert process.poll() is None
+    assert len(living(process.pid)) >= 3  # itself and two workers
     process.kill()
     process.communicate(timeout=30)  # ends when the last worker has closed the pipes
     assert nothing_lives(process.pid)

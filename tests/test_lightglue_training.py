@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -12,6 +15,7 @@ import pytest
 import torch
 from make_lightglue import seeded_tensors, write
 from trainings.lightglue import command as train_lightglue
+from trainings.lightglue import data
 from trainings.lightglue.batches import batch_of, piece
 from trainings.lightglue.blocks import Pair
 from trainings.lightglue.data import OutOfTime, mapped, read_groups, write_groups
@@ -100,7 +104,13 @@ def test_the_least_score_is_where_the_precision_ends() -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_nothing_is_begun_when_the_time_is_over(jobs: int) -> None:
+def test_nothing_is_begun_when_the_time_is_over(jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:  # begun once for both calls
+        monkeypatch.setattr(data, "ProcessPoolExecutor", lambda *_, **__: nullcontext(pool))
+        nothing_is_begun_late(jobs)
+
+
+def nothing_is_begun_late(jobs: int) -> None:
     assert mapped(abs, [-1, 2], jobs, time.time() + 1000.0) == [1, 2]
     with pytest.raises(OutOfTime):
         mapped(abs, [-1, 2], jobs, time.time() - 1.0)

@@ -101,7 +101,7 @@ def test_no_more_workers_than_tasks() -> None:
 
 @pytest.mark.slow
 def test_a_run_says_how_many_workers_it_uses(site: Site) -> None:
-    told = site("pairs", "--jobs", "4", "--memory", "1200MB", "--executor", "processes")
+    told = site("pairs", "--jobs", "4", "--memory", "1200MB", "--executor", "processes", "--set", "orient=none")
     assert told.code == 0
     assert "memory: 2 of 4 workers" in told.stderr
     wrong = site("pairs", "--memory", "8")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from conftest import UNORIENTED, Site
+from conftest import QUICK, UNORIENTED, Site
 
 SETTINGS = UNORIENTED
 
@@ -27,11 +28,14 @@ def block_after(heading: str) -> str:
 
 @pytest.fixture
 def shell(site: Site, tmp_path: Path) -> dict[str, str]:
-    """An environment in which `aeromatch` is this one, one process, with cameras of the block."""
+    """An environment in which `aeromatch` is this one, one process, with cameras of the block; its runs are short."""
     folder = tmp_path / "bin"
     folder.mkdir()
     script = folder / "aeromatch"
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m aeromatch_cli.cli "$@"\n')
+    quick = shlex.join([*QUICK, *UNORIENTED])
+    script.write_text(
+        f'#!/bin/sh\n[ "$1" != run ] || set -- "$@" {quick}\nexec "{sys.executable}" -m aeromatch_cli.cli "$@"\n'
+    )
     script.chmod(0o755)
     return os.environ | {
         "PATH": f"{folder}:{os.environ['PATH']}", "AEROMATCH_JOBS": "1",

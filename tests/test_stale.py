@@ -98,7 +98,7 @@ def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
     assert not tilted <= {f"{name}.png" for name in names}
 
 
-@pytest.mark.parametrize("command", ["extract", "match", "run"])
+@pytest.mark.parametrize("command", ["extract", "run"])
 def test_pictures_of_the_same_settings_stay(site: Site, command: str) -> None:
     shadow = ("--set", "enhance=shadow")
     assert site("enhance", *shadow).code == site("simulate", *shadow).code == 0

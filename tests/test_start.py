@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import invoke
 
 HEAVY = {
     *("cv2", "torch", "kornia", "scipy", "matplotlib", "rasterio", "pyproj", "shapely", "poselib", "pycolmap", "PIL"),
@@ -52,28 +53,29 @@ def test_help_answers_in_half_a_second(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "expected", "as_a_process"),
     [
-        (["run", "baselin"], "did you mean 'baseline'?"),
-        (["run", "nowhere.yaml"], "cannot read configuration nowhere.yaml"),
-        (["pairs", "baseline", "--set", "extract.keypointz=1"], "extract.keypointz: unknown key; did you mean"),
-        (["check", "baseline", "--set", "nonsense"], "write key.sub=value"),
-        (["run", "baseline", "--executor", "threads"], "run.executor: must be 'serial', 'processes' or 'dask'"),
-        (["run", "baseline", "--set", "pairs=file", "--set", "pairs.path=gone.txt", "--images", "."], "gone.txt"),
+        (["run", "baselin"], "did you mean 'baseline'?", True),
+        (["run", "nowhere.yaml"], "cannot read configuration nowhere.yaml", False),
+        (["pairs", "baseline", "--set", "extract.keypointz=1"], "extract.keypointz: unknown key; did you mean", False),
+        (["check", "baseline", "--set", "nonsense"], "write key.sub=value", False),
+        (["run", "baseline", "--executor", "threads"], "run.executor: must be 'serial', 'processes' or 'dask'", False),
+        (["run", "baseline", "--set", "pairs=file", "--set", "pairs.path=gone.txt", "--images", "."], "gone.txt", True),
     ],
 )
 def test_wrong_configurations_leave_with_code_2_and_no_traceback(
-    tmp_path: Path, arguments: list[str], expected: str
+    tmp_path: Path, arguments: list[str], expected: str, as_a_process: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from make_images import write_image
 
     write_image(tmp_path / "a.jpg")
     write_image(tmp_path / "b.jpg")
-    command = [sys.executable, "-m", "aeromatch_cli.cli", *arguments]
-    if arguments[0] != "check":
-        command += ["--workspace", str(tmp_path / "work")]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 2, done.stderr
-    assert expected in done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stdout == ""
+    monkeypatch.chdir(tmp_path)
+    words = arguments if arguments[0] == "check" else [*arguments, "--workspace", str(tmp_path / "work")]
+    found = invoke(*words)
+    assert (found.code, found.stdout) == (2, "")
+    assert expected in found.stderr
+    if as_a_process:
+        command = [sys.executable, "-m", "aeromatch_cli.cli", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", found.stderr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -293,7 +294,10 @@ def test_ground_grid_is_closed_and_shared_between_areas() -> None:
     assert (normals[:, 2] > 0).all()
 
 
-def test_equal_seeds_give_equal_bytes_and_other_seeds_other_scenes(folder: Path, tmp_path: Path) -> None:
+def test_equal_seeds_give_equal_bytes_and_other_seeds_other_scenes(
+    folder: Path, tmp_path: Path, scenes_built_once: Callable[[], None]
+) -> None:
+    scenes_built_once()  # or this process would not build the scene a second time
     render_block(tmp_path / "again", "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3, jobs=2)
     written = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     assert len(written) == 3 + 3 * 3 + 6

@@ -246,14 +246,14 @@ def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
     extract_s, calls = Sift.__call__, []
 
     def slow_to_start(self, camera, views):
-        time.sleep(0.0 if calls else 3.0)  # as a network that is loaded
+        time.sleep(0.0 if calls else 1.2)  # as a network that is loaded
         calls.append(len(views))
         return extract_s(self, camera, views)
 
     monkeypatch.setattr(Sift, "__call__", slow_to_start)
     estimate = site("check").facts["estimate"]
-    assert estimate["seconds_to_start"] > 3.0
-    assert estimate["seconds_per_image"] < 1.5
+    assert estimate["seconds_to_start"] > 1.2
+    assert estimate["seconds_per_image"] < 0.6
     work = len(site.names()) * estimate["seconds_per_image"] + estimate["pairs"] * estimate["seconds_per_pair"]
     assert 0.0 < estimate["seconds_to_orient"] < 10.0
     work += estimate["seconds_to_orient"]
