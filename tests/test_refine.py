@@ -10,23 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import IMAGES, UNORIENTED, Site
+from conftest import Site
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pair, PairGeometry, Pose
-from aeromatch_cli.errors import ItemError
+from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
 from aeromatch_cli.evaluate import open_truth
+from aeromatch_cli.fingerprints import picture_fingerprint
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.images.source import Source
 from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
-from aeromatch_cli.stages import measuring, refine
+from aeromatch_cli.stages import measuring
 from aeromatch_cli.stages.measuring import _far_inside
 from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, LeastSquares, Patches
 from aeromatch_cli.workspace import Workspace
@@ -231,111 +231,13 @@ def test_near_the_edge_of_a_picture_or_of_a_mask_nothing_is_measured() -> None:
     assert _far_inside((80, 100), valid, places).tolist() == [*everywhere[:7], False, True]
 
 
-@pytest.mark.slow
-def test_what_lacked_a_picture_is_made_again_when_it_is_back(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    work = Workspace(done_site.work)
-    kept = [work.adjusted, work.dropped, *sorted(work.refined_files.parent.glob("*.npz"))]
-    before = {path: path.read_bytes() for path in kept if path.is_file()}
-    name = done_site.names()[1]
-
-    def unreadable(source: Source, *, colour: bool) -> tuple[NDArray[Any], BoolArray | None]:
-        if source.path.name == name:
-            raise ItemError(f"image {name} cannot be read")
-        return read_source(source, colour=colour)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(refine, "read_source", unreadable)
-        patch.setattr(measuring, "read_source", unreadable)
-        outcome = done_site("adjust", "--overwrite", "--executor", "serial")
-        assert outcome.code == 1
-        made = {path: path.stat().st_mtime_ns for path in (work.adjusted, work.refined_files)}
-        again = done_site("adjust", "--executor", "serial")
-        # What can be made without it is not made again.
-        assert again.code == 1
-        assert "cannot be read" in (work.failures).read_text()
-        assert {path: path.stat().st_mtime_ns for path in made} == made
-    assert work.adjusted.read_bytes() != before[work.adjusted]
-    assert done_site("adjust").code == 0
-    assert "cannot be read" not in (work.failures).read_text()
-    assert {path: path.read_bytes() for path in before} == before
-
-
-@pytest.mark.slow
-def test_images_measured_in_parts_are_measured_alike(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    work = Workspace(done_site.work)
-    before = _files(work)
-    monkeypatch.setattr(refine, "_IMAGES_AT_ONCE", 2)
-    assert done_site("adjust", "--overwrite", "--executor", "serial").code == 0
-    assert _files(work) == before
-
-
-def _files(work: Workspace) -> dict[str, bytes]:
-    folder = work.refined_files.parent
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-@pytest.mark.slow
-def test_a_stage_that_was_stopped_goes_on_and_ends_alike(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was measured before is not measured again."""
-    work = Workspace(done_site.work)
-    before = _files(work)
-    names = sorted(path.stem for path in work.measured("").parent.glob("*.npz"))
-    assert len(names) >= IMAGES - 1  # nothing measures an image all of whose keypoints stand for their points
-    work.refined_files.unlink()
-    for name in names[2:]:
-        work.measured(name).unlink()
-    measured: list[str] = []
-
-    def spied(task: measuring.MeasureTask) -> measuring.Measured:
-        measured.append(task.image_id)
-        return measuring.measure(task)
-
-    monkeypatch.setattr(refine, "measure", spied)
-    assert done_site("adjust", "--executor", "serial").code == 0
-    assert sorted(measured) == names[2:]
-    assert _files(work) == before
-    # A file that does not hold what it should is no reason to stop, nor to believe it.
-    damaged = work.measured(names[0])
-    damaged.write_bytes(damaged.read_bytes()[:-30])
-    work.refined_files.unlink()
-    measured.clear()
-    assert done_site("adjust", "--executor", "serial").code == 0
-    assert measured == names[:1]
-    assert _files(work) == before
-
-
-@pytest.mark.slow
-def test_a_further_image_has_its_neighbours_measured_anew(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    chain = (*UNORIENTED, "--set", "pairs=sequential", "--set", "pairs.window=1", "--executor", "serial")
-    last = site.image(-1)
-    away = site.root / last.name
-    last.rename(away)
-    assert site("run", *chain).code == 0
-    away.rename(last)
-    measured: list[str] = []
-
-    def spied(task: measuring.MeasureTask) -> measuring.Measured:
-        measured.append(task.image_id)
-        return measuring.measure(task)
-
-    monkeypatch.setattr(refine, "measure", spied)
-    assert site("run", *chain).code == 0
-    ids = [name.replace(".", "_") for name in site.names()]
-    # Other keypoints may stand for the points that the new image sees, too: no further than along these points.
-    assert set(measured) & {ids[-1], ids[-2]}
-    assert ids[0] not in measured
-    before = _files(Workspace(site.work))
-    assert site("adjust", *chain, "--overwrite").code == 0
-    assert _files(Workspace(site.work)) == before
-
-
 def cut(folder: Path, pixels: NDArray[Any], places_px: FloatArray, scale: float = 1.0) -> NDArray[np.uint8]:
     """Patches of a picture that is written and read again."""
     import cv2
 
     cv2.imwrite(str(folder / "a.tif"), pixels)
     camera = Camera("SIMPLE_PINHOLE", pixels.shape[1], pixels.shape[0], (500.0, 0.0, 0.0))
-    source = Source(folder / "a.tif", None, camera, None, scale, "")
+    source = Source(folder / "a.tif", None, camera, None, scale, "", picture_fingerprint(folder / "a.tif"))
     assert measuring.cut_patches(measuring.CutTask(source, places_px, folder / "patches.npy")) == len(places_px)
     return np.asarray(np.load(folder / "patches.npy"))
 

@@ -23,7 +23,7 @@ from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, write_match_row, write_verified_row
 from aeromatch_cli.report import gathering
 from aeromatch_cli.report import page as report
-from aeromatch_cli.report.adjustment import Adjustment, adjustment_notices
+from aeromatch_cli.report.adjustment import Adjustment
 from aeromatch_cli.report.gathering import Gathered, gather
 from aeromatch_cli.report.pair_viewer import pair_table
 from aeromatch_cli.report.previews import chosen_previews
@@ -209,33 +209,6 @@ def test_images_tell_the_views_that_the_steps_of_a_cascade_made(full):
     write_json(full.workspace.step("learned", "learned").enhanced("b", ".json"), {"shadow_share": 0.2})
     of_b = gather(cascaded).images[1]
     assert (of_b.views, of_b.shadow) == (1, 0.2)
-
-
-def test_an_adjustment_of_earlier_matches_is_left_out_and_named(full):
-    told = StageReport("adjust", items=4, done=4)
-    told.facts = {"images": 4, "points": 77, "remarks": ["a remark"], "outside": {}, "control": None}
-    told.write(full.workspace)
-    page = page_of(full)
-    assert "Adjustment and points are older than the matches" in page
-    assert "a remark" not in page
-    assert ">77 in" not in page
-
-
-def test_control_points_that_say_nothing_are_named():
-    control = {"points": 4, "control": 4, "check": 0, "not_measured_in_two_images": ["p3", "p4"], "doubtful": [],
-               "rays_do_not_meet": ["p2"], "control_rmse_m": None, "check_rmse_m": None}  # fmt: skip
-    (notice,) = adjustment_notices([], Adjustment({"control": control}))
-    assert "fewer than 3 are measured in two oriented images" in notice.text
-    assert "rays do not meet of p2" in notice.text
-
-
-def test_a_frame_of_its_own_has_no_metres(full):
-    oriented = StageReport("orient", items=4, done=4)
-    oriented.facts = {"frame": "own"}
-    oriented.write(full.workspace)
-    page = page_of(full)
-    assert "x, arbitrary units" in page
-    assert "metres" not in page.split('id="settings"')[0].replace("no metre", "")
 
 
 def test_page_shows_headline_tables_and_reasons(full):

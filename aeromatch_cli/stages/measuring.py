@@ -21,6 +21,7 @@ from aeromatch_cli.formats.reading import say_damaged
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.stages.enhance import check_unchanged
 from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, REACH_PX, LeastSquares, Patches
 
 _PATCHES = "patches"
@@ -94,6 +95,7 @@ def cut_patches(task: CutTask) -> int:
     """Write the patches of an image; how many there are. Those near its edge, or near what a mask hides, are empty:
     nothing is measured there."""
     pixels, valid = read_source(task.source, colour=False)
+    check_unchanged(task.source)
     places = in_working_frame(task.points_px.astype(np.float64), task.source.scale)
     side = 2 * PATCH_HALF_PX + 1
     padded = np.pad(pixels, PATCH_HALF_PX, mode="edge")
