@@ -240,6 +240,15 @@ def test_the_environment_asks_for_json_as_the_option_does(monkeypatch):
     assert invoke("run", "--job", "3").stdout == ""
 
 
+def test_a_place_that_a_script_left_empty_is_not_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = {"--workspace": ("run", "--workspace", ""), "--poses": ("check", "--images", ".", "--poses", "")}
+    for option, words in (given | {"--masks": ("pairs", "--masks=")}).items():
+        outcome = invoke(*words, "--json")
+        assert (outcome.code, f"{option} is empty" in outcome.facts["error"]) == (2, True)
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_defect_is_no_success_and_leaves_a_traceback_in_the_log(site, monkeypatch):
     from aeromatch_cli.stages import run
 

@@ -44,7 +44,11 @@ def test_a_sound_block_is_called_so() -> None:
         ),
         ({"adjust": {"groups": [{"kind": "level"}] * 3}}, ["3 parts whose scale and place nothing ties", "--poses"]),
         ({"adjust": {"groups": [{"kind": "positions"}] * 2}}, ["sound: all 4 images are connected and oriented"]),
-        ({"adjust": {"images": 0}}, ["sound: all 4 images are connected; they are not oriented"]),
+        ({"adjust": {"images": 0}}, ["sound: all 4 images are connected; not oriented, as orient=none asks"]),
+        (
+            {"adjust": {"images": 0, "remarks": ["not done: no image is oriented"]}},
+            ["not sound: no image is oriented", "known positions and attitudes (--poses)"],
+        ),
         (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
             ["not sound: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],

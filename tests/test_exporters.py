@@ -169,7 +169,7 @@ def test_opensfm_reads_matches_cameras_and_positions(contents, truth: Truth, tmp
 def test_opensfm_refuses_two_images_of_one_file_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(i, name=f"{k}/same.jpg") for k, i in enumerate(truth.block.images)]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(ItemError, match=r"several are called same\.jpg"):
+    with pytest.raises(ItemError, match=r"would both be called same\.jpg"):
         EXPORTERS["opensfm"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "o")  # type: ignore[operator]
 
 
@@ -306,7 +306,7 @@ def test_openmvg_has_views_poses_features_and_matches(contents, truth: Truth, tm
 def test_openmvg_refuses_two_images_of_one_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(image, name=f"{image.name[0:6]}/same.jpg") for image in truth.block.images]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(ItemError, match="several are called same"):
+    with pytest.raises(ItemError, match="would both be called same"):
         EXPORTERS["openmvg"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "v")  # type: ignore[operator]
 
 

@@ -49,7 +49,7 @@ def test_two_images_whose_files_would_be_one_are_refused(
     contents = renamed(truth, *names)
     with pytest.raises(ItemError) as raised:
         EXPORTERS[exporter]()(contents, tmp_path / "e")  # type: ignore[operator]
-    assert f"several are called {same}, {names[0]} and {names[1]}: rename them" in str(raised.value)
+    assert f"{names[0]} and {names[1]} would both be called {same}: rename one" in str(raised.value)
     assert not (tmp_path / "e").exists()
 
 

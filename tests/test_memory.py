@@ -68,14 +68,14 @@ def test_a_command_needs_memory_for_itself_and_its_workers() -> None:
 
 
 @pytest.mark.slow
-def test_check_counts_networks_and_reduced_images(site: Site) -> None:
+def test_check_counts_all_workers_and_reduced_images(site: Site) -> None:
     told = {
         words: site("check", *UNORIENTED, *words, "--jobs", "2").facts["estimate"]["memory_mb"]
-        for words in ((), ("--max-size", "100"), ("--set", "match=lightglue"))
+        for words in ((), ("--max-size", "100"))
     }
-    plain, reduced, network = told.values()
+    plain, reduced = told.values()
     assert reduced < plain
-    assert network - plain == pytest.approx(2 * 900.0, abs=2)
+    assert plain > 400.0 + 2 * 350.0
 
 
 def test_an_executor_keeps_to_its_limit() -> None:

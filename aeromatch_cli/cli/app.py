@@ -42,8 +42,22 @@ class _Commands(TyperGroup):
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
         """Keeps the arguments as they were written, for the log file."""
         written = list(args)  # parsing uses them up
+        _refuse_empty(written)
         options["obj"] = {ARGUMENTS: written}
         return super().make_context(info_name, args, *rest, **options)
+
+
+# Options whose value is a place: an unset variable of a script leaves it empty, and that would be the current folder.
+_PLACES = ("workspace", "images", "poses", "cameras", "masks", "gcp", "ground", "out", "truth", "log-file")
+
+
+def _refuse_empty(written: list[str]) -> None:
+    """Raises the parser's error for an option of a place with an empty value."""
+    for place, word in enumerate(written):
+        name, stated, value = word.partition("=")
+        after = written[place + 1] if place + 1 < len(written) else None
+        if name.startswith("--") and name[2:] in _PLACES and (value if stated else after) == "":
+            raise typer.BadParameter(f"{name} is empty: give its value, or leave the option out")
 
 
 def _stated_by_environment() -> bool:

@@ -170,6 +170,7 @@ class Outcome(Line):
     ]
     workspace: str = Field(description="Folder of the results.")
     failures: int = Field(description="Images and pairs that failed; failures.csv names them.")
+    sound: bool | None = Field(None, description="Of a whole `run`: whether its line `result` says sound.")
     stages: Stages = Field(description="What each stage did.")
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.files import read_json
@@ -120,10 +121,8 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
     cascade, whose shards report in the folders of the steps."""
     groups: dict[tuple[str, bool], list[dict[str, Any]]] = {}
     shards: dict[str, set[str]] = {}
-    in_steps = (workspace.root / "steps").glob("*/reports/*-of-*.json")
-    for path in (*sorted(workspace.reports.glob("*.json")), *sorted(in_steps)):
+    for path, report in _reports(workspace):
         shard = re.fullmatch(r".+\.(\d+-of-\d+)", path.stem)
-        report = read_json(path)
         groups.setdefault((str(report["stage"]), shard is not None), []).append(report)
         if shard:
             shards.setdefault(str(report["stage"]), set()).add(shard[1])
@@ -143,6 +142,21 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         facts = "" if sharded else _facts_words(reports[0]["facts"])
         rows.append(StageRow(label, seconds, items, done, skipped, failed, facts))
     return rows
+
+
+def _reports(workspace: Workspace) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Of all stages, and of the shards of a cascade's steps."""
+    in_steps = (workspace.root / "steps").glob("*/reports/*-of-*.json")
+    for path in (*sorted(workspace.reports.glob("*.json")), *sorted(in_steps)):
+        yield path, read_json(path)
+
+
+def seconds_by_stage(workspace: Workspace) -> dict[str, float]:
+    """Of the last run of every stage, with those of its shards."""
+    found: dict[str, float] = {}
+    for _, report in _reports(workspace):
+        found[str(report["stage"])] = found.get(str(report["stage"]), 0.0) + float(report["seconds"])
+    return found
 
 
 def _facts_words(facts: Mapping[str, Any]) -> str:

@@ -27,13 +27,14 @@ from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
 from aeromatch_cli.report.pictures import image_picture, pair_picture
-from aeromatch_cli.report.rows import STAGE_ORDER
+from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
+from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Partners that are listed one by one.
@@ -91,6 +92,10 @@ class _Work:
 
     def image(self, text: str) -> Image:
         """By name, file name, stem or id. Raises ConfigError where none or several fit."""
+        folder = self.settings.block.images
+        here = Path(text).resolve()
+        if not is_remote(folder) and here.is_file() and here.is_relative_to(Path(folder).resolve()):
+            text = here.relative_to(Path(folder).resolve()).as_posix()  # as a shell's completion writes it
         wanted = text.replace("\\", "/").lower()
         fitting = [
             image
@@ -150,21 +155,24 @@ def _workspace(work: _Work) -> Shown:
     block = read_json(workspace.block)
     lines.append(f"world       {block['crs']}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
     lines.append(f"pairs       {len(work.pairs)}")
-    stages: dict[str, Any] = {}
+    stages, seconds = dict[str, Any](), seconds_by_stage(workspace)
     for stage in STAGE_ORDER:
         path = workspace.stage_report(stage)
         if path.is_file():
             found = stages[stage] = read_json(path)
-            lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {found['seconds']:.1f} s")
+            lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s")
             if stage == "filter":
                 states = ", ".join(f"{count} {state}" for state, count in found["facts"].get("pairs", {}).items())
                 lines.append(f"            {states}; {found['facts'].get('verified_matches', 0)} verified matches")
             if stage == "consistency" and found["facts"].get("verified_matches") is not None:
                 keys = "dropped_matches", "rejected_pairs", "verified_matches"
                 gone, pairs, left = (found["facts"][key] for key in keys)
-                lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} matches are left")
+                verified = workspace.stage_report("filter")
+                earlier = verified.is_file() and verified.stat().st_mtime > path.stat().st_mtime
+                when = ", of earlier matches: run aeromatch adjust" if earlier else ""
+                lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
     written = set(stages.get("export", {}).get("facts", {}))
-    folders = sorted(workspace.export("x").parent.glob("[!.]*"))
+    folders = sorted(one for one in workspace.exports.parent.glob("*") if one.name in EXPORTERS)
     lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")

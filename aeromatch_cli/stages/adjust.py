@@ -35,7 +35,7 @@ VERSION = 19
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
 _FAR_CONTROL_M, _FAR_CONTROL_SIGMAS = 10.0, 5.0
-_NOTHING = "not done: no image is oriented, so that export/colmap/sparse holds none"
+_NOTHING = "not done: no image is oriented; exports have poses only where some are given"
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
 

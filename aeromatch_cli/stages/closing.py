@@ -25,9 +25,15 @@ def closing_lines(reports: Sequence[StageReport], names: Mapping[str, str]) -> l
             [f"not sound: {faults[0][0]}", *(words for words, _ in faults[1:])],
             [*(remedy for _, remedy in faults), *weak],
         )
-    oriented = " and oriented" if facts["adjust"].get("images", 0) == count else "; they are not oriented"
+    oriented = " and oriented" if facts["adjust"].get("images", 0) == count else "; not oriented, as orient=none asks"
     whole = f"sound: all {count} images are connected{oriented}" if count > 2 else "both images are connected"
     return _said([whole], weak)
+
+
+def is_sound(reports: Sequence[StageReport], names: Mapping[str, str]) -> bool | None:
+    """Whether nothing is wrong with the block as a whole; None of a run without the stages that tell."""
+    facts = {report.stage: report.facts for report in reports if not report.part}
+    return None if "filter" not in facts or "adjust" not in facts else not _faults(facts, names)
 
 
 def _said(first: Sequence[str], then: Sequence[str]) -> list[str]:
@@ -55,6 +61,15 @@ def _faults(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[tuple[st
                 f"not oriented: {_listed(outside, names)}",
                 f"the lines of adjust say why; `aeromatch show WORK {one}` shows what it has; images of other places "
                 "may be left out",
+            )
+        )
+    # Nothing is said of an orientation that nobody wanted.
+    if not facts["adjust"].get("images", 0) and facts["adjust"].get("remarks") and len(names) > 2:
+        found.append(
+            (
+                "no image is oriented",
+                "more overlap, or known positions and attitudes (--poses) and cameras (--cameras) help; matches are "
+                "exported all the same",
             )
         )
     kinds = [part["kind"] for part in facts["adjust"].get("groups", ())]

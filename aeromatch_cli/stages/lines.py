@@ -33,6 +33,8 @@ def _picture_lines(stage: StageReport) -> list[str]:
     if "views_per_image" in facts:
         views, megapixels = facts["views_per_image"], facts["view_megapixels_per_image"]
         words.append(f"views per image: {views:.3g}, {megapixels:.3g} megapixels together")
+    if facts.get("images_without_keypoints"):
+        words.append(f"{facts['images_without_keypoints']} images without keypoints")
     if facts.get(enhance.SKIPPED):
         words.append(f"{facts[enhance.SKIPPED]} images not enhanced (skipped: same illumination)")
     if "settled_by" in facts:

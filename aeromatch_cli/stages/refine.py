@@ -120,10 +120,11 @@ def _make_room(context: Context) -> None:
     folder, kept = workspace.refined_files.parent, workspace.measured("").parent
     if context.overwrite:
         _remove(folder)
-    with translated_os_errors(folder):
+    with translated_os_errors(kept):
         kept.mkdir(parents=True, exist_ok=True)
-        ids = {image.image_id for image in context.block.images}
-        for path in [*folder.iterdir(), *(path for path in kept.iterdir() if path.stem not in ids)]:
+    ids = {image.image_id for image in context.block.images}
+    for path in [*folder.iterdir(), *(path for path in kept.iterdir() if path.stem not in ids)]:
+        with translated_os_errors(path):
             if path != kept:
                 path.unlink()
 

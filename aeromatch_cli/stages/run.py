@@ -15,6 +15,7 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_os_errors, whole_record
+from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages import (
@@ -34,7 +35,7 @@ from aeromatch_cli.stages import (
     union,
 )
 from aeromatch_cli.stages.changes import changed_words
-from aeromatch_cli.stages.closing import closing_lines
+from aeromatch_cli.stages.closing import closing_lines, is_sound
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
@@ -267,11 +268,25 @@ def _run_all(context: Context) -> list[StageReport]:
     if context.shard is None:
         if not reports[-1].facts["verified_matches"]:
             report.run(context)  # in any case: nothing else says why
-            raise InputError(f"no pair could be verified: the table of pairs in {context.workspace.report} says why")
+            raise InputError(
+                f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
+                + _without_keypoints(context)
+            )
         reports += [refine.run(context), adjust.run(context), consistency.run(context), export.run(context)]
         if context.settings.run.report:
             reports.append(_page(context))
     return reports
+
+
+def _without_keypoints(context: Context) -> str:
+    """Of a block none of whose pairs is verified: how many images show nothing to match, and what may hide it."""
+    paths = [context.workspace.features(image.image_id) for image in context.block.images]
+    empty = sum(path.is_file() and not len(read_keypoints(path)[0]) for path in paths)
+    if not empty:
+        return ""
+    masks = context.settings.block.masks
+    hidden = f"; do the masks {masks} hide them? white is used, black is ignored" if masks else ""
+    return f"; {empty} of {len(paths)} images have no keypoints{hidden}"
 
 
 def _page(context: Context) -> StageReport:
@@ -327,7 +342,8 @@ def _result(
     elif command == "run" and workspace.report.is_file() and _current_page(workspace, settings=False) is None:
         lines.append(f"report    {workspace.report} is of an earlier run: `aeromatch report` makes it anew")
     if command in ("run", "export") and not part:
-        lines += [f"export    {workspace.export(e.name)}" for e in settings.export]
+        written = next((report.facts for report in reports if report.stage == "export"), {})
+        lines += [f"export    {workspace.export(e.name)}" for e in settings.export if e.name in written]
         lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
     if failures:
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
@@ -336,6 +352,8 @@ def _result(
         "stages": _stage_facts(reports),
         "failures": len(failures),
     }
+    if command == "run" and not part:
+        facts["sound"] = is_sound(reports, names)
     return Result(tuple(lines), facts, failures)
 
 

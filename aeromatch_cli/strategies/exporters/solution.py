@@ -166,6 +166,6 @@ def called(images: Iterable[Image], name_of: Callable[[str], str], how: str) -> 
     for image in images:
         name = names[image.image_id] = name_of(image.name)
         if name in first:
-            raise ItemError(f"{how}, and several are called {name}, {first[name]} and {image.name}: rename them")
+            raise ItemError(f"{how}, and {first[name]} and {image.name} would both be called {name}: rename one")
         first[name] = image.name
     return names
