@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.config import Settings, load
+from aeromatch_cli.config import FAMILIES, Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json
@@ -34,7 +34,6 @@ from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
-from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Partners that are listed one by one.
@@ -172,7 +171,7 @@ def _workspace(work: _Work) -> Shown:
                 when = ", of earlier matches: run aeromatch adjust" if earlier else ""
                 lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
     written = set(stages.get("export", {}).get("facts", {}))
-    folders = sorted(one for one in workspace.exports.parent.glob("*") if one.name in EXPORTERS)
+    folders = sorted(one for one in workspace.exports.parent.glob("*") if one.name in FAMILIES["export"])
     lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
