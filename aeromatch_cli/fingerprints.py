@@ -10,6 +10,7 @@ from typing import Any
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.images.files import beyond_bytes
+from aeromatch_cli.images.png import SIGNATURE
 from aeromatch_cli.strategies import Strategy
 
 _PROBE_BYTES = 1 << 20
@@ -18,7 +19,7 @@ _SQLITE = b"SQLite format 3\0"
 _SQLITE_MODE, _SQLITE_COUNTERS = slice(18, 20), (slice(24, 28), slice(92, 100))
 # Bits and colour type in a PNG's first chunk, and those of gray of 8 bits and fewer, without and with alpha. Masks of
 # other kinds are read by their bands, since this mark of theirs.
-_PNG, _JPEG, _PNG_KIND = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", slice(24, 26)
+_JPEG, _PNG_KIND = b"\xff\xd8", slice(24, 26)
 _PNG_GRAY = frozenset({b"\1\0", b"\2\0", b"\4\0", b"\x08\0", b"\x08\4"})
 _MASKS_BY_BANDS = " bands"
 # The same for pictures of other depths than 8 bits, or with a table of colours; raised when what is made of these
@@ -105,7 +106,7 @@ def _mask_fingerprint(path: Path, size: int, stamp: int) -> str:
     del size, stamp  # only tell changed files apart
     with path.open("rb") as stream:
         head = stream.read(_PNG_KIND.stop)
-    gray8 = head.startswith(_PNG) and head[_PNG_KIND] in _PNG_GRAY
+    gray8 = head.startswith(SIGNATURE) and head[_PNG_KIND] in _PNG_GRAY
     # A JPEG, or gray of 8 bits at most, is read as it ever was.
     alike = gray8 or head.startswith(_JPEG)
     return image_fingerprint(path) + ("" if alike else _MASKS_BY_BANDS)

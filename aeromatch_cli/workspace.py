@@ -87,6 +87,11 @@ class Workspace:
         """The adjusted block without what only dropped matches have held; absent where that is nothing."""
         return self.orientation / "final.npz"
 
+    def ran_since(self, path: Path, *stages: str) -> bool:
+        """Whether one of these stages has made something since a file was written; by the times of files."""
+        written_s, reports = path.stat().st_mtime, map(self.stage_report, stages)
+        return any(report.is_file() and report.stat().st_mtime > written_s for report in reports)
+
     @property
     def final_or_adjusted(self) -> Path:
         return self.final if self.final.is_file() else self.adjusted
@@ -170,6 +175,10 @@ class Workspace:
 
     def export(self, exporter: str) -> Path:
         return self.root / "export" / exporter
+
+    def exported(self) -> list[Path]:
+        """Folders of all exports, also of earlier ones."""
+        return sorted(path for path in self.exports.parent.glob("[!.]*") if path.is_dir())
 
     def changed_tables(self) -> list[str]:
         """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""

@@ -10,10 +10,10 @@ from typing import Protocol
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
-from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.texture import Texture, read_texture
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.footprints import view_angles_deg
+from aeromatch_cli.recent import recent
 
 # Samples per image, on an even grid: several for each cell of the coverage grid, whatever the image's size.
 _SAMPLES = 16384

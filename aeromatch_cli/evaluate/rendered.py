@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.metrics import coverage, pose_error_deg, thin
 from aeromatch_cli.evaluate.overlap import OverlapFinder, place_on
-from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX, Conditions, PairScore
 from aeromatch_cli.evaluate.surfaces import surfaces
+from aeromatch_cli.recent import recent
 from aeromatch_cli.synthetic.write import IN_SHADOW_BELOW
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.evaluate.mapping import map_both
 from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
-from aeromatch_cli.evaluate.recent import recent
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
+from aeromatch_cli.recent import recent
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.workspace import Workspace, opened_workspace
@@ -98,8 +98,7 @@ def evaluate_workspace(
 def _export_is_older(workspace: Workspace) -> bool:
     """Whether stages before the export ran after it."""
     made = workspace.stage_report("export")
-    before = [workspace.stage_report(stage) for stage in ("filter", "refine", "consistency")]
-    return made.is_file() and any(p.is_file() and p.stat().st_mtime > made.stat().st_mtime for p in before)
+    return made.is_file() and workspace.ran_since(made, "filter", "refine", "consistency")
 
 
 def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockTruth, truth_folder: Path) -> None:

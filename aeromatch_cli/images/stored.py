@@ -6,9 +6,7 @@ done once per worker, as it is with what has a mask, a frame or sky.
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +16,16 @@ from aeromatch_cli.images import gdal
 from aeromatch_cli.images.masks import without_frames
 from aeromatch_cli.images.scaling import shrink_in_strips
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.recent import recent
 
 # Gray as decoded, where it is valid, and what its values are multiplied with.
 Picture = tuple[NDArray[Any], BoolArray | None, float]
-T = TypeVar("T")
 
 # What a worker keeps, by the fingerprint of all that it depends on: a row compares one image with a handful of others.
 _KEPT, _KEPT_REDUCED, _KEPT_UNITS = 4, 8, 4096
-_wholes: OrderedDict[str, Picture] = OrderedDict()
-_units: OrderedDict[str, float | None] = OrderedDict()
-_reduced: OrderedDict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = OrderedDict()
+_wholes: dict[str, Picture] = {}
+_units: dict[str, float | None] = {}
+_reduced: dict[tuple[str, float], tuple[FloatArray, BoolArray | None]] = {}
 # A TIFF is looked at on this scale first: for a frame, and for its largest value, which becomes _TOP, so that it makes
 # no difference whether reflectances up to 1 are stored or gray values up to 65535, nor whether a picture is read by
 # parts or whole. Only what is decoded whole and has 8 bits stays as it is.
@@ -44,7 +42,7 @@ class StoredRaster:
         self.finest = source.scale
 
     def reduced(self, scale: float) -> tuple[FloatArray, BoolArray | None]:
-        return _kept(_reduced, (self._source.fingerprint, scale), _KEPT_REDUCED, lambda: self._made(scale))
+        return recent(_reduced, (self._source.fingerprint, scale), lambda: self._made(scale), _KEPT_REDUCED)
 
     def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
         unit = self._unit()
@@ -69,7 +67,7 @@ class StoredRaster:
 
     def _unit(self) -> float | None:
         """What values of a file that is read by parts are multiplied with; None where it is decoded whole."""
-        return _kept(_units, self._source.fingerprint, _KEPT_UNITS, self._glanced)
+        return recent(_units, self._source.fingerprint, self._glanced, _KEPT_UNITS)
 
     def _glanced(self) -> float | None:
         source = self._source
@@ -115,7 +113,7 @@ class StoredRaster:
 
     def _whole(self) -> Picture:
         """(H, W) gray at the working scale, where it is valid, and the gain of its values."""
-        return _kept(_wholes, self._source.fingerprint, _KEPT, self._decoded)
+        return recent(_wholes, self._source.fingerprint, self._decoded, _KEPT)
 
     def _decoded(self) -> Picture:
         # JPEGs have 8 bits: straight from the decoder. Others keep their depth.
@@ -143,12 +141,3 @@ def _gray(pixels: NDArray[Any]) -> NDArray[Any]:
     if pixels.dtype not in (np.uint8, np.uint16, np.float32):
         pixels = pixels.astype(np.float32)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
-
-
-def _kept(cache: OrderedDict[Any, T], key: Any, most: int, make: Callable[[], T]) -> T:
-    if key not in cache:
-        cache[key] = make()
-        if len(cache) > most:
-            cache.popitem(last=False)
-    cache.move_to_end(key)
-    return cache[key]

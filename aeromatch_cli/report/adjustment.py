@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from aeromatch_cli.data import AdjustedBlock, Camera
-from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import control_words
+from aeromatch_cli.stages.stage_report import facts_on_file
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Adjustment:
 
 
 def read_adjustment(context: Context) -> Adjustment:
-    facts = stage_facts(context, "adjust")
-    in_world = stage_facts(context, "orient").get("frame") != "own"
+    facts = facts_on_file(context.workspace, "adjust")
+    in_world = facts_on_file(context.workspace, "orient").get("frame") != "own"
     if facts.get("points") and not adjust.is_current(context):
         return Adjustment(outdated=True, in_world=in_world)
-    return Adjustment(facts, stage_facts(context, "consistency"), in_world=in_world)
+    return Adjustment(facts, facts_on_file(context.workspace, "consistency"), in_world=in_world)
 
 
 def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | None:
@@ -126,9 +126,3 @@ def camera_words(cameras: Mapping[str, Camera]) -> str:
         words.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
     more = [f"and {len(words) - 10} more"] if len(words) > 10 else []
     return "\n".join(words[:10] + more)
-
-
-def stage_facts(context: Context, stage: str) -> dict[str, Any]:
-    """What a stage left in its report."""
-    path = context.workspace.stage_report(stage)
-    return dict(read_json(path)["facts"]) if path.is_file() else {}

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import differing, load
-from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images, read_pairs
 from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
+from aeromatch_cli.stages.stage_report import facts_on_file
 from aeromatch_cli.workspace import opened_workspace
 
 _LISTED = 10
@@ -95,11 +95,10 @@ def _side(root: Path) -> _Side:
         entry = None if found is None else final(pair.image_id0, found)
         good = entry is not None and entry.verdict.state == "verified"
         matches[names[pair.image_id0], names[pair.image_id1]] = len(entry.matches.indices) if good and entry else 0
-    adjusted = workspace.stage_report("adjust")
     return _Side(
         settings=load(str(workspace.config)).model_dump(mode="json"),
         images=frozenset(names.values()),
         matches=matches,
         seconds=seconds_by_stage(workspace),
-        adjusted=read_json(adjusted)["facts"] if adjusted.is_file() else {},
+        adjusted=facts_on_file(workspace, "adjust"),
     )

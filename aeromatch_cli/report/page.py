@@ -28,7 +28,6 @@ from aeromatch_cli.report.adjustment import (
     counted,
     final_points,
     read_adjustment,
-    stage_facts,
 )
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.gathering import Gathered, gather, settled
@@ -49,7 +48,7 @@ from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, facts_on_file
 from aeromatch_cli.workspace import Workspace
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
@@ -91,8 +90,10 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     pairs, images = found.pairs, found.images
     judged = (row for row in pairs if row.state != NOT_JUDGED)
     facts = summarise(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
-    wrong = {i: float(angle) for i, angle in stage_facts(context, "orient").get("wrong_attitudes", {}).items()}
-    input_facts = stage_facts(context, "pairs")
+    wrong = {
+        i: float(angle) for i, angle in facts_on_file(context.workspace, "orient").get("wrong_attitudes", {}).items()
+    }
+    input_facts = facts_on_file(context.workspace, "pairs")
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
     # Without a verified pair what is on file is of other keypoints.
@@ -134,7 +135,9 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         pair_keys=keys,
         pairs_beside=bool(drawn.beside),
         has_steps=any(row.steps for row in pairs),
-        settled=settled_words(matched) if "settled_by" in (matched := stage_facts(context, "match")) else "",
+        settled=settled_words(matched)
+        if "settled_by" in (matched := facts_on_file(context.workspace, "match"))
+        else "",
         pair_count=len(pairs),
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),
@@ -181,7 +184,7 @@ def _all_notices(
     warnings: Sequence[str],
 ) -> list[Notice]:
     """The gravest first."""
-    found = notices(images, pairs, facts, stage_facts(context, "orient"))
+    found = notices(images, pairs, facts, facts_on_file(context.workspace, "orient"))
     found += adjustment_notices(images, adjustment)
     found += [Notice("warn", "Note on the input", warning) for warning in warnings]
     return sorted(found, key=lambda notice: notice.level != "bad")

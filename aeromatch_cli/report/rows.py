@@ -189,7 +189,6 @@ def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:
     for path in sorted(workspace.evaluation.glob("*.png")):
         coded = base64.b64encode(path.read_bytes()).decode("ascii")
         pictures.append((path.stem.replace("_", " "), f"data:image/png;base64,{coded}"))
-    made = [workspace.stage_report(stage) for stage in ("filter", "consistency")]
-    outdated = any(path.is_file() and path.stat().st_mtime > stated.stat().st_mtime for path in made)
+    outdated = workspace.ran_since(stated, "filter", "consistency")
     summary = [(str(name), str(value)) for name, value in read_json(stated)["summary"]]
     return EvaluationFigures(summary, pictures, outdated)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.config import FAMILIES, Settings, load
+from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.files import read_json
@@ -166,13 +166,12 @@ def _workspace(work: _Work) -> Shown:
             if stage == "consistency" and found["facts"].get("verified_matches") is not None:
                 keys = "dropped_matches", "rejected_pairs", "verified_matches"
                 gone, pairs, left = (found["facts"][key] for key in keys)
-                verified = workspace.stage_report("filter")
-                earlier = verified.is_file() and verified.stat().st_mtime > path.stat().st_mtime
-                when = ", of earlier matches: run aeromatch adjust" if earlier else ""
+                when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
                 lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
     written = set(stages.get("export", {}).get("facts", {}))
-    folders = sorted(one for one in workspace.exports.parent.glob("*") if one.name in FAMILIES["export"])
-    lines += [f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in folders]
+    lines += [
+        f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
+    ]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
     if workspace.report.is_file():

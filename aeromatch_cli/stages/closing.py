@@ -15,8 +15,8 @@ _FEW_POINTS = 20
 
 def closing_lines(reports: Sequence[StageReport], names: Mapping[str, str]) -> list[str]:
     """Of the reports of a whole run, filter to consistency. names: of the files, by image_id."""
-    facts = {report.stage: report.facts for report in reports if not report.part}
-    if "filter" not in facts or "adjust" not in facts:
+    facts = _told(reports)
+    if facts is None:
         return []
     faults, weak = _faults(facts, names), _weak(facts, names)
     count = len(names)
@@ -32,8 +32,14 @@ def closing_lines(reports: Sequence[StageReport], names: Mapping[str, str]) -> l
 
 def is_sound(reports: Sequence[StageReport], names: Mapping[str, str]) -> bool | None:
     """Whether nothing is wrong with the block as a whole; None of a run without the stages that tell."""
+    facts = _told(reports)
+    return None if facts is None else not _faults(facts, names)
+
+
+def _told(reports: Sequence[StageReport]) -> dict[str, Any] | None:
+    """By stage; None without those that tell of the block as a whole."""
     facts = {report.stage: report.facts for report in reports if not report.part}
-    return None if "filter" not in facts or "adjust" not in facts else not _faults(facts, names)
+    return facts if {"filter", "adjust"} <= facts.keys() else None
 
 
 def _said(first: Sequence[str], then: Sequence[str]) -> list[str]:

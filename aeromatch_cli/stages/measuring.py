@@ -149,9 +149,8 @@ def _save(found: Measured, made_of: str, stream: BinaryIO) -> None:
 
 
 def kept_measurements(task: MeasureTask) -> Measured | None:
-    """What an earlier run has kept of the same measurements; None, with a warning, where the file is broken."""
-    if not task.path.is_file():
-        return None
+    """What the file of an earlier run has kept, where it is of the same measurements; None, with a warning, where it is
+    broken."""
     try:
         found = load_arrays(task.path, ("fingerprint", "shifts_px", "held", "matrices"))
     except BrokenFileError as error:

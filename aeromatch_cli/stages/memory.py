@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.images.scaling import scale_within
 
 # Measured on SIFT in tiles of 4 megapixels: a worker's libraries, and bytes per pixel of the source or of its views
 # together, whichever are more: a view of a turned or tilted image is larger than the image.
@@ -66,7 +67,7 @@ def jobs_within(
     if largest is None:
         return jobs, ""
     stored = largest.width_px * largest.height_px / 1e6
-    scale = min(1.0, max_size_px / max(largest.width_px, largest.height_px)) if max_size_px else 1.0
+    scale = scale_within(max_size_px, largest.width_px, largest.height_px)
     megapixels = stored * scale**2
     need = worker_mb(megapixels, network=network, stored=stored)
     most = int((budget - _PARENT_MB) / need)

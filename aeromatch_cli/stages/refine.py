@@ -210,13 +210,15 @@ def _measured(context: Context, table: _Table, recipe: LeastSquares, report: Sta
     folder = context.workspace.refined_files.parent
     by = {image_id: table.measured_by(image_id) for image_id in table.names}
     found, todo = Measured.nothing(len(table.trees.parent)), list[str]()
-    for image_id in table.names:
-        task = _task(context, table, recipe, image_id, by[image_id])
-        kept = kept_measurements(task) if task.by else None
-        if kept is not None:
-            found.set(table.first[image_id] + task.rows, kept)
-        elif task.by:
+    for image_id in (image_id for image_id in table.names if by[image_id]):
+        # Where nothing is kept, nobody need know what it would have to be of.
+        known = context.workspace.measured(image_id).is_file()
+        task = _task(context, table, recipe, image_id, by[image_id]) if known else None
+        kept = None if task is None else kept_measurements(task)
+        if task is None or kept is None:
             todo.append(image_id)
+        else:
+            found.set(table.first[image_id] + task.rows, kept)
     batches = [todo[at : at + _IMAGES_AT_ONCE] for at in range(0, len(todo), _IMAGES_AT_ONCE)]
     needed = [sorted({*batch, *(other for image_id in batch for other in by[image_id])}) for batch in batches]
     last = {image_id: number for number, names in enumerate(needed) for image_id in names}

@@ -40,7 +40,6 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
-from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import Workspace, locked
 
@@ -360,8 +359,7 @@ def _result(
 def _left(workspace: Workspace, settings: Settings) -> list[Path]:
     """Folders of exporters that the settings no longer name."""
     wanted = {exporter.name for exporter in settings.export}
-    folders = sorted(workspace.exports.parent.glob("*"))
-    return [folder for folder in folders if folder.name in EXPORTERS and folder.name not in wanted]
+    return [folder for folder in workspace.exported() if folder.name not in wanted]
 
 
 def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:

@@ -84,6 +84,12 @@ class StageReport:
         return known == [failures, self.fingerprint, self.facts]
 
 
+def facts_on_file(workspace: Workspace, stage: str) -> dict[str, Any]:
+    """What a stage left in its report, nothing where there is none."""
+    path = workspace.stage_report(stage)
+    return dict(read_json(path)["facts"]) if path.is_file() else {}
+
+
 def _shard_failed_since(path: Path) -> bool:
     """Whether a shard's report of the stage of this whole report is newer and names failures."""
     made_ns = path.stat().st_mtime_ns

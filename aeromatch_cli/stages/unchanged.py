@@ -18,7 +18,7 @@ from aeromatch_cli.errors import BrokenFileError, ConfigError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.images.remote import is_remote
 from aeromatch_cli.stages.pairs import chosen_strategies
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.stage_report import StageReport, facts_on_file
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.workspace import Workspace
 
@@ -60,7 +60,9 @@ def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[S
         if any(record.get(key) != value for key, value in now.items()):
             return None
         return [
-            StageReport(stage, items=own["items"], skipped=own["items"], facts=own["facts"] or _told(workspace, stage))
+            StageReport(
+                stage, items=own["items"], skipped=own["items"], facts=own["facts"] or facts_on_file(workspace, stage)
+            )
             for stage, own in record["stages"].items()
         ]
     except BrokenFileError:  # the long way makes it again
@@ -73,16 +75,13 @@ def remember(workspace: Workspace, inputs: Mapping[str, str], stages: Mapping[st
     if not inputs:
         return
     told = {
-        stage: {"items": own["items"], "facts": None if own["facts"] == _told(workspace, stage) else own["facts"]}
+        stage: {
+            "items": own["items"],
+            "facts": None if own["facts"] == facts_on_file(workspace, stage) else own["facts"],
+        }
         for stage, own in stages.items()
     }
     write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
-
-
-def _told(workspace: Workspace, stage: str) -> dict[str, Any]:
-    """Facts in the report of a stage; none without one."""
-    path = workspace.stage_report(stage)
-    return dict(read_json(path)["facts"]) if path.is_file() else {}
 
 
 def _inputs(settings: Settings, root: Path) -> Iterator[Path]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray, JoinedKeypoints, Matches, Pair
-from aeromatch_cli.files import read_json, write_atomically, write_text
+from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_joined, read_keypoints, write_joined
 from aeromatch_cli.formats.rows import (
@@ -32,7 +32,7 @@ from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
 from aeromatch_cli.stages.rows import features_of
-from aeromatch_cli.stages.stage_report import StageReport, gather_failures, run_stage
+from aeromatch_cli.stages.stage_report import StageReport, facts_on_file, gather_failures, run_stage
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace
 
@@ -125,8 +125,7 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
     # An image that fails in one step has the keypoints of the others.
     report.skipped = joined - len(tasks)
-    first = steps[0].context.workspace.stage_report("extract")
-    found = read_json(first)["facts"] if first.is_file() else {}
+    found = facts_on_file(steps[0].context.workspace, "extract")
     report.facts = {
         "images_by_step": {step.name: len(step.images) for step in steps if step.own_features},
         "images_without_keypoints": found.get("images_without_keypoints", 0),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aeromatch_cli.evaluate.recent import recent
+from aeromatch_cli.recent import recent
 
 
 def test_the_one_not_asked_for_longest_goes() -> None:
