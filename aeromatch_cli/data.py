@@ -22,9 +22,9 @@ BoolArray = NDArray[np.bool_]
 class Camera:
     """A lens and a sensor, shared by a group of images.
 
-    model: COLMAP's name, one of `geometry.cameras.MODELS`.
+    model: one of `geometry.cameras.MODELS`: BROWN, or a name of COLMAP's.
     width_px, height_px: size of the stored raster.
-    params: COLMAP's order; focal lengths in px, cx and cy in this project's pixel frame (COLMAP's minus 0.5).
+    params: in the order of MODELS; focal lengths in px, cx and cy in this project's pixel frame (COLMAP's minus 0.5).
     """
 
     model: str

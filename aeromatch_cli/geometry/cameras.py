@@ -1,8 +1,21 @@
-"""Lens models under COLMAP's names: rays to pixels and back.
+"""Lens models: rays to pixels and back.
 
-Normalised coordinates (u, v) are camera x/z, y/z. *Undistorted pixels* are (fx u + cx, fy v + cy): the image that a
-distortion-free camera of the same focal length and principal point would take. Two-view estimation works on them.
-Source of the models: COLMAP, src/colmap/sensor/models.h (Schoenberger and Frahm, CVPR 2016); OPENCV is Brown's model.
+Normalised coordinates (u, v) are camera x/z, y/z. *Undistorted pixels* are K (u, v, 1): the image that a
+distortion-free camera of the same focal length, principal point and affinity would take. Two-view estimation works on
+them.
+
+The block's own model is BROWN, the full model of Brown (1971) that photogrammetric programs calibrate:
+
+    r2 = u^2 + v^2
+    xd = u (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 u v + p2 (r2 + 2 u^2)
+    yd = v (1 + k1 r2 + k2 r2^2 + k3 r2^3) + p1 (r2 + 2 v^2) + 2 p2 u v
+    x  = cx + (f + b1) xd + b2 yd
+    y  = cy + f yd
+
+p1 and p2 are in OpenCV's and COLMAP's order; b1, b2 are Metashape's affinity and skew in pixels. The other names are
+COLMAP's (src/colmap/sensor/models.h; Schoenberger and Frahm, CVPR 2016) and are special cases of BROWN, but for
+OPENCV_FISHEYE, where the angle t from the optical axis, times 1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8, is the distance
+from the axis (Kannala and Brandt, IEEE TPAMI 28(8), 2006). docs/cameras.md has the parameters of other programs.
 """
 
 from __future__ import annotations
@@ -12,23 +25,45 @@ import numpy as np
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 
-# Model name -> parameter names in COLMAP's order.
+BROWN = "BROWN"
+FISHEYE = "OPENCV_FISHEYE"
+# Model name -> parameter names, in COLMAP's order where COLMAP has the model.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    BROWN: ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2"),
+    FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 _MAX_ITERATIONS = 50
 
 
 def parameters(camera: Camera) -> dict[str, float]:
-    """Every parameter by name, with fx, fy, k1, k2, p1, p2 present whatever the model."""
+    """Every parameter by name; fx, fy, skew, cx, cy, k1 to k4, p1, p2 are present whatever the model.
+
+    skew: pixels to the right for each unit of yd (b2 of BROWN). k4 is of OPENCV_FISHEYE alone.
+    """
     named = dict(zip(MODELS[camera.model], camera.params, strict=True))
     f = named.pop("f", 0.0)
-    return {"fx": f, "fy": f, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0} | named
+    named = {"fx": f + named.pop("b1", 0.0), "fy": f, "skew": named.pop("b2", 0.0)} | named
+    return dict.fromkeys(_DISTORTION, 0.0) | named
+
+
+def as_brown(camera: Camera) -> Camera:
+    """The same camera as BROWN. Raises ValueError for a fisheye lens, which BROWN does not describe."""
+    if is_fisheye(camera):
+        raise ValueError(f"{FISHEYE} is no special case of {BROWN}")
+    p = parameters(camera)
+    values = {**p, "f": p["fy"], "b1": p["fx"] - p["fy"], "b2": p["skew"]}
+    return Camera(BROWN, camera.width_px, camera.height_px, tuple(values[name] for name in MODELS[BROWN]))
+
+
+def is_fisheye(camera: Camera) -> bool:
+    return camera.model == FISHEYE
 
 
 def focal_px(camera: Camera) -> float:
@@ -40,31 +75,72 @@ def focal_px(camera: Camera) -> float:
 def calibration_matrix(camera: Camera) -> FloatArray:
     """(3, 3) K: undistorted pixel ~ K (u, v, 1)."""
     p = parameters(camera)
-    return np.array([[p["fx"], 0.0, p["cx"]], [0.0, p["fy"], p["cy"]], [0.0, 0.0, 1.0]])
+    return np.array([[p["fx"], p["skew"], p["cx"]], [0.0, p["fy"], p["cy"]], [0.0, 0.0, 1.0]])
 
 
 def has_distortion(camera: Camera) -> bool:
     p = parameters(camera)
-    return any(p[key] != 0.0 for key in ("k1", "k2", "p1", "p2"))
+    return is_fisheye(camera) or any(p[key] != 0.0 for key in _DISTORTION)
+
+
+def _normalised(p: dict[str, float], points_px: FloatArray) -> FloatArray:
+    """(xd, yd) (N, 2) of pixels (N, 2): through the inverse of K."""
+    v = (points_px[:, 1] - p["cy"]) / p["fy"]
+    return np.stack([(points_px[:, 0] - p["cx"] - p["skew"] * v) / p["fx"], v], axis=1)
+
+
+def _pixels(p: dict[str, float], uv: FloatArray) -> FloatArray:
+    """Pixels (N, 2) of (xd, yd) (N, 2): through K."""
+    u, v = uv[:, 0], uv[:, 1]
+    return np.stack([p["fx"] * u + p["skew"] * v + p["cx"], p["fy"] * v + p["cy"]], axis=1)
 
 
 def _distort_normalised(p: dict[str, float], uv: FloatArray) -> FloatArray:
     u, v = uv[:, 0], uv[:, 1]
     r2 = u * u + v * v
-    radial = 1.0 + r2 * (p["k1"] + r2 * p["k2"])
+    radial = 1.0 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * p["k3"]))
     du = 2.0 * p["p1"] * u * v + p["p2"] * (r2 + 2.0 * u * u)
     dv = p["p1"] * (r2 + 2.0 * v * v) + 2.0 * p["p2"] * u * v
     return np.stack([u * radial + du, v * radial + dv], axis=1)
 
 
+def _smallest_root(coefficients: tuple[float, ...]) -> float:
+    """The smallest s > 0 where 1 + c1 s + c2 s^2 + ... is zero, inf where there is none."""
+    roots = np.roots([*reversed(coefficients), 1.0])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots.real), 1.0)) & (roots.real > 0.0)]
+    return float(real.min(initial=np.inf))
+
+
 def _largest_radius(p: dict[str, float]) -> float:
-    """Normalised radius up to which the radial model is one-to-one: the first root of d(r (1 + k1 r2 + k2 r4))/dr."""
-    discriminant = 9.0 * p["k1"] ** 2 - 20.0 * p["k2"]
-    if discriminant < 0:
-        return np.inf
-    # The smaller root of 5 k2 s^2 + 3 k1 s + 1 with s = r^2, in the form that also holds for k2 = 0.
-    denominator = np.sqrt(discriminant) - 3.0 * p["k1"]
-    return float(np.sqrt(2.0 / denominator)) if denominator > 1e-12 else np.inf
+    """Normalised radius up to which the radial model is one-to-one: the first root of d(r (1 + k1 r2 + ...))/dr."""
+    return float(np.sqrt(_smallest_root((3.0 * p["k1"], 5.0 * p["k2"], 7.0 * p["k3"]))))
+
+
+def _fisheye_radius(p: dict[str, float], angle: FloatArray) -> FloatArray:
+    square = angle * angle
+    terms = (p["k4"], p["k3"], p["k2"], p["k1"])
+    factor = np.zeros_like(square)
+    for term in terms:
+        factor = (factor + term) * square
+    return angle * (1.0 + factor)
+
+
+def _fisheye_slope(p: dict[str, float], angle: FloatArray) -> FloatArray:
+    square = angle * angle
+    return 1.0 + square * (
+        3.0 * p["k1"] + square * (5.0 * p["k2"] + square * (7.0 * p["k3"] + square * 9.0 * p["k4"]))
+    )
+
+
+def _largest_angle(p: dict[str, float]) -> float:
+    """The angle from the axis up to which a fisheye model is one-to-one, at most a right angle."""
+    first = _smallest_root((3.0 * p["k1"], 5.0 * p["k2"], 7.0 * p["k3"], 9.0 * p["k4"]))
+    return min(float(np.sqrt(first)), np.pi / 2.0)
+
+
+def _scaled_to(uv: FloatArray, radius: FloatArray, wanted: FloatArray) -> FloatArray:
+    """uv (N, 2), whose distances from the axis are radius (N,), moved along their directions to those wanted."""
+    return np.asarray(uv * np.where(radius > 0.0, wanted / np.where(radius > 0.0, radius, 1.0), 1.0)[:, None])
 
 
 def distort(camera: Camera, undistorted_px: FloatArray) -> FloatArray:
@@ -73,24 +149,33 @@ def distort(camera: Camera, undistorted_px: FloatArray) -> FloatArray:
     if not has_distortion(camera):
         return points.copy()
     p = parameters(camera)
-    focal, centre = np.array([p["fx"], p["fy"]]), np.array([p["cx"], p["cy"]])
-    uv = (points - centre) / focal
-    distorted = _distort_normalised(p, uv) * focal + centre
-    distorted[(uv**2).sum(axis=1) > _largest_radius(p) ** 2] = np.nan
+    uv = _normalised(p, points)
+    radius = np.hypot(uv[:, 0], uv[:, 1])
+    if is_fisheye(camera):
+        angle = np.arctan(radius)
+        distorted = _pixels(p, _scaled_to(uv, radius, _fisheye_radius(p, angle)))
+        distorted[angle > _largest_angle(p)] = np.nan
+        return distorted
+    distorted = _pixels(p, _distort_normalised(p, uv))
+    distorted[radius > _largest_radius(p)] = np.nan
     return distorted
 
 
 def undistort(camera: Camera, points_px: FloatArray) -> FloatArray:
     """Undistorted pixels (N, 2) of stored pixels (N, 2), by Newton's method; NaN where no ray has that pixel.
 
-    Accurate to 1e-9 px on the image and a margin around it (tested by round trip).
+    Accurate to 1e-9 px on the image and a margin around it (tested by round trip). A fisheye's rays at a right angle
+    from the axis and beyond have no undistorted pixel.
     """
     points = np.asarray(points_px, dtype=np.float64)
     if not has_distortion(camera):
         return points.copy()
     p = parameters(camera)
-    focal, centre = np.array([p["fx"], p["fy"]]), np.array([p["cx"], p["cy"]])
-    target = (points - centre) / focal
+    target = _normalised(p, points)
+    return _pixels(p, _from_fisheye(p, target) if is_fisheye(camera) else _from_brown(p, target))
+
+
+def _from_brown(p: dict[str, float], target: FloatArray) -> FloatArray:
     uv = target.copy()
     for _ in range(_MAX_ITERATIONS):
         residual = _distort_normalised(p, uv) - target
@@ -99,20 +184,36 @@ def undistort(camera: Camera, points_px: FloatArray) -> FloatArray:
         if not np.nanmax(np.abs(step), initial=0.0) > 1e-13:
             break
     bad = (np.abs(_distort_normalised(p, uv) - target) > 1e-9).any(axis=1)
-    bad |= (uv**2).sum(axis=1) > _largest_radius(p) ** 2
+    bad |= np.hypot(uv[:, 0], uv[:, 1]) > _largest_radius(p)
     uv[bad] = np.nan
-    return uv * focal + centre
+    return uv
+
+
+def _from_fisheye(p: dict[str, float], target: FloatArray) -> FloatArray:
+    radius = np.hypot(target[:, 0], target[:, 1])
+    most = _largest_angle(p)
+    angle = np.minimum(radius, most)
+    for _ in range(_MAX_ITERATIONS):
+        slope = _fisheye_slope(p, angle)
+        step = (_fisheye_radius(p, angle) - radius) / np.where(slope > 1e-6, slope, 1e-6)
+        angle = np.clip(angle - step, 0.0, most)
+        if not np.abs(step).max(initial=0.0) > 1e-13:
+            break
+    bad = (np.abs(_fisheye_radius(p, angle) - radius) > 1e-9) | (angle >= np.pi / 2.0 - 1e-6)
+    uv = _scaled_to(target, radius, np.tan(np.where(bad, 0.0, angle)))
+    uv[bad] = np.nan
+    return uv
 
 
 def _distortion_jacobian(p: dict[str, float], uv: FloatArray) -> FloatArray:
     u, v = uv[:, 0], uv[:, 1]
     r2 = u * u + v * v
-    radial = 1.0 + r2 * (p["k1"] + r2 * p["k2"])
-    slope = 2.0 * (p["k1"] + 2.0 * r2 * p["k2"])
+    radial = 1.0 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * p["k3"]))
+    slope = 2.0 * (p["k1"] + r2 * (2.0 * p["k2"] + 3.0 * r2 * p["k3"]))
     jacobian = np.empty((len(uv), 2, 2))
     jacobian[:, 0, 0] = radial + slope * u * u + 2.0 * p["p1"] * v + 6.0 * p["p2"] * u
     jacobian[:, 0, 1] = slope * u * v + 2.0 * p["p1"] * u + 2.0 * p["p2"] * v
-    jacobian[:, 1, 0] = slope * u * v + 2.0 * p["p1"] * u + 2.0 * p["p2"] * v
+    jacobian[:, 1, 0] = jacobian[:, 0, 1]
     jacobian[:, 1, 1] = radial + slope * v * v + 6.0 * p["p1"] * v + 2.0 * p["p2"] * u
     return jacobian
 
@@ -127,17 +228,14 @@ def _solve_2x2(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def normalise(camera: Camera, points_px: FloatArray) -> FloatArray:
     """Normalised coordinates (N, 2) of stored pixels (N, 2)."""
-    p = parameters(camera)
-    return (undistort(camera, points_px) - [p["cx"], p["cy"]]) / [p["fx"], p["fy"]]
+    return _normalised(parameters(camera), undistort(camera, points_px))
 
 
 def project(camera: Camera, world_rotation: FloatArray, center_m: FloatArray, points_m: FloatArray) -> FloatArray:
     """Stored pixels (N, 2) of world points (N, 3); NaN behind the camera or outside the lens model."""
     rays = (np.asarray(points_m, dtype=np.float64) - center_m) @ np.asarray(world_rotation).T
     depth = np.where(rays[:, 2] > 1e-9, rays[:, 2], np.nan)
-    p = parameters(camera)
-    undistorted = rays[:, :2] / depth[:, None] * [p["fx"], p["fy"]] + [p["cx"], p["cy"]]
-    return distort(camera, undistorted)
+    return distort(camera, _pixels(parameters(camera), rays[:, :2] / depth[:, None]))
 
 
 def world_rays(camera: Camera, world_rotation: FloatArray, points_px: FloatArray) -> FloatArray:
@@ -168,7 +266,7 @@ def resized(camera: Camera, scale: float, width_px: int, height_px: int) -> Came
     """The camera of the same image shrunk by `scale` to the given size, half-pixel correct."""
     values = []
     for name, value in zip(MODELS[camera.model], camera.params, strict=True):
-        if name in ("f", "fx", "fy"):
+        if name in ("f", "fx", "fy", "b1", "b2"):
             values.append(value * scale)
         elif name in ("cx", "cy"):
             values.append((value + 0.5) * scale - 0.5)
