@@ -39,13 +39,20 @@ class Pose:
 
     center_m: (3,) float64, projection centre in the world frame, metres.
     world_rotation: (3, 3) float64, rotation part of cam_from_world, or None where only the position is known.
-    sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle.
+    sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle. sigmas_m: those along
+    x, y, z of the world frame where they differ; None: sigma_position_m each.
     """
 
     center_m: FloatArray
     world_rotation: FloatArray | None
     sigma_position_m: float
     sigma_angle_deg: float
+    sigmas_m: tuple[float, float, float] | None = None
+
+    @property
+    def axis_sigmas_m(self) -> FloatArray:
+        """(3,) standard deviations along x, y, z."""
+        return np.array(self.sigmas_m or (self.sigma_position_m,) * 3)
 
 
 @dataclass(frozen=True, eq=False)

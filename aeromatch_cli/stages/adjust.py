@@ -30,7 +30,7 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
-VERSION = 19
+VERSION = 20
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -110,7 +110,7 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
-    known = sorted(context.focal_sigmas.items()), sorted(context.angles.items())
+    known = sorted(context.focal_sigmas.items()), sorted(context.observed.cameras.items()), sorted(context.angles.items())
     measured = refine.made_fingerprint(context)
     return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
 

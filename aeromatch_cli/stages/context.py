@@ -9,14 +9,18 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, Camera, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
+from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import scale_within, shrink_camera
+from aeromatch_cli.orientation.focal import with_focal_length
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.strategies import Matcher
@@ -39,7 +43,7 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
+    share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
     given one. angles: image_id -> attitude as it was given. control: surveyed points.
     """
 
@@ -51,6 +55,7 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
+    calibrated: frozenset[str] = frozenset()
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
@@ -75,12 +80,22 @@ class Context:
     @property
     def observed(self) -> Observed:
         """What was given, for mapping and adjustment."""
-        return Observed(self.given.poses, self.focal_sigmas, self.angles)
+        cameras = {camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras}
+        return Observed(self.given.poses, self.focal_sigmas, self.angles, cameras)
+
+    def _stated_camera(self, camera_id: str) -> Camera:
+        """A camera as it was given; where EXIF contradicts it, with the focal length that the pictures are nearer to."""
+        stated = self.given.cameras[camera_id]
+        if camera_id not in self.likely_focals or camera_id not in self.block.cameras:
+            return stated
+        found_px = focal_px(self.block.cameras[camera_id])
+        nearest_px = min(focal_px(stated), self.likely_focals[camera_id], key=lambda px: abs(np.log(px / found_px)))
+        return with_focal_length(stated, nearest_px)
 
     @property
     def guessed_cameras(self) -> frozenset[str]:
         """Cameras whose focal length is no more than a guess."""
-        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS)
+        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS) - self.calibrated
 
     def owns(self, item_id: str) -> bool:
         return self.shard is None or self.shard.owns(item_id)
