@@ -14,7 +14,7 @@ from make_scenes import NOON_WEST, make_scene, make_truth, make_view, one_box
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError
-from aeromatch_cli.geometry.cameras import MODELS, colmap_params
+from aeromatch_cli.geometry.cameras import MODELS, corner_params
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.synthetic import Truth, load_truth, render_block, transfer
 from aeromatch_cli.synthetic.render import render_image
@@ -315,7 +315,7 @@ def test_poses_and_camera_round_trip(folder: Path, truth: Truth) -> None:
         assert np.array_equal(truth.poses[row["image"]].world_rotation, rotation)
     lens = json.loads((folder / "block.json").read_text())["cameras"]["1"]
     assert {(c.model, c.width_px, c.height_px) for c in truth.cameras.values()} == {("SIMPLE_RADIAL", WIDTH, HEIGHT)}
-    assert all(list(colmap_params(camera)) == lens["params"] for camera in truth.cameras.values())
+    assert all(list(corner_params(camera)) == lens["params"] for camera in truth.cameras.values())
 
 
 @pytest.mark.parametrize("lens", MODELS)
