@@ -45,9 +45,7 @@ CAMERAS = {
     "SIMPLE_RADIAL": Camera("SIMPLE_RADIAL", WIDTH_PX, HEIGHT_PX, (3100.0, 2003.5, 1490.0, -0.06)),
     "RADIAL": Camera("RADIAL", WIDTH_PX, HEIGHT_PX, (3100.0, 2003.5, 1490.0, -0.11, 0.05)),
     "OPENCV": Camera("OPENCV", WIDTH_PX, HEIGHT_PX, (3100.0, 3090.0, 2003.5, 1490.0, -0.11, 0.05, 1e-3, -7e-4)),
-    BROWN: Camera(
-        BROWN, WIDTH_PX, HEIGHT_PX, (3090.0, 2003.5, 1490.0, -0.11, 0.05, -0.02, 1e-3, -7e-4, 10.0, -4.0)
-    ),
+    BROWN: Camera(BROWN, WIDTH_PX, HEIGHT_PX, (3090.0, 2003.5, 1490.0, -0.11, 0.05, -0.02, 1e-3, -7e-4, 10.0, -4.0)),
     FISHEYE: Camera(FISHEYE, WIDTH_PX, HEIGHT_PX, (1900.0, 1890.0, 2003.5, 1490.0, -0.02, 0.006, -0.003, 5e-4)),
 }
 # COLMAP has all of them but BROWN's b2.
@@ -241,7 +239,9 @@ def test_a_camera_without_skew_has_the_same_rays() -> None:
     camera, points = CAMERAS[BROWN], grid_px(CAMERAS[BROWN])
     flat = undistort(camera, points)
     fx, fy, cx, cy = poselib_camera(camera)["params"]
-    np.testing.assert_allclose((without_skew(camera, flat) - [cx, cy]) / [fx, fy], normalise(camera, points), atol=1e-12)
+    np.testing.assert_allclose(
+        (without_skew(camera, flat) - [cx, cy]) / [fx, fy], normalise(camera, points), atol=1e-12
+    )
     other = CAMERAS["OPENCV"]
     assert without_skew(other, points) is points
 

@@ -111,8 +111,12 @@ def pose_error_deg(
         "max_iterations": _POSE_ITERATIONS[1],
     }
     found, _ = poselib.estimate_relative_pose(
-        without_skew(camera0, points0[usable]), without_skew(camera1, points1[usable]),
-        poselib_camera(camera0), poselib_camera(camera1), ransac, {},
+        without_skew(camera0, points0[usable]),
+        without_skew(camera1, points1[usable]),
+        poselib_camera(camera0),
+        poselib_camera(camera1),
+        ransac,
+        {},
     )
     rotation, translation = relative_pose(pose0, pose1)
     return angle_between_deg(np.asarray(found.R), rotation), _direction_angle_deg(np.asarray(found.t), translation)

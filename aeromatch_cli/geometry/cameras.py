@@ -146,9 +146,7 @@ def _fisheye_radius(p: dict[str, float], angle: FloatArray) -> FloatArray:
 
 def _fisheye_slope(p: dict[str, float], angle: FloatArray) -> FloatArray:
     square = angle * angle
-    return 1.0 + square * (
-        3.0 * p["k1"] + square * (5.0 * p["k2"] + square * (7.0 * p["k3"] + square * 9.0 * p["k4"]))
-    )
+    return 1.0 + square * (3.0 * p["k1"] + square * (5.0 * p["k2"] + square * (7.0 * p["k3"] + square * 9.0 * p["k4"])))
 
 
 def _largest_angle(p: dict[str, float]) -> float:

@@ -160,35 +160,44 @@ def nearest(start: Camera, forward: Forward) -> Nearest:
     return replace(found, camera=None if folds else camera)
 
 
-def nearest_of(camera: Camera, free: Collection[str], held: dict[str, float] | None = None) -> Nearest:
+def nearest_of(camera: Camera, free: Collection[str]) -> Nearest:
     """The camera of BROWN that comes nearest `camera` with only the parameters `free`; never without camera.
 
-    free: names of BROWN's parameters that are found; the others are zero, or as `held` says (cx, cy: the middle of the
-    picture). An exact one is not fitted. Of a fisheye lens, what lies further than 70 degrees from the axis is left out.
+    free: names of BROWN's parameters that are found; the others are zero, and the principal point the middle of the
+    picture. An exact one is not fitted. Of a fisheye lens, what lies further than 70 degrees from its axis is left out.
     """
     middle = (camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0
     p = parameters(camera)
     if is_fisheye(camera):
         p |= {"k1": p["k1"] - 1.0 / 3.0, "k2": 0.0, "k3": 0.0}  # the tangent's series begins angle + angle^3 / 3
     own = dict(zip(MODELS[BROWN], brown_camera((camera.width_px, camera.height_px), p).params, strict=True))
-    others = {name: 0.0 for name in own if name not in free} | (held or {})
-    others |= {name: value for name, value in zip(("cx", "cy"), middle, strict=True) if name in others}
-    start = Camera(BROWN, camera.width_px, camera.height_px, tuple((own | others).values()))
-    if not is_fisheye(camera) and start.params == tuple(own.values()):
+    others = dict.fromkeys(own, 0.0) | dict(zip(("cx", "cy"), middle, strict=True))
+    params = tuple(value if name in free else others[name] for name, value in own.items())
+    start = Camera(BROWN, camera.width_px, camera.height_px, params)
+    if not is_fisheye(camera) and params == tuple(own.values()):
         return Nearest(start)
-    wanted = _grid(camera)
-    rays = normalise(camera, wanted)
-    inside = np.hypot(rays[:, 0], rays[:, 1]) < (_WIDEST if is_fisheye(camera) else math.inf)
-    return _fitted(start, [name for name in MODELS[BROWN] if name in free], rays[inside], wanted[inside])
+    return _fitted(start, [name for name in MODELS[BROWN] if name in free], *_seen(camera))
+
+
+def in_colmap(camera: Camera) -> Nearest:
+    """The camera that COLMAP can hold: itself, or the nearest one without b2."""
+    if not parameters(camera)["skew"]:
+        return Nearest(camera)
+    return nearest_of(camera, [name for name in MODELS[BROWN] if name != "b2"])
 
 
 def fitted(formula: Formula, start: FloatArray, scale: FloatArray, camera: Camera) -> tuple[FloatArray, float, float]:
     """Parameters (P,) by which a formula's pixels come nearest a camera's, and the root mean square and the largest of
     their distances in pixels. scale: (P,) what makes the parameters of one order."""
+    return _least(formula, start, scale, *_seen(camera))
+
+
+def _seen(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Normalised coordinates and stored pixels (N, 2 each) over the picture that other models may have."""
     wanted = _grid(camera)
     rays = normalise(camera, wanted)
     inside = np.hypot(rays[:, 0], rays[:, 1]) < (_WIDEST if is_fisheye(camera) else math.inf)
-    return _least(formula, start, scale, rays[inside], wanted[inside])
+    return rays[inside], wanted[inside]
 
 
 def _fitted(start: Camera, free: Sequence[str], rays: FloatArray, wanted: FloatArray) -> Nearest:

@@ -19,7 +19,8 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
+from aeromatch_cli.geometry.cameras import BROWN, as_brown, colmap_camera, colmap_params, focal_px
+from aeromatch_cli.geometry.lenses import in_colmap, of_colmap
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
@@ -148,7 +149,7 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
         Colmap(raw_matches=False, pose_priors=False)(contents, folder)
         cameras = {
             str(number): {
-                "params": colmap_params(contents.block.cameras[k]),
+                "params": colmap_params(_sent(contents.block.cameras[k])),
                 "focal_px": focal_px(contents.block.cameras[k]),
                 "sigma": observed.focal_sigmas[k],
             }
@@ -195,5 +196,17 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
 
 
 def _camera(given: Camera, params: FloatArray) -> Camera:
-    """The given camera with what the mapper found, which counts pixels from the corner of the first."""
-    return from_colmap(given.model, given.width_px, given.height_px, tuple(float(value) for value in params))
+    """The given camera with what the mapper found, which counts pixels from the corner of the first.
+
+    COLMAP has no b2, so that the poses which it finds go with a camera without; what it finds of terms that divide goes
+    into the nearest BROWN camera.
+    """
+    sent = _sent(given)
+    model, _ = colmap_camera(sent)
+    found = of_colmap(model, given.width_px, given.height_px, tuple(float(value) for value in params)).camera or sent
+    return as_brown(found) if given.model == BROWN else found
+
+
+def _sent(camera: Camera) -> Camera:
+    """What COLMAP gets of a camera."""
+    return in_colmap(camera).camera or camera
