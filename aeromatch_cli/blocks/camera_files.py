@@ -1,6 +1,7 @@
 """Cameras from files: COLMAP's cameras.txt, YAML or JSON, and the block.json of a shared block.
 
 Parameters follow COLMAP: its order and its corner origin (cx = W / 2 is the centre); here they become this project's.
+BROWN, which COLMAP does not have, stands there in the same way.
 
 YAML and JSON: NAME: {model, width, height, params}, for every camera, or the same below a key `cameras`, beside which
 `crs` (a code) and `ground_z` (a height, or percentiles with p50) may stand. One camera may stand without its NAME.
@@ -14,11 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.lenses import Nearest, of_colmap
+from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes
-from aeromatch_cli.geometry.cameras import MODELS, colmap_params, focal_px
+from aeromatch_cli.geometry.cameras import FULL_OPENCV, MODELS, corner_params, focal_px
+from aeromatch_cli.geometry.lenses import Nearest, of_colmap
 
 _ENTRY_KEYS = ("model", "width", "height", "params")
 
@@ -100,7 +102,7 @@ def _file(
     path: Path, lenses: Mapping[str, Nearest], crs: str | None = None, ground_z_m: float | None = None
 ) -> CameraFile:
     cameras = {name: lens.camera for name, lens in lenses.items() if lens.camera is not None}
-    remarks = [lens.remark(f"{path.name}, camera {name}") for name, lens in lenses.items()]
+    remarks = [remark(lens, f"{path.name}, camera {name}") for name, lens in lenses.items()]
     return CameraFile(cameras, crs, ground_z_m, tuple(filter(None, remarks)))
 
 
@@ -132,9 +134,9 @@ def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) 
         raise ConfigError(f"{where}: {error}") from error
     camera = lens.camera
     if camera is None:
-        raise ConfigError(f"{lens.remark(where)}: give one of {', '.join(MODELS)}")
+        raise ConfigError(f"{remark(lens, where)}: give one of {', '.join((*MODELS, FULL_OPENCV))}")
     names = MODELS[camera.model]
-    named = dict(zip(names, colmap_params(camera), strict=True))
+    named = dict(zip(names, corner_params(camera), strict=True))
     if focal_px(camera) <= 0 or not (0 <= named["cx"] <= size[0] and 0 <= named["cy"] <= size[1]):
         raise ConfigError(
             f"{where}: focal length {focal_px(camera):g} px and principal point ({named['cx']:g}, {named['cy']:g}) px "

@@ -151,8 +151,8 @@ def _fisheyes(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
     degrees = 2.0 * math.degrees(math.atan(0.5 / _FISHEYE_FOCAL))
     return (
         f"the field of view of {len(wide)} of {len(facts)} images ({listed(wide)}) is wider than {degrees:.0f} degrees "
-        "by EXIF: probably a fisheye lens, which no camera model here describes; give undistorted images, and their "
-        "camera with --cameras",
+        "by EXIF: probably a fisheye lens, of which EXIF does not tell enough; give its camera as OPENCV_FISHEYE, by "
+        "--cameras or a pose file that has it, or undistorted images with theirs",
     )
 
 

@@ -198,6 +198,8 @@ def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict
 
 def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     with pycolmap.Database.open(database) as opened:
+        # Terms that divide follow noise; a camera of that model has a calibration to begin with.
+        divided = any(camera.model.name == "FULL_OPENCV" for camera in opened.read_all_cameras())
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
     options = pycolmap.GlobalPipelineOptions()
@@ -208,7 +210,7 @@ def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
     options.mapper.bundle_adjustment.refine_focal_length = free
-    options.mapper.bundle_adjustment.refine_extra_params = free and most >= _DISTORTION_IMAGES
+    options.mapper.bundle_adjustment.refine_extra_params = free and most >= _DISTORTION_IMAGES and not divided
     return options
 
 

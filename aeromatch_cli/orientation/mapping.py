@@ -20,6 +20,7 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px
+from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, lens_prior
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
@@ -185,7 +186,7 @@ def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, 
         "lens": prior.lens.tolist(),
         "sigmas": freed(prior, observed.calibration, observed.switches, images).tolist(),
         "fisheye": prior.fisheye,
-        "params": colmap_params(block.cameras[camera_id]),
+        "params": colmap_params(in_colmap(block.cameras[camera_id]).camera or block.cameras[camera_id]),
         "focal_px": focal_px(stated),
         "sigma": observed.focal_sigmas[camera_id],
     }

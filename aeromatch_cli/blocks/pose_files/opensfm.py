@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown, fisheye
 from aeromatch_cli.blocks.pose_files.geodesy import from_topocentric
 from aeromatch_cli.blocks.pose_files.odm import rotation_of_vector
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, rotation_row
@@ -19,6 +18,7 @@ from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import from_colmap
+from aeromatch_cli.geometry.lenses import Nearest, brown, fisheye
 
 
 def is_reconstruction(source: Source) -> bool:
@@ -96,11 +96,14 @@ def _camera(entry: Any) -> Nearest | None:
         if model == "perspective":
             f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
             return Nearest(from_colmap("RADIAL", width, height, (f, *middle, float(entry["k1"]), float(entry["k2"]))))
-        if model == "brown":
+        if model in ("brown", "simple_radial", "radial", "fisheye_opencv"):
             fx, fy = (float(entry[key]) * longer for key in ("focal_x", "focal_y"))
             cx, cy = width / 2.0 + float(entry["c_x"]) * longer, height / 2.0 + float(entry["c_y"]) * longer
-            radial = [float(entry.get(key, 0.0)) for key in ("k1", "k2", "k3")]
-            return brown((width, height), (fx, fy), (cx, cy), radial, (float(entry["p1"]), float(entry["p2"])))
+            radial = [float(entry.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4")]
+            if model == "fisheye_opencv":
+                return fisheye((width, height), (fx, fy), (cx, cy), radial)
+            tangential = float(entry.get("p1", 0.0)), float(entry.get("p2", 0.0))
+            return brown((width, height), (fx, fy), (cx, cy), radial[:3], tangential)
         if model == "fisheye":
             f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
             return fisheye((width, height), (f, f), middle, (float(entry["k1"]), float(entry["k2"])))

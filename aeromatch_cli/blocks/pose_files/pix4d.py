@@ -5,7 +5,8 @@ Geolocation: `name,c1,c2,z[,a1,a2,a3][,accuracy_horizontal,accuracy_vertical]`. 
 roll from straight down: nothing in the file tells them, so of flights that look down the column that turns most does.
 
 *_calibrated_camera_parameters.txt: eight lines of header, then for every image its name and size, K, radial and
-tangential distortion, t (the projection centre less the project's offset) and R (cam_from_world in OpenCV's axes). The
+tangential distortion (T1, T2 in OpenCV's order), t (the projection centre less the project's offset) and R
+(cam_from_world in OpenCV's axes). The
 offset lies beside in *_offset.xyz.
 """
 
@@ -16,7 +17,6 @@ from functools import partial
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown
 from aeromatch_cli.blocks.pose_files.source import (
     IMAGE,
     CameraShelf,
@@ -30,6 +30,7 @@ from aeromatch_cli.blocks.pose_files.source import (
 )
 from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.lenses import Nearest, brown
 
 _COUNTS = (4, 6, 7, 9)
 _LINES_OF_IMAGE = 10

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest
+from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
+from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
@@ -134,9 +135,9 @@ class CameraShelf:
             return
         if lens.camera is not None:
             self.found[key] = lens.camera
-        remark = lens.remark(f"{self.file}, camera {key}")
-        if remark and remark not in self.remarks:
-            self.remarks.append(remark)
+        said = remark(lens, f"{self.file}, camera {key}")
+        if said and said not in self.remarks:
+            self.remarks.append(said)
 
     def key(self, wanted: str) -> str:
         """The name for a row, "" where there is no such camera."""

@@ -50,7 +50,8 @@ class ExportContents:
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """Counts of what was written. files: absolute or relative as the folder was given, sorted."""
+    """Counts of what was written. files: absolute or relative as the folder was given, sorted. remarks: for a person,
+    on what the format does not hold."""
 
     files: tuple[Path, ...]
     images: int
@@ -60,6 +61,7 @@ class ExportSummary:
     matches: int
     verified_pairs: int
     verified_matches: int
+    remarks: tuple[str, ...] = ()
 
 
 @contextmanager
