@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Camera, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Camera, ControlPoint, FloatArray, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
@@ -40,7 +40,8 @@ class Context:
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
     share of it. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
-    given one. angles: image_id -> attitude as it was given. control: surveyed points.
+    given one. angles: image_id -> attitude as it was given. flights, velocities, relative_heights_m: as in
+    `orientation.mapping.Observed`. control: surveyed points.
     """
 
     settings: Settings
@@ -53,6 +54,9 @@ class Context:
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
+    flights: Mapping[str, str] = field(default_factory=dict)
+    velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     # By name; none where the images lie in a folder.
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
@@ -75,7 +79,15 @@ class Context:
     @property
     def observed(self) -> Observed:
         """What was given, for mapping and adjustment."""
-        return Observed(self.given.poses, self.focal_sigmas, self.angles)
+        return Observed(
+            poses=self.given.poses,
+            focal_sigmas=self.focal_sigmas,
+            angles=self.angles,
+            flights=self.flights,
+            velocities=self.velocities,
+            relative_heights_m=self.relative_heights_m,
+            control=self.control,
+        )
 
     @property
     def guessed_cameras(self) -> frozenset[str]:
