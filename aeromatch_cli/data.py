@@ -39,8 +39,9 @@ class Pose:
 
     center_m: (3,) float64, projection centre in the world frame, metres.
     world_rotation: (3, 3) float64, rotation part of cam_from_world, or None where only the position is known.
-    sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle. sigmas_m: those along
-    x, y, z of the world frame where they differ; None: sigma_position_m each.
+    sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle.
+    sigmas_m: standard deviations along x, y, z of the world frame where they differ, sigma_position_m being their root
+    mean square; None where each is sigma_position_m.
     """
 
     center_m: FloatArray
@@ -51,8 +52,8 @@ class Pose:
 
     @property
     def axis_sigmas_m(self) -> FloatArray:
-        """(3,) standard deviations along x, y, z."""
-        return np.array(self.sigmas_m or (self.sigma_position_m,) * 3)
+        """(3,) standard deviations along x, y, z of the world frame."""
+        return np.full(3, self.sigma_position_m) if self.sigmas_m is None else np.array(self.sigmas_m)
 
 
 @dataclass(frozen=True, eq=False)

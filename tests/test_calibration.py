@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from make_images import DJI_XMP, gps_tags, write_image
 
-from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigmas_m
 from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS, cameras_from_exif, focal_from_exif_px
 from aeromatch_cli.blocks.exif import ExifFacts, read_exif
 from aeromatch_cli.blocks.observations import observation_of_exif
@@ -62,10 +62,27 @@ def test_calibrated_focal_length_alone() -> None:
 
 def test_rtk_accuracy_is_the_position_s_sigma() -> None:
     xmp = {"drone-dji:RtkStdLon": "0.0112", "drone-dji:RtkStdLat": "0.0131", "drone-dji:RtkStdHgt": "0.0291"}
-    assert position_sigma_m(xmp) == 0.0291
-    assert position_sigma_m(dict.fromkeys(xmp, "0.004")) == 0.02
-    assert position_sigma_m(dict.fromkeys(xmp, "0")) is None
-    assert position_sigma_m({}) is None
+    assert position_sigmas_m(xmp) == ((0.02, 0.02, 0.0291), "")
+    assert position_sigmas_m(dict.fromkeys(xmp, "0.004")) == ((0.02, 0.02, 0.02), "")
+    assert position_sigmas_m(dict.fromkeys(xmp, "0")) == (None, "")
+    assert position_sigmas_m({}) == (None, "")
+
+
+@pytest.mark.parametrize(
+    ("flag", "sigmas_m", "said"),
+    [
+        ("50", (0.02, 0.03, 0.7), ""),
+        ("34", (0.5, 0.5, 0.7), "no fixed RTK solution"),
+        ("16", None, "no RTK solution"),
+        ("0", None, "no RTK solution"),
+    ],
+)
+def test_what_a_receiver_without_a_fix_states_is_not_believed(flag: str, sigmas_m: tuple | None, said: str) -> None:
+    xmp = {"RtkStdLon": "0.01", "RtkStdLat": "0.03", "RtkStdHgt": "0.7", "RtkFlag": flag}
+    found, remark = position_sigmas_m({f"drone-dji:{name}": value for name, value in xmp.items()})
+    assert found == sigmas_m
+    assert remark.startswith(said)
+    assert bool(remark) == bool(said)
 
 
 def test_an_image_file_is_read_with_both(tmp_path: Path) -> None:
@@ -77,7 +94,7 @@ def test_an_image_file_is_read_with_both(tmp_path: Path) -> None:
     assert focal_from_exif_px(facts) == (60.0, "XMP calibration")
     observation = observation_of_exif(facts, "auto")
     assert observation is not None
-    assert observation.sigma_position_m == 0.1
+    assert observation.sigmas_m == (0.05, 0.05, 0.1)
     found = cameras_from_exif({"a.jpg": facts}, {})
     assert set(found.focal_sigmas.values()) == {FOCAL_SIGMAS["XMP calibration"]}
 

@@ -2,7 +2,8 @@
 
 DJI's namespace `drone-dji`: DewarpData ("date;fx,fy,cx,cy,k1,k2,p1,p2,k3", pixels, cx and cy from the picture's centre,
 distortion as in OpenCV), CalibratedFocalLength (pixels), CalibratedOpticalCenterX (pixels, of the picture that both
-were measured in), DewarpFlag (1: the picture is free of distortion already), RtkStdLon, RtkStdLat, RtkStdHgt (metres).
+were measured in), DewarpFlag (1: the picture is free of distortion already), RtkStdLon, RtkStdLat, RtkStdHgt (metres),
+RtkFlag (status of the RTK solution, see `accuracies`).
 Source: DJI, Phantom 4 RTK and Zenmuse P1 user manuals.
 """
 
@@ -11,7 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from aeromatch_cli.data import Camera
+import numpy as np
+
+from aeromatch_cli.blocks.accuracies import Sigmas, believed_sigmas_m, completed_sigmas_m
+from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.cameras import brown_camera, focal_px, resized
 
 # Antenna and shutter add to what the receiver states.
@@ -47,12 +51,20 @@ def calibrated_camera(xmp: Mapping[str, str], width_px: int, height_px: int) -> 
     return resized(camera, width_px / full_width, width_px, height_px)
 
 
-def position_sigma_m(xmp: Mapping[str, str]) -> float | None:
-    """Standard deviation of a coordinate, the largest of those stated by the RTK receiver (DJI) or as GPSXYAccuracy and
-    GPSZAccuracy (senseFly, Pix4D); None where XMP states none."""
+def position_sigmas_m(xmp: Mapping[str, str]) -> tuple[Sigmas | None, str]:
+    """Standard deviations of a position to the east, to the north and of the height, as the RTK receiver (DJI) or
+    GPSXYAccuracy and GPSZAccuracy (senseFly, Pix4D) state them; None where XMP states none that can be believed. And
+    what is said of that."""
     rtk = _positive(xmp, [f"drone-dji:RtkStd{name}" for name in ("Lon", "Lat", "Hgt")])
-    stated = rtk or _positive(xmp, ["Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"])
-    return max(_LEAST_SIGMA_M, *stated) if stated else None
+    flag = _numbers(xmp.get("drone-dji:RtkFlag", ""))
+    if rtk:
+        x_m, y_m, z_m = (max(_LEAST_SIGMA_M, value) for value in rtk)
+        return believed_sigmas_m((x_m, y_m, z_m), flag[0] if len(flag) == 1 else None)
+    stated = _positive(xmp, ["Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"])
+    if not stated:
+        return None, ""
+    across_m, up_m = (max(_LEAST_SIGMA_M, value) for value in stated)
+    return completed_sigmas_m(z_m=up_m, across_m=across_m), ""
 
 
 def angle_sigma_deg(xmp: Mapping[str, str]) -> float | None:

@@ -1,9 +1,12 @@
-"""What aircraft write into the XMP of their pictures: angles of the camera, positions.
+"""What aircraft write into the XMP of their pictures: angles of the camera, positions, speed, serial number.
 
 Angles come from the camera's tags, never the aircraft's (Flight*Degree): DJI's and newer Autels' Gimbal*Degree,
 Skydio's CameraOrientationNED and Parrot's Camera*Degree count from level (`gimbal`: pitch -90 looks down);
 Camera:Yaw, Pitch, Roll of the Pix4D namespace (senseFly, MicaSense, Sequoia, older Autels, integrators of Sony
 cameras) from straight down with the image's top to the north (`nadir`). Yaw is against true north in all.
+
+DJI's FlightXSpeed, FlightYSpeed and FlightZSpeed are those of the aircraft to true north, to the east and, in the
+same axes as its angles (NED), down, in metres per second (Mavic 3E and Zenmuse P1 user manuals, list of XMP fields).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ LONGITUDES = (
     "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude", "drone-skydio:Longitude",
 )  # fmt: skip
 ALTITUDES = ("drone-dji:AbsoluteAltitude", "drone-skydio:AbsoluteAltitude")
+_SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber", "drone-dji:CameraSerialNumber")
 _PREFIXES = ("drone-dji", "drone-skydio", "drone-parrot")
 # Structures whose members carry the names of others.
 _STRUCTURE = "CameraOrientationNED"
@@ -96,6 +100,17 @@ def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
             yaw, pitch, roll = (float(value) for value in values if value is not None)
             return CameraAngles(yaw, pitch, roll, convention)
     return None
+
+
+def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
+    """Of the aircraft to true north, to the east and down, metres per second; None where XMP does not state all."""
+    north, east, down = (tag_number(xmp.get(f"drone-dji:Flight{axis}Speed")) for axis in "XYZ")
+    return None if north is None or east is None or down is None else (north, east, down)
+
+
+def xmp_serial(xmp: Mapping[str, str]) -> str:
+    """Serial number of the aircraft, else of the camera, "" where XMP states none."""
+    return next((xmp[name] for name in _SERIALS if xmp.get(name, "").strip("0 ")), "")
 
 
 def tag_number(value: Any) -> float | None:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, ControlPoint, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px
 from aeromatch_cli.geometry.lenses import in_colmap
@@ -51,10 +51,12 @@ class Model:
 class Observed:
     """What was given of a block, as observations.
 
-    poses: image_id -> pose whose centre is one, with sigma_position_m. focal_sigmas: camera_id -> standard deviation of
-    its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt counts. cameras:
-    camera_id -> Camera as it was stated; of others the block's own count. calibration, switches: what is free of them,
-    see `calibration.freed`. flights: image_id -> name of its flight. velocities: image_id -> (3,) metres per second.
+    poses: image_id -> pose whose centre is one, with its standard deviations. focal_sigmas: camera_id -> standard
+    deviation of its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt
+    counts. cameras: camera_id -> Camera as it was stated; of others the block's own count. calibration, switches: what
+    is free of them, see `calibration.freed`. flights: image_id -> name of its flight. velocities: image_id -> (3,) of
+    the aircraft in the world frame, metres per second, where it is known. relative_heights_m: image_id -> height above
+    the take-off point of its flight, where it is stated. control: surveyed points.
     """
 
     poses: Mapping[str, Pose]
@@ -65,6 +67,8 @@ class Observed:
     switches: Mapping[str, bool] = field(default_factory=dict)
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
+    control: tuple[ControlPoint, ...] = ()
 
 
 def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> tuple[Model, ...]:

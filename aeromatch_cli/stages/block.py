@@ -20,7 +20,7 @@ from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, ControlPoint, Ground, Image
+from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
@@ -43,7 +43,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised: as in `read.BlockInputs`. gsd_before_m: gsd_m and reduced_gsd_m that the workspace had, or None.
+    recognised, flights, velocities, relative_heights_m: as in `read.BlockInputs`. gsd_before_m: gsd_m and
+    reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
 
@@ -52,6 +53,9 @@ class BlockRead:
     focal_sigmas: Mapping[str, float]
     likely_focals: Mapping[str, float]
     angles: Mapping[str, Angles]
+    flights: Mapping[str, str]
+    velocities: Mapping[str, FloatArray]
+    relative_heights_m: Mapping[str, float]
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
@@ -87,6 +91,9 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         focal_sigmas=inputs.focal_sigmas,
         likely_focals=inputs.likely_focals,
         angles=inputs.angles,
+        flights=inputs.flights,
+        velocities=inputs.velocities,
+        relative_heights_m=inputs.relative_heights_m,
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Camera, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Camera, ControlPoint, FloatArray, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
@@ -43,8 +43,9 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
-    given one. angles: image_id -> attitude as it was given. control: surveyed points.
+    share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal
+    length in pixels that EXIF speaks for, where it contradicts the given one. angles: image_id -> attitude as it was
+    given. flights, velocities, relative_heights_m: as in `orientation.mapping.Observed`. control: surveyed points.
     """
 
     settings: Settings
@@ -58,6 +59,9 @@ class Context:
     calibrated: frozenset[str] = frozenset()
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
+    flights: Mapping[str, str] = field(default_factory=dict)
+    velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     # By name; none where the images lie in a folder.
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
@@ -80,8 +84,16 @@ class Context:
     @property
     def observed(self) -> Observed:
         """What was given, for mapping and adjustment."""
-        cameras = {camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras}
-        return Observed(self.given.poses, self.focal_sigmas, self.angles, cameras)
+        return Observed(
+            poses=self.given.poses,
+            focal_sigmas=self.focal_sigmas,
+            angles=self.angles,
+            cameras={camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras},
+            flights=self.flights,
+            velocities=self.velocities,
+            relative_heights_m=self.relative_heights_m,
+            control=self.control,
+        )
 
     def _stated_camera(self, camera_id: str) -> Camera:
         """A camera as it was given; where EXIF contradicts it, with the focal length that the pictures are nearer to."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.pose_files.geodesy import from_topocentric
 from aeromatch_cli.blocks.pose_files.odm import rotation_of_vector
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, rotation_row
@@ -136,7 +137,7 @@ def read_overrides(source: Source) -> PoseList:
         rows.append(
             PoseRow(
                 image=image_name(name), line=0, position=place, position_kind="geographic", attitude=angles,
-                attitude_kind="omega_phi_kappa" if angles else "none", sigma_position_m=sigma or None,
+                attitude_kind="omega_phi_kappa" if angles else "none", sigmas_m=completed_sigmas_m(overall_m=sigma),
             )
         )  # fmt: skip
     return PoseList(tuple(rows), "geographic", (), "OpenSfM exif_overrides.json")

@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import (
     IMAGE,
     CameraShelf,
@@ -91,13 +92,13 @@ def _row(
 ) -> PoseRow:
     first, second, height = values[:3]
     angles = tuple(values[3:6]) if len(values) >= 6 else None
-    sigmas = values[6:8] if len(values) == 8 else values[3:5] if len(values) == 5 else []
+    across_m, up_m = values[-2:] if len(values) in (5, 8) else (None, None)
     return PoseRow(
         image=image_name(name), line=line, position=(second, first, height) if exchanged else (first, second, height),
         position_kind=kind, attitude=angles, attitude_kind=form if angles else "none",
         forward=False if angles and form == "yaw_pitch_roll" else None,
         true_north=bool(angles) and form == "yaw_pitch_roll",
-        sigma_position_m=max((s for s in sigmas if s > 0.0), default=None),
+        sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
     )  # fmt: skip
 
 

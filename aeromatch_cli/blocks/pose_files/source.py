@@ -206,7 +206,6 @@ def rotation_row(
     *,
     true_north: bool = False,
     camera: str = "",
-    sigma_position_m: float | None = None,
 ) -> PoseRow:
     """A row of a projection centre and a matrix cam_from_world (3, 3), relative to the grid or to true north."""
     x, y, z = (float(value) for value in center)
@@ -217,6 +216,5 @@ def rotation_row(
         attitude = to_quaternion(rotation)
     return PoseRow(
         image=image_name(image), line=line, position=(x, y, z), position_kind=kind, attitude=attitude,
-        attitude_kind="none" if attitude is None else "quaternion", camera=camera, sigma_position_m=sigma_position_m,
-        true_north=true_north,
+        attitude_kind="none" if attitude is None else "quaternion", camera=camera, true_north=true_north,
     )  # fmt: skip
