@@ -12,10 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from aeromatch_cli.blocks.accuracies import Sigmas, believed_sigmas_m, completed_sigmas_m
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import brown_camera, focal_px, resized
 
 # Antenna and shutter add to what the receiver states.

@@ -1,5 +1,5 @@
-"""Adjustment of pycolmap models, for the processes of `mapper` and `refiner`: in the world frame, with what was given of
-positions, attitudes and cameras as observations.
+"""Adjustment of pycolmap models, for the processes of `mapper` and `refiner`: in the world frame, with what was
+given of positions, attitudes and cameras as observations.
 
 Image numbers are those of the database, from 1; arrays of what was given have one row for each.
 """
@@ -30,7 +30,7 @@ from aeromatch_cli.orientation.bundle.of_model import (
 from aeromatch_cli.orientation.bundle.projection import project
 from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.judgement import connected_groups
-from aeromatch_cli.orientation.placing import Placement, place
+from aeromatch_cli.orientation.placing import Placement, height_steps_m, place
 from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of
 
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
@@ -61,8 +61,8 @@ _FAR_SIGMAS = 10.0
 class Given:
     """What was given of N images: rows are their numbers less one.
 
-    positions_m, sigmas_m: (N, 3), NaN where there is none. ups: (N, 3) unit vectors upwards in the camera's frame by its
-    measured tilt. rotations: (N, 3, 3) cam_from_world, sigmas_deg: (N,) of its angles. flights: (N,) from 0.
+    positions_m, sigmas_m: (N, 3), NaN where there is none. ups: (N, 3) unit vectors upwards in the camera's frame by
+    its measured tilt. rotations: (N, 3, 3) cam_from_world, sigmas_deg: (N,) of its angles. flights: (N,) from 0.
     velocities_m_s: (N, 3), zero where it is not known.
     """
 
@@ -75,7 +75,7 @@ class Given:
     velocities_m_s: FloatArray
 
     @classmethod
-    def of_file(cls, arrays: Mapping[str, FloatArray]) -> Given:
+    def of_file(cls, arrays: Mapping[str, Any]) -> Given:
         """Of priors.npz, see `mapping`."""
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__})
 
@@ -132,32 +132,22 @@ class Work:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """result: of the adjustment; images, points: numbers of its rows. placement: None where the model had its place."""
+    """result: of the adjustment; images, points, cameras, flights: numbers of its rows. placement: None where the model
+    had its place. steps_m: (N,) by row of what was given, steps of height of the flights that were taken out before.
+    """
 
     result: Adjusted
     images: list[int]
     points: list[int]
+    cameras: list[int]
+    flights: list[int]
     placement: Placement | None = None
+    steps_m: FloatArray | None = None
 
     @property
     def used(self) -> list[int]:
         """Numbers of the images whose positions count."""
         return [i for i, counts in zip(self.images, self.result.network.located, strict=True) if counts]
-
-
-def adjustment_facts(work: Work, outcome: Outcome) -> dict[str, Any]:
-    """What an adjustment says of itself, JSON-ready: accuracy of observations, and of every camera its calibration."""
-    result = outcome.result
-    found = result.found
-    cameras = {}
-    numbers = [n for n in sorted(work.priors) if n in work.lenses]
-    del numbers
-    return {
-        "sigma_px": result.sigma_px,
-        "position_factors": result.position_factors.tolist(),
-        "positions_used": int(result.network.located.sum()),
-        "cameras": cameras,
-    } | ({} if found is None else {})
 
 
 def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -> Outcome:
@@ -167,6 +157,7 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     """
     ids = image_numbers(model)
     rows = np.array(ids, dtype=int) - 1
+    given, steps_m = _without_steps(model, given)
     positions_m, sigmas_m = given.positions_m[rows], given.mean_sigmas_m[rows]
     placement = _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
     # A wrong focal length puts images far from positions that are right: those count that may be.
@@ -180,7 +171,19 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     outcome = _adjust(work, model, ids, given, counts, now, levels, np.zeros(6), held)
     if placement.kind == "level":  # its scale and place are those of an adjusted flying height
         _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
-    return replace(outcome, placement=replace(placement, agreeing=outcome.result.network.located))
+    return replace(outcome, placement=placement, steps_m=steps_m)
+
+
+def _without_steps(model: Any, given: Given) -> tuple[Given, FloatArray]:
+    """Positions without steps of height between flights, and these: (N,) metres."""
+    ids = image_numbers(model)
+    rows = np.array(ids, dtype=int) - 1
+    steps_m = np.zeros(len(given.positions_m))
+    rotations = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])
+    in_model = np.einsum("nji,nj->ni", rotations, given.ups[rows])
+    seen = centers_of(model, ids), points_of(model), given.positions_m[rows], given.mean_sigmas_m[rows], in_model
+    steps_m[rows] = height_steps_m(*seen, given.flights[rows])
+    return replace(given, positions_m=given.positions_m - steps_m[:, None] * [0.0, 0.0, 1.0]), steps_m
 
 
 def adjust_in_place(
@@ -234,7 +237,7 @@ def _adjust(
     start = replace(start, lens=np.where(network.lens_sigmas > 0.0, start.lens, network.lens_prior))
     result = adjust(network, start, work.options)
     _take(work, model, ids, points, numbers, result.state)
-    return Outcome(result, ids, points)
+    return Outcome(result, ids, points, numbers, np.unique(given.flights[rows]).tolist())
 
 
 def _network(work: Work, model: Any, given: Given) -> tuple[Network, Unknowns, list[int], list[int]]:

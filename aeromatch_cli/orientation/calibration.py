@@ -20,8 +20,8 @@ Calibration = Literal["auto", "given", "focal", "brown"]
 
 # Standard deviations of what nobody has stated: the principal point as a share of the picture's width; the radial terms
 # each by what they move the corner of the picture, as a share of its distance from the middle; decentring likewise;
-# affinity and skew as a share of the focal length. Lenses of consumer cameras: Luhmann et al., Close-Range Photogrammetry,
-# section 3.3; principal points 15 to 24 px off in pictures of 1,000 to 4,000 px.
+# affinity and skew as a share of the focal length. Lenses of consumer cameras: Luhmann et al., Close-Range
+# Photogrammetry, section 3.3; principal points 15 to 24 px off in pictures of 1,000 to 4,000 px.
 _CENTRE, _RADIAL, _DECENTRING, _AFFINITY = 0.02, 0.05, 0.0007, 0.0002
 # A calibration that was stated is this much nearer to the truth than nothing; it was made at another time, temperature
 # and focus.
@@ -58,7 +58,7 @@ def camera_of(lens: FloatArray, given: Camera) -> Camera:
         named = {**values, "fx": values["f"] + values["b1"], "fy": values["f"], "k4": values["p1"]}
         return Camera(FISHEYE, given.width_px, given.height_px, tuple(named[name] for name in MODELS[FISHEYE]))
     brown = Camera(BROWN, given.width_px, given.height_px, tuple(values[name] for name in MODELS[BROWN]))
-    named = {**parameters(brown), "f": values["f"]}
+    named = {**parameters(brown), **values}
     same = Camera(given.model, given.width_px, given.height_px, tuple(named[n] for n in MODELS[given.model]))
     return same if np.array_equal(lens_of(same)[:10], lens_of(brown)[:10]) else brown
 

@@ -25,7 +25,6 @@ from aeromatch_cli.orientation.adjusting import (
     Work,
     adjust_in_place,
     adjusted,
-    adjustment_facts,
     believed_tilts,
     connected_parts,
     drop_weak_images,
@@ -34,6 +33,7 @@ from aeromatch_cli.orientation.adjusting import (
     keep_images,
     state_errors,
 )
+from aeromatch_cli.orientation.adjustment_facts import adjustment_facts
 from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
@@ -109,9 +109,9 @@ def refine(folder: Path) -> None:
         lenses = {n: work.lens(model, n) for n in images_by_camera(model)}
         held |= lenses.keys()
         name = f"model{len(facts)}.npz"
-        deviations = _deviations(model, given, outcome)
+        deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
         np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
-        known = {} if outcome is None else adjustment_facts(work, outcome)
+        known = {} if outcome is None else adjustment_facts(outcome)
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 

@@ -110,7 +110,11 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
-    known = sorted(context.focal_sigmas.items()), sorted(context.observed.cameras.items()), sorted(context.angles.items())
+    known = (
+        sorted(context.focal_sigmas.items()),
+        sorted(context.observed.cameras.items()),
+        sorted(context.angles.items()),
+    )
     measured = refine.made_fingerprint(context)
     return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
 

@@ -96,7 +96,7 @@ class Context:
         )
 
     def _stated_camera(self, camera_id: str) -> Camera:
-        """A camera as it was given; where EXIF contradicts it, with the focal length that the pictures are nearer to."""
+        """A camera as given; where EXIF contradicts it, with that focal length which the pictures are nearer to."""
         stated = self.given.cameras[camera_id]
         if camera_id not in self.likely_focals or camera_id not in self.block.cameras:
             return stated

@@ -8,6 +8,7 @@ fits best then (Meissl 1969; Triggs et al. 2000, section 9).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -100,12 +101,13 @@ def pose_sigmas(network: Network, state: Unknowns, found: Covariance) -> tuple[F
 
 def lens_correlations(found: Covariance) -> list[tuple[int, str, str, float]]:
     """Camera, two of its unknowns and their correlation, the strongest first."""
-    listed = []
+    listed: list[tuple[int, str, str, float]] = []
     for camera, matrix in enumerate(found.lens):
-        sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        for i in np.flatnonzero(sigmas):
-            for j in np.flatnonzero(sigmas[:i]):
-                listed.append((camera, LENS[j], LENS[i], float(matrix[i, j] / (sigmas[i] * sigmas[j]))))
+        free = np.flatnonzero(np.diag(matrix) > 0.0)
+        sigmas = np.sqrt(np.diag(matrix)[free])
+        related = matrix[np.ix_(free, free)] / np.outer(sigmas, sigmas)
+        pairs = combinations(range(len(free)), 2)
+        listed += [(camera, LENS[free[i]], LENS[free[j]], float(related[i, j])) for i, j in pairs]
     return sorted(listed, key=lambda one: -abs(one[3]))
 
 

@@ -28,14 +28,15 @@ FLIGHT = ("shift_x", "shift_y", "shift_z", "lag_s", "unused", "unused")
 class Network:
     """Observations of M image points of P object points in N images of K cameras and F flights.
 
-    image, point: (M,) rows. xy_px: (M, 2) measured, sigma_px: (M,) of a coordinate. camera, flight: (N,) rows.
+    image, point: (M,) rows. xy_px: (M, 2) measured, sigma_px: (M,) of a coordinate; that of tie points is estimated.
+    camera, flight: (N,) rows.
     fisheye: (K,) whether the lens is OPENCV_FISHEYE. rows_px: (K,) height of the pictures.
     positions_m: (N, 3), NaN where there is none; position_sigmas_m: (N, 3) of each axis.
     attitudes: (N, 3, 3) measured cam_from_world; attitude_sigmas: (N, 3) radians about the world's axes, inf where an
     angle is not measured.
     velocities_m_s: (N, 3) in the world, zero where they are not known.
-    lens_prior, lens_sigmas: (K, 12) by LENS; mount_sigmas: (K, 6) by MOUNT, flight_sigmas: (F, 6) by FLIGHT, about zero.
-    A standard deviation of zero holds the unknown, an infinite one says nothing of it.
+    lens_prior, lens_sigmas: (K, 12) by LENS. mount_sigmas: (K, 6) by MOUNT, flight_sigmas: (F, 6) by FLIGHT, about 0.
+    A standard deviation of 0 holds the unknown, an infinite one says nothing of it.
     control: (Q,) rows of points that were surveyed, control_m: (Q, 3), control_sigmas_m: (Q, 3).
     held: (N,) images whose poses stay.
     """
@@ -73,6 +74,16 @@ class Network:
     @property
     def flights(self) -> int:
         return len(self.flight_sigmas)
+
+    @property
+    def tie_points(self) -> BoolArray:
+        """(M,) image points that are not those of control points."""
+        return ~np.isin(self.point, self.control)
+
+    @property
+    def tie_sigma_px(self) -> float:
+        """Standard deviation of a coordinate of a tie point."""
+        return float(self.sigma_px[self.tie_points].mean()) if self.tie_points.any() else 1.0
 
     @property
     def located(self) -> BoolArray:

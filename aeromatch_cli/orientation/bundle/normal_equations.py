@@ -129,7 +129,7 @@ def equations(network: Network, state: Unknowns) -> Equations:
     by_pose = np.concatenate([by_turn, -by_point], axis=2) * ~network.held[network.image, None, None]
     lens = layout.lens(camera)
     rows = [_rows([(network.image, by_pose), (lens, by_lens[:, :, :6]), (lens + 1, by_lens[:, :, 6:])], layout)]
-    values = [residuals.ravel()]
+    values: list[FloatArray] = [residuals.ravel()]
     for found, derivatives in (_positions(network, state, layout), _attitudes(network, state, layout)):
         if len(found):
             rows.append(_rows(derivatives, layout))

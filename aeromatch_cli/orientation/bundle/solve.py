@@ -37,13 +37,13 @@ def solve(network: Network, state: Unknowns, tolerance: float) -> Solved:
         made = equations(network, state)
         while damping <= _MOST_DAMPING:
             tried = _moved(network, state, reduced(made, damping))
-            found = cost(network, tried) if tried is not None else np.inf
-            if found < best:
+            if tried is not None and cost(network, tried) < best:
                 break
             damping *= _RAISED
         else:
             break
-        step += 1
+        assert tried is not None
+        step, found = step + 1, cost(network, tried)
         gain, best, state = 1.0 - found / best, found, tried
         damping = max(_EASED * damping, _LEAST_DAMPING)
         if gain < tolerance:
