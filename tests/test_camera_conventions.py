@@ -275,8 +275,8 @@ def test_dewarp_data_is_read() -> None:
 # --- exporters: the numbers of what they wrote, by the program's formula ---------------------------------------------
 
 
-def export(name: str, camera: Camera, folder: Path, pixel: tuple[float, float] = (1.0, 2.0)) -> ExportSummary:
-    """Two images of one camera; one match of the first image at `pixel`."""
+def contents_with(camera: Camera, pixel: tuple[float, float]) -> ExportContents:
+    """Two images of one camera and one match, at `pixel` in both."""
     truth = make_truth()
     images = tuple(
         dataclasses.replace(image, camera_id="a", width_px=WIDTH, height_px=HEIGHT) for image in truth.block.images[:2]
@@ -286,8 +286,11 @@ def export(name: str, camera: Camera, folder: Path, pixel: tuple[float, float] =
     places = {image.image_id: np.array([pixel], np.float64) for image in images}
     one = np.zeros((1, 2), np.int32)
     item = PairContents(truth.pairs[0].pair, one, one, "E", truth.pairs[0].model)
-    contents = ExportContents(block, places.__getitem__, iter([item]))
-    return EXPORTERS[name]()(contents, folder)  # type: ignore[operator, no-any-return]
+    return ExportContents(block, places.__getitem__, iter([item]))
+
+
+def export(name: str, camera: Camera, folder: Path, pixel: tuple[float, float] = (1.0, 2.0)) -> ExportSummary:
+    return EXPORTERS[name]()(contents_with(camera, pixel), folder)  # type: ignore[operator, no-any-return]
 
 
 def opencv(k: tuple[float, ...], p1: float, p2: float) -> tuple[float, float]:
@@ -481,3 +484,16 @@ def test_every_program_of_the_tests_is_on_the_page() -> None:
     programs = ("COLMAP", "OpenCV", "Metashape", "BlocksExchange", "Pix4D", "OpenSfM", "ODM", "MicMac", "openMVG",
                 "AliceVision", "Bundler", "BINGO", "DJI", "transforms.json")  # fmt: skip
     assert [name for name in programs if name not in page] == []
+
+
+def test_remarks_reach_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The stage says what an exporter could not write exactly, and keeps it in its facts."""
+    from aeromatch_cli.stages import export as stage
+
+    monkeypatch.setattr(stage, "contents_of", lambda *_: contents_with(block_camera(), (1.0, 2.0)))
+    task: Any = stage.ExportTask(EXPORTERS["bundler"](), None, tmp_path / "bundler", None)  # type: ignore[arg-type]
+    facts = stage._run_task(task)
+    (remark,) = facts["remarks"]
+    assert f"warning: export bundler: {remark}" in caplog.text
