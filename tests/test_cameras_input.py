@@ -164,6 +164,7 @@ def test_a_fisheye_lens_is_named(tmp_path: Path, focal_35mm: int, fisheye: bool)
         write_image(tmp_path / f"{number}.jpg", (400, 300), exif={37386: 2.7, 41989: focal_35mm})
     warnings = read_inputs(tmp_path).warnings
     assert any("probably a fisheye lens" in warning for warning in warnings) == fisheye
+    assert any("give its camera as OPENCV_FISHEYE" in warning for warning in warnings) == fisheye
 
 
 def test_names_of_cameras_that_the_file_has_none_of_are_not_used(tmp_path: Path) -> None:

@@ -42,8 +42,8 @@ One line per image: `image_id` (unique slug of the relative path), `name` (relat
 
 ### cameras.csv
 
-`camera_id`, `model` (COLMAP's name), `width_px`, `height_px`, `params`: separated by spaces, in COLMAP's order. cx and
-cy are in this workspace's pixel frame (COLMAP's minus 0.5).
+`camera_id`, `model` (COLMAP's name, or BROWN), `width_px`, `height_px`, `params`: separated by spaces, in the order of
+cameras.md. cx and cy are in this workspace's pixel frame (COLMAP's minus 0.5).
 
 ### poses.csv
 

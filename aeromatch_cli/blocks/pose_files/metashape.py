@@ -21,13 +21,14 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.lenses import of_metashape
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
-from aeromatch_cli.geometry.lenses import Nearest, brown, fisheye
+from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
@@ -206,25 +207,14 @@ def _similarity(source: Source, element: Any) -> tuple[FloatArray, FloatArray, f
 
 
 def _sensor(sensor: Any) -> Nearest | None:
-    """The adjusted calibration of a frame or fisheye camera; without camera for other types, None without a
-    calibration. Metashape's fisheye is equidistant before its distortion, as OpenCV's is."""
+    """The adjusted calibration; without camera for lenses that no model here describes, None without a calibration."""
     found = [c for c in sensor.findall("calibration") if c.get("class") == "adjusted"] or sensor.findall("calibration")
     if not found:
         return None
-    kind = found[0].get("type", "frame")
-    if kind not in ("frame", "fisheye"):
-        return Nearest(None)
+    size = found[0].find("resolution")
+    size = sensor.find("resolution") if size is None else size
     try:
-        facts = {child.tag: float(child.text) for child in found[0] if child.tag != "resolution" and child.text}
-        size = found[0].find("resolution")
-        size = sensor.find("resolution") if size is None else size
         width, height = int(size.get("width")), int(size.get("height"))
-        f = facts["f"]
-        middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+    except (AttributeError, TypeError, ValueError):
         return None
-    focal = f + facts.get("b1", 0.0), f
-    radial = [facts.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)]
-    tangential = facts.get("p2", 0.0), facts.get("p1", 0.0)
-    read = fisheye if kind == "fisheye" else brown
-    return read((width, height), focal, middle, radial, tangential, facts.get("b2", 0.0))
+    return of_metashape(found[0], found[0].get("type", "frame"), width, height)
