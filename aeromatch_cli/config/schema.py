@@ -86,8 +86,18 @@ class BlockSettings(_Section):
     )
     gcp: str = Field(
         "",
-        description="Ground control points in the layout of ODM's gcp_list.txt; the adjusted block is compared with "
-        "them.",
+        description="Ground control points: ODM's gcp_list.txt, Pix4D's or Metashape's coordinates (CSV), or "
+        "Metashape's markers (XML).",
+    )
+    gcp_marks: str = Field(
+        "",
+        description="Image measurements of the control points where they stand in a file of their own (image, label, "
+        "x, y); empty: the one beside the coordinates.",
+    )
+    gcp_use: Literal["adjust", "check"] = Field(
+        "adjust",
+        description="What control points are for: the fit, except those that are marked as check points (adjust), or "
+        "none of them (check).",
     )
     angles: Literal["auto", "gimbal", "nadir"] = Field(
         "auto",
