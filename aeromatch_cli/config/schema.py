@@ -67,8 +67,8 @@ class BlockSettings(_Section):
     )
     cameras: str = Field(
         "exif",
-        description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, focal length and size); or "
-        "`folder` (one camera per folder).",
+        description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, serial number, lens, band, "
+        "focal length and size); or `folder` (one camera per folder).",
     )
     crs: str = Field(
         "auto",
