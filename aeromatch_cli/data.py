@@ -100,15 +100,18 @@ class AdjustedBlock:
 
 @dataclass(frozen=True, eq=False)
 class ControlPoint:
-    """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in transformations.
+    """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in any fit.
 
-    pixels: image_id -> (2,) stored pixel.
+    pixels: image_id -> (2,) stored pixel. sigmas_m: standard deviations of x, y, z; sigma_px: of each coordinate of a
+    pixel.
     """
 
     name: str
     position_m: FloatArray
     check: bool
     pixels: Mapping[str, FloatArray]
+    sigmas_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
+    sigma_px: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -221,6 +221,18 @@ def test_sensefly_states_accuracies(tmp_path: Path) -> None:
     assert (facts.sigmas_m, facts.sigma_angle_deg) == ((0.03, 0.03, 0.05), 5.0)
 
 
+def test_bands_of_a_multispectral_camera(tmp_path: Path) -> None:
+    space = 'xmlns:Camera="http://pix4d.com/camera/1.0/"'
+    for inner, band in (
+        ("<rdf:Seq><rdf:li>Green</rdf:li></rdf:Seq>", "Green"),
+        ("<rdf:Seq><rdf:li>Red</rdf:li><rdf:li>Green</rdf:li></rdf:Seq>", ""),
+        ("NIR", "NIR"),
+    ):
+        body = f"<Camera:BandName>{inner}</Camera:BandName>"
+        facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
+        assert facts.band == band
+
+
 def test_a_positioning_error_in_the_gps_tags_is_a_standard_deviation(tmp_path: Path) -> None:
     facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0) | {31: 2.5}))
     assert facts.sigmas_m == (2.5, 2.5, 5.0)  # it is the horizontal one
@@ -234,6 +246,8 @@ def test_serial_number_offset_of_the_clock_and_speed(tmp_path: Path) -> None:
     assert (facts.serial, facts.utc_offset, facts.speed_m_s) == ("3Q4", "+02:00", (1.5, -4.0, 0.1))
     xmp = xmp.replace("drone-dji:FlightXS", 'drone-dji:DroneSerialNumber="1581F" drone-dji:FlightXS')
     facts = read_exif(write_image(tmp_path / "a.jpg", exif=exif | {36881: "   :  "}, xmp=xmp))
-    assert (facts.serial, facts.utc_offset) == ("1581F", "")
+    assert (facts.serial, facts.camera_serial, facts.utc_offset) == ("1581F", "3Q4", "")
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={42033: "0000000000", 42036: "24 mm f/2.8", 42037: "77"}))
+    assert (facts.serial, facts.camera_serial, facts.lens) == ("", "", "24 mm f/2.8 77")
     facts = read_exif(write_image(tmp_path / "a.jpg"))
     assert (facts.serial, facts.utc_offset, facts.speed_m_s) == ("", "", None)

@@ -25,6 +25,7 @@ from aeromatch_cli.blocks.xmp import (
     CameraAngles,
     tag_number,
     xmp_angles,
+    xmp_band,
     xmp_properties,
     xmp_serial,
     xmp_speed_m_s,
@@ -37,11 +38,12 @@ from aeromatch_cli.images.gdal import check_pixels
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
 _DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL = 36867, 37520, 37521, 36881
-_BODY_SERIAL, _CAMERA_SERIAL = 42033, 50735
+_BODY_SERIAL, _CAMERA_SERIAL, _LENS_MODEL, _LENS_SERIAL = 42033, 50735, 42036, 42037
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
+_XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # What Pillow raises on headers that are cut or scrambled.
@@ -58,8 +60,9 @@ class ExifFacts:
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
     relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the
     position to the east, to the north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg:
-    of the angles. serial: number of the aircraft or, where only that is stated, of the camera's body. utc_offset:
-    of `time`, such as "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
+    of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
+    that of the aircraft. lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as
+    "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
     georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
     be used.
     """
@@ -84,6 +87,9 @@ class ExifFacts:
     sigma_angle_deg: float | None = None
     georeferenced: bool = False
     serial: str = ""
+    camera_serial: str = ""
+    lens: str = ""
+    band: str = ""
     utc_offset: str = ""
     speed_m_s: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
@@ -114,6 +120,7 @@ def read_exif(path: Path) -> ExifFacts:
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     orientation = tag_number(tags.get(_ORIENTATION)) or 1.0
+    body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
     return ExifFacts(
         width_px=width_px,
         height_px=height_px,
@@ -134,7 +141,10 @@ def read_exif(path: Path) -> ExifFacts:
         sigmas_m=_sigmas_m(header.gps, xmp, notes),
         sigma_angle_deg=angle_sigma_deg(xmp),
         georeferenced=bool(_GEOTIFF & tags.keys()),
-        serial=xmp_serial(xmp) or _text(exif.get(_BODY_SERIAL)) or _text(tags.get(_CAMERA_SERIAL)),
+        serial=xmp_serial(xmp) or body,
+        camera_serial=body or xmp_serial(xmp),
+        lens=" ".join(part for part in (_text(exif.get(_LENS_MODEL)), _serial(exif.get(_LENS_SERIAL))) if part),
+        band=xmp_band(xmp),
         utc_offset=_utc_offset(exif),
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
@@ -322,6 +332,12 @@ def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+
+
+def _serial(value: Any) -> str:
+    """A serial number; zeros stand for none."""
+    text = _text(value)
+    return text if text.strip("0 ") else ""
 
 
 def _positive(value: Any) -> float | None:

@@ -22,8 +22,9 @@ LONGITUDES = (
     "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude", "drone-skydio:Longitude",
 )  # fmt: skip
 ALTITUDES = ("drone-dji:AbsoluteAltitude", "drone-skydio:AbsoluteAltitude")
-_SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber", "drone-dji:CameraSerialNumber")
+_SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber")
 _PREFIXES = ("drone-dji", "drone-skydio", "drone-parrot")
+_BAND = "BandName"
 # Structures whose members carry the names of others.
 _STRUCTURE = "CameraOrientationNED"
 _MEMBERS = ("Yaw", "Pitch", "Roll")
@@ -75,7 +76,10 @@ def xmp_properties(packet: Any, notes: list[str]) -> dict[str, str]:
 
 
 def _add(properties: dict[str, str], element: Any, inside: str = "") -> None:
-    for name, value in [*element.attrib.items(), (element.tag, element.text or "")]:
+    text = element.text or ""
+    if element.tag.endswith(_BAND):  # a list
+        text = text.strip() or ",".join(part.text or "" for part in element.iter() if part.tag.endswith("}li"))
+    for name, value in [*element.attrib.items(), (element.tag, text)]:
         namespace, _, local = name.rpartition("}")
         prefix = _prefix(namespace)
         if prefix and value.strip():
@@ -108,8 +112,14 @@ def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
     return None if north is None or east is None or down is None else (north, east, down)
 
 
+def xmp_band(xmp: Mapping[str, str]) -> str:
+    """Name of the band of a multispectral camera, "" where XMP states none, or several: those of a colour picture."""
+    band = xmp.get(f"Camera:{_BAND}", "") or xmp.get(f"drone-dji:{_BAND}", "")
+    return "" if "," in band else band
+
+
 def xmp_serial(xmp: Mapping[str, str]) -> str:
-    """Serial number of the aircraft, else of the camera, "" where XMP states none."""
+    """Serial number of the aircraft, "" where XMP states none."""
     return next((xmp[name] for name in _SERIALS if xmp.get(name, "").strip("0 ")), "")
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.control import far_control, read_control
+from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -73,8 +73,15 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints, remote = _read_inputs(settings, workspace, executor, before)
     ground, source, remarks = given_ground(settings, inputs)
-    control, absent = read_control(settings.block.gcp, inputs.images, inputs.crs, inputs.origin_m)
-    absent += far_control(control, inputs.poses, settings.block.gcp)
+    control, absent = read_control(
+        settings.block.gcp,
+        inputs.images,
+        inputs.crs,
+        inputs.origin_m,
+        marks=settings.block.gcp_marks,
+        poses=inputs.poses,
+        use=settings.block.gcp_use,
+    )
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,
