@@ -166,7 +166,7 @@ enhanced have none.
 ### simulated/<id>/views.json, <view>.png
 
 - `fingerprint`, `files`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views
-  were made of.
+  were made of. `remark`: why another ground than the terrain below the image is looked at, else empty.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
   With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image, a few pixels

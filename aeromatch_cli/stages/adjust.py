@@ -26,6 +26,7 @@ from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.simulate import degenerate_view
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
@@ -237,7 +238,8 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
         if image_id in unread:
             reasons[image_id] = f"no features: {unread[image_id]}"
         elif count <= _FEW_KEYPOINTS * usual:
-            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: no texture, or blurred"
+            seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
+            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
         elif not pairs[image_id]:
             reasons[image_id] = "in no pair: it overlaps no other image"
         elif not verified[image_id]:
