@@ -165,7 +165,8 @@ class Block:
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the images, or None where no image has an attitude; reduced_gsd_m: of them as they are worked on, None
     where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
-    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
+    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found. metric:
+    whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary.
     """
 
     images: tuple[Image, ...]
@@ -180,6 +181,7 @@ class Block:
     similar: tuple[tuple[str, str], ...] = ()
     outside: frozenset[str] = frozenset()
     reduced_gsd_m: float | None = None
+    metric: bool = True
 
     @property
     def views_gsd_m(self) -> float | None:

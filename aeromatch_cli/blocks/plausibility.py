@@ -62,7 +62,7 @@ def _position_warnings(block: Block, names: Names, centers: FloatArray) -> list[
             "images are paired by name"
         )
     rest = centers[~null_island, :2]
-    if len(rest) >= 2:
+    if len(rest) >= 2 and block.metric:
         spread = float(np.hypot(*np.ptp(rest, axis=0)))
         if spread < 1e-3:
             found.append(
@@ -97,14 +97,15 @@ def _degenerate_warnings(block: Block, degenerate: Mapping[str, Degenerate]) -> 
     names = [image.name for image in block.images if image.image_id in degenerate]
     first = next(iter(degenerate.values()))
     return [
-        f"{_some(names)} with a {degenerate_words(first, block.origin_m[2])}: the ground of the images around is used "
+        f"{_some(names)} with a {degenerate_words(first, block)}: the ground of the images around is used "
         "instead; if cameras fly low beside steep ground, give --ground"
     ]
 
 
 def _height_warnings(block: Block, names: Names, centers: FloatArray, elsewhere: BoolArray) -> list[str]:
     """elsewhere: (N,) whether another ground than that below the camera is used."""
-    if block.ground is None or len(centers) == 0:
+    # Heights in units of arbitrary length are odd in no sense.
+    if block.ground is None or len(centers) == 0 or not block.metric:
         return []
     found = []
     ground = block.ground.height_m(centers[:, :2])

@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Ground, Pose
 from aeromatch_cli.geometry.cameras import focal_px, normalise
+from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.geometry.rotations import tilt_deg
 from aeromatch_cli.geometry.warps import border_px
 
@@ -244,13 +245,11 @@ def _plane_around_m(pose: Pose, poses: Mapping[str, Pose], footprints: Mapping[s
     return float(np.median(heights_m[nearest]))
 
 
-def degenerate_words(degenerate: Degenerate, origin_z_m: float = 0.0) -> str:
-    """origin_z_m: of the world, so that the height counts in the CRS."""
+def degenerate_words(degenerate: Degenerate, block: Block) -> str:
+    """In words; the height counts in the block's CRS."""
+    height = length_words(degenerate.ground_z_m + block.origin_m[2], 0, metric=block.metric)
     size = f"{degenerate.width_px}x{degenerate.height_px} px"
-    return (
-        f"degenerate ground view ({size}: the terrain there, {degenerate.ground_z_m + origin_z_m:.0f} m, is nearly as "
-        "high as the camera)"
-    )
+    return f"degenerate ground view ({size}: the terrain there, {height}, is nearly as high as the camera)"
 
 
 def common_gsd_m(footprints: Mapping[str, Footprint], scales: Mapping[str, float] | None = None) -> float | None:

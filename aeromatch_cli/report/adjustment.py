@@ -85,13 +85,12 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
     facts = adjustment.facts
     if not facts.get("points"):
         return []
-    length = "m" if adjustment.in_world else "units of the frame"
     found = [
         ("Oriented images", f"{facts['images']:,}"),
         ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
         ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
     ]
-    units = ("sigma_position_m", length), ("sigma_angle_deg", "degrees")
+    units = ("sigma_position_m", "m"), ("sigma_angle_deg", "degrees")
     sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))

@@ -242,8 +242,9 @@ def notices(
 def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
     block = context.block
     gsd_m = block.gsd_m if in_world else None
+    frame = f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"
     return [
-        ("World frame", f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"),
+        ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
         ("Ground", block.ground_source),
         ("Ground sampling distance", "unknown" if gsd_m is None else f"{gsd_m:.3g} m"),
         ("Cameras", camera_words(block.cameras)),

@@ -140,12 +140,13 @@ def _write(context: Context, adjusted: AdjustedBlock, report: StageReport) -> No
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
     control = _control(context, adjusted)
+    beside = adjusted.frames  # no length there is a metre
     return {
         "images": len(adjusted.poses),
         "points": len(adjusted.points_m),
         "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
         "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
-        "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in adjusted.poses.values()]),
+        "sigma_position_m": _median([float(np.mean(p.sigmas_m)) for i, p in adjusted.poses.items() if i not in beside]),
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
         "groups": [dict(one) for one in figures],
         "cameras": {

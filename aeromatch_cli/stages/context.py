@@ -118,7 +118,7 @@ class Context:
         footprint = block_footprints(self.block).get(image_id)
         if footprint is None or footprint.degenerate is None:
             return ""
-        return degenerate_words(footprint.degenerate, self.block.origin_m[2])
+        return degenerate_words(footprint.degenerate, self.block)
 
     def working_camera(self, image: Image) -> Camera:
         """The camera of the picture that is worked on (--max-size)."""
