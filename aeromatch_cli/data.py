@@ -91,6 +91,25 @@ class AdjustedBlock:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseResidual:
+    """An adjusted pose beside the one given, and how well the image fits its points.
+
+    position_m: (3,) adjusted less given, x, y, z of the world. rotation_deg: (3,) rotation vector, about the same axes,
+    that turns the given attitude into the adjusted one. position_sigmas, rotation_sigmas: (3,) both in standard
+    deviations of what was given. NaN where nothing was given, and in a frame that no position ties to the world.
+    error_px: mean reprojection error; points: how many; images_per_point: mean of them. NaN without points.
+    """
+
+    position_m: FloatArray
+    position_sigmas: FloatArray
+    rotation_deg: FloatArray
+    rotation_sigmas: FloatArray
+    error_px: float
+    points: int
+    images_per_point: float
+
+
+@dataclass(frozen=True, eq=False)
 class ControlPoint:
     """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in transformations.
 

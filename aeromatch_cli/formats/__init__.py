@@ -103,14 +103,26 @@ standard deviations hold within the group), or `predicted` of an image that is n
 attitude given or that of its strip, empty where nothing is known; `unit`: of all lengths of the line, `m`, or
 `arbitrary` in a frame of its own.
 
+### orientation/residuals.csv
+
+Written by `adjust`: the adjusted block beside what was given, and how well its images fit their points. One line per
+adjusted image: `image` (its name); `dx_m`, `dy_m`, `dz_m`: adjusted less given position; `rotation_x_deg`,
+`rotation_y_deg`, `rotation_z_deg`: rotation vector about the axes of the world that turns the given attitude into the
+adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in standard deviations
+of what was given. All are empty where nothing was given, and in a frame of its own. `error_px`: mean reprojection
+error; `points`: of the image; `images_per_point`: how many images see them, mean.
+
 ### orientation/adjusted.json
 
-- `fingerprint`; `files`: SHA-256 of `adjusted.npz` and `orientation.csv`.
+- `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
 - `facts`: `images`, `points`, `track_length` (images per point, mean), `reprojection_error_px` (mean),
   `sigma_position_m` (median over the images whose frame has metres, else null), `sigma_angle_deg` (median), `groups`
   (the same figures of each), `outside`
   (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
-  `control` (errors at ground control points, or null).
+  `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
+  `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
+  (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was
+  given; `positions`, `rotations`: how many were compared; `error_px_median`, `error_px_worst`: of the images' means.
 
 ### orientation/adjusted.npz
 
@@ -292,8 +304,8 @@ the page tells of. Both hold SHA-256 digests; what differs is made again.
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
 0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
 their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
-`orientation.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin;
-`unit`: `m`, or `arbitrary` in a frame of the pictures' own.
+`orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here
+plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 """
 
 
