@@ -68,6 +68,9 @@ class AdjustFacts(Facts):
     sigma_position_m: float | None = Field(None, description="Of the positions, metres, median; null without metres.")
     sigma_angle_deg: float | None = Field(None, description="Of the attitudes, degrees, median.")
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
+    residuals: dict[str, Any] = Field(
+        {}, description="Adjusted less given positions and attitudes: rms, median, worst image; see residuals.csv."
+    )
 
 
 class RefineFacts(Facts):

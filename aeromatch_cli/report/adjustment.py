@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.stages import adjust
@@ -54,6 +55,12 @@ def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | No
     """The adjusted block with the points that final matches hold; None where the last adjustment found none."""
     path = context.workspace.final_or_adjusted
     return read_adjusted(path) if adjustment.facts.get("points") and path.is_file() else None
+
+
+def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:
+    """By image_id; none of earlier matches, and of an adjustment by an earlier version."""
+    path = context.workspace.residuals
+    return read_residuals(path, context.block.images) if adjustment.facts.get("points") and path.is_file() else {}
 
 
 def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> list[Notice]:
