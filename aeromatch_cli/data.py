@@ -99,6 +99,25 @@ class AdjustedBlock:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseResidual:
+    """An adjusted pose beside the one given, and how well the image fits its points.
+
+    position_m: (3,) adjusted less given, x, y, z of the world. rotation_deg: (3,) rotation vector, about the same axes,
+    that turns the given attitude into the adjusted one. position_sigmas, rotation_sigmas: (3,) both in standard
+    deviations of what was given. NaN where nothing was given, and in a frame that no position ties to the world.
+    error_px: mean reprojection error; points: how many; images_per_point: mean of them. NaN without points.
+    """
+
+    position_m: FloatArray
+    position_sigmas: FloatArray
+    rotation_deg: FloatArray
+    rotation_sigmas: FloatArray
+    error_px: float
+    points: int
+    images_per_point: float
+
+
+@dataclass(frozen=True, eq=False)
 class ControlPoint:
     """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in any fit.
 
@@ -176,7 +195,8 @@ class Block:
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the images, or None where no image has an attitude; reduced_gsd_m: of them as they are worked on, None
     where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
-    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
+    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found. metric:
+    whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary.
     """
 
     images: tuple[Image, ...]
@@ -191,6 +211,7 @@ class Block:
     similar: tuple[tuple[str, str], ...] = ()
     outside: frozenset[str] = frozenset()
     reduced_gsd_m: float | None = None
+    metric: bool = True
 
     @property
     def views_gsd_m(self) -> float | None:

@@ -139,6 +139,7 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
         "format_version": FORMAT_VERSION,
         "crs": block.crs,
         "origin_m": list(block.origin_m),
+        "metric": block.metric,
         "given_crs": given.crs,
         "given_origin_m": list(given.origin_m),
         "ground_source": block.ground_source,

@@ -17,7 +17,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import focal_px
-from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.geometry.footprints import block_footprints, degenerate_words
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import scale_within, shrink_camera
 from aeromatch_cli.orientation.focal import with_focal_length
@@ -139,6 +139,13 @@ class Context:
     def ground_z_m(self, image_id: str) -> float | None:
         """Ground height where an image looks (below it, without attitude), None without ground or position."""
         return _ground_heights(self.block).get(image_id)
+
+    def ground_remark(self, image_id: str) -> str:
+        """Why the ground of an image is not the terrain below it, else ""."""
+        footprint = block_footprints(self.block).get(image_id)
+        if footprint is None or footprint.degenerate is None:
+            return ""
+        return degenerate_words(footprint.degenerate, self.block)
 
     def working_camera(self, image: Image) -> Camera:
         """The camera of the picture that is worked on (--max-size)."""

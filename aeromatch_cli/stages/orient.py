@@ -90,7 +90,7 @@ def run(
         # Given positions are in another frame, and nothing ties this one to a CRS.
         context = replace(
             context,
-            block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0)),
+            block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False),
             given=replace(context.given, poses={}),
         )
     block = replace(

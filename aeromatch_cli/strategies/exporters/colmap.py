@@ -21,6 +21,7 @@ from pydantic import Field
 from aeromatch_cli.data import Camera, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.adjusted import orientation_text
+from aeromatch_cli.formats.residuals import residuals_text
 from aeromatch_cli.geometry.cameras import colmap_camera
 from aeromatch_cli.geometry.epipolar import fundamental
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
@@ -36,11 +37,11 @@ _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFS
 
 class Colmap(Strategy):
     """Writes database.db (cameras, rigs, frames, images, keypoints, matches, two-view geometries, pose priors),
-    sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv. Where an image name
-    contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
+    sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv and residuals.csv. Where
+    an image name contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["colmap"] = "colmap"
     raw_matches: bool = Field(
         True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
@@ -60,6 +61,9 @@ class Colmap(Strategy):
             if contents.adjusted is not None:
                 text = orientation_text(contents.adjusted, contents.block)
                 (partial / "orientation.csv").write_text(text, encoding="utf-8")
+            if contents.residuals:
+                text = residuals_text(contents.residuals, contents.block.images)
+                (partial / "residuals.csv").write_text(text, encoding="utf-8")
             write_world(partial, contents.block)
             names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
         return ExportSummary(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose
+from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose, PoseResidual
 from aeromatch_cli.errors import WorkspaceError
 
 
@@ -36,7 +36,7 @@ class ExportContents:
     guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
     positions: image_id -> position as it was given, with its standard deviation; None: those of the block. adjusted:
     the block after bundle adjustment, or None. geographic: world (N, 3) -> WGS84 latitude, longitude in degrees and
-    height (N, 3); None in a local frame.
+    height (N, 3); None in a local frame. residuals: of the adjusted images, by image_id.
     """
 
     block: Block
@@ -46,6 +46,7 @@ class ExportContents:
     positions: Mapping[str, Pose] | None = None
     adjusted: AdjustedBlock | None = None
     geographic: Callable[[FloatArray], FloatArray] | None = None
+    residuals: Mapping[str, PoseResidual] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,12 @@ def misfit_remark(camera_id: str, program: str, found: Nearest) -> list[str]:
 
 def write_world(folder: Path, block: Block) -> None:
     """world.json: in which CRS, less which origin, coordinates count that a format has no place for."""
-    world = {"crs": block.crs, "origin_m": list(block.origin_m), "note": "coordinate in crs = coordinate here + origin"}
+    world = {
+        "crs": block.crs,
+        "origin_m": list(block.origin_m),
+        "unit": "m" if block.metric else "arbitrary",
+        "note": "coordinate in crs = coordinate here + origin",
+    }
     write(folder / "world.json", json.dumps(world, indent=2) + "\n")
 
 
