@@ -21,6 +21,8 @@ from aeromatch_cli.strategies.refiners import REFINERS
 from aeromatch_cli.strategies.simulators import SIMULATORS
 from aeromatch_cli.strategies.steps import STEPS
 
+LensParameter = Literal["f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
+
 
 def named(value: Any) -> Any:
     """A bare name stands for the strategy with its defaults."""
@@ -129,6 +131,27 @@ class BlockSettings(_Section):
         return str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
+class AdjustSettings(_Section):
+    """What the bundle adjustment may find of cameras."""
+
+    calibration: Literal["auto", "given", "focal", "brown"] = Field(
+        "auto",
+        description="Unknowns of cameras: those that the block determines (auto), none (given), the focal length "
+        "(focal), or the whole of Brown's model whatever the block says of it (brown). Each has a prior by what was "
+        "stated.",
+    )
+    free: tuple[LensParameter, ...] = Field(
+        (), description="Parameters that are unknowns in any case: f, cx, cy, k1, k2, k3, p1, p2, b1, b2."
+    )
+    hold: tuple[LensParameter, ...] = Field(
+        (), description="Parameters that stay as they were stated in any case, such as [b1, b2]."
+    )
+    rolling_shutter: bool = Field(
+        True,
+        description="Whether the read-out time of cameras is an unknown where the block determines it.",
+    )
+
+
 class RunSettings(_Section):
     """How it is run; nothing here changes a result."""
 
@@ -194,6 +217,7 @@ class Settings(_Section):
     refine: _choice(REFINERS) = Field(  # type: ignore[valid-type]
         REFINERS["least-squares"](), description="How exactly the places of verified tie points are measured."
     )
+    adjust: AdjustSettings = Field(AdjustSettings(), description="What the bundle adjustment may find of cameras.")
     consistency: _choice(CONSISTENCIES) = Field(  # type: ignore[valid-type]
         CONSISTENCIES["block"](), description="What is done about verified matches that contradict the adjusted block."
     )

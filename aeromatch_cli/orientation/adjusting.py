@@ -282,6 +282,13 @@ def _take(work: Work, model: Any, ids: list[int], points: list[int], numbers: Se
     work.lenses.update(found)
 
 
+def take_outcome(work: Work, model: Any, outcome: Outcome) -> None:
+    """Give a model what an adjustment has found; rows of points beyond the model's own are those of control."""
+    state = outcome.result.state
+    own = replace(state, points_m=state.points_m[: len(outcome.points)])
+    _take(work, model, outcome.images, outcome.points, outcome.cameras, own)
+
+
 def intersect(work: Work, model: Any, given: Given) -> None:
     """Place the points of a model where their rays meet best, poses and lenses as they are, and state their errors."""
     network, start, points, numbers = _network(work, model, given)

@@ -54,7 +54,8 @@ class Observed:
     poses: image_id -> pose whose centre is one, with its standard deviations. focal_sigmas: camera_id -> standard
     deviation of its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt
     counts. cameras: camera_id -> Camera as it was stated; of others the block's own count. calibration, switches: what
-    is free of them, see `calibration.freed`. flights: image_id -> name of its flight. velocities: image_id -> (3,) of
+    is free of them, see `calibration.freed`; rolling_shutter: whether read-out times are. flights: image_id -> name of
+    its flight. velocities: image_id -> (3,) of
     the aircraft in the world frame, metres per second, where it is known. relative_heights_m: image_id -> height above
     the take-off point of its flight, where it is stated. control: surveyed points.
     """
@@ -65,6 +66,7 @@ class Observed:
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     calibration: Calibration = "auto"
     switches: Mapping[str, bool] = field(default_factory=dict)
+    rolling_shutter: bool = True
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
     relative_heights_m: Mapping[str, float] = field(default_factory=dict)
@@ -107,6 +109,17 @@ def refine_block(
         "groups": [{"kind": group.kind, "images": [number[i] for i in group.images]} for group in groups],
         "more": len(grouped) < len(block.images),
         "fixed": fixed,
+        "control": [
+            {
+                "name": point.name,
+                "position_m": np.asarray(point.position_m).tolist(),
+                "sigmas_m": list(point.sigmas_m),
+                "sigma_px": point.sigma_px,
+                "check": point.check,
+                "pixels": [(number[i], *map(float, xy)) for i, xy in sorted(point.pixels.items()) if i in number],
+            }
+            for point in observed.control
+        ],
     }
     with _task(contents, observed) as folder:
         facts = _solved(folder, "refiner", task, "pycolmap's bundle adjustment")
@@ -163,7 +176,8 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
             str(number): _camera_task(contents.block, k, observed)
             for number, k in enumerate(sorted(contents.block.cameras), start=1)
         }
-        (folder / "task.json").write_text(json.dumps({"cameras": cameras}), encoding="utf-8")
+        how = {"chosen": observed.calibration != "brown", "readout": observed.rolling_shutter}
+        (folder / "task.json").write_text(json.dumps({"cameras": cameras, **how}), encoding="utf-8")
         nowhere, untold = np.full(3, np.nan), np.full((3, 3), np.nan)
         flights = sorted(set(observed.flights.values()))
         ups = {i: one.rotation[:, 2] for i, one in observed.angles.items()}

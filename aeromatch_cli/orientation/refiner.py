@@ -37,6 +37,7 @@ from aeromatch_cli.orientation.adjustment_facts import adjustment_facts
 from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
+from aeromatch_cli.orientation.control_adjustment import Surveyed, with_control
 from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import quiet_pycolmap
 from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, tracks_of
@@ -69,9 +70,12 @@ def refine(folder: Path) -> None:
     pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
     given = Given.of_file(np.load(folder / "priors.npz"))
-    work = Work.of_task(pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=True))
+    work = Work.of_task(
+        pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=True, choose=task["chosen"], readout=task["readout"])
+    )
     _hold_all_that_adjusts(work, folder)
     facts: list[dict[str, Any]] = []
+    surveyed = [Surveyed.of_task(entry) for entry in task["control"]]
     waiting = deque(task["groups"])
     if len(waiting) > 1 and not task["fixed"]:
         waiting = deque(_joined_groups(work, folder, task["groups"]))
@@ -94,12 +98,14 @@ def refine(folder: Path) -> None:
         attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
         registered: list[int] = []
         outcome: Outcome | None = None
+        control: dict[str, Any] = {}
         if free:
             if task["more"]:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
                 grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
-            model, outcome = _refined(work, folder, model, group["kind"], observed, attitudes, held)
+            inside = surveyed if group["kind"] != "level" else []
+            model, outcome, control = _refined(work, folder, model, group["kind"], observed, attitudes, held, inside)
         intersect(work, model, observed)
         _once_per_image(model)
         _drop_weak_points(model)
@@ -111,7 +117,7 @@ def refine(folder: Path) -> None:
         name = f"model{len(facts)}.npz"
         deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
         np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
-        known = {} if outcome is None else adjustment_facts(outcome)
+        known = {} if outcome is None else adjustment_facts(outcome) | {"control": control}
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 
@@ -184,14 +190,17 @@ def _refined(
     given: Given,
     attitudes: Collection[int],
     held: Collection[int],
-) -> tuple[Any, Outcome | None]:
-    """The model adjusted and triangulated in turn, while that makes it better; and the last adjustment.
+    surveyed: Sequence[Surveyed],
+) -> tuple[Any, Outcome | None, dict[str, Any]]:
+    """The model adjusted and triangulated in turn, while that makes it better; the last adjustment, and what control
+    points say.
 
     attitudes: numbers of images whose given attitudes are observations. held: cameras that stay as they are.
     """
     if kind == "positions":
         given = replace(given, ups=believed_tilts(work.pycolmap, model, given))
     outcome: Outcome | None = None
+    control: dict[str, Any] = {}
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
@@ -203,7 +212,9 @@ def _refined(
         else:
             outcome = adjusted(work, moved, given, held)
         settled = state_errors(work, moved, given) > (1.0 - _WORTH_AGAIN) * before
-        settled = settled and not (number == 0 and _found(kind))
+        settled = (settled and not (number == 0 and _found(kind))) or number == _MAX_ROUNDS - 1
+        if settled and surveyed:
+            outcome, control = with_control(work, moved, outcome, surveyed)
         if settled and thin is None:
             break
         if thin is not None:
@@ -211,7 +222,7 @@ def _refined(
         model = _triangulated(work.pycolmap, model, folder, rough=False)
         if settled:
             break
-    return model, outcome
+    return model, outcome, control
 
 
 def _found(kind: str) -> bool:

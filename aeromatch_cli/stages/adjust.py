@@ -106,21 +106,22 @@ def current_fingerprint(context: Context) -> str:
 
 
 def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
-    given = {i: (pose.center_m, pose.sigma_position_m) for i, pose in context.given.poses.items()}
-    block = context.block
+    block, observed = context.block, context.observed
+    poses = {i: (pose.center_m, pose.axis_sigmas_m, pose.sigma_angle_deg) for i, pose in observed.poses.items()}
     ids = sorted(image.image_id for image in block.images)
-    state = [ids, sorted(block.cameras.items()), sorted(block.poses.items()), sorted(given.items())]
+    state = [ids, sorted(block.cameras.items()), sorted(block.poses.items()), sorted(poses.items())]
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
-    control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
-    known = (
-        sorted(context.focal_sigmas.items()),
-        sorted(context.observed.cameras.items()),
-        sorted(context.angles.items()),
-    )
-    measured = refine.made_fingerprint(context)
-    return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
+    control = [
+        (p.name, p.position_m, p.sigmas_m, p.check, p.sigma_px, sorted(p.pixels.items())) for p in observed.control
+    ]
+    known = [
+        sorted(part.items())
+        for part in (observed.focal_sigmas, observed.cameras, observed.angles, observed.flights, observed.velocities)
+    ]
+    how = context.settings.orient, context.settings.adjust.model_dump()
+    return fingerprint(versions, *how, held, state, known, pairs, control, refine.made_fingerprint(context))
 
 
 def _on_file(context: Context) -> Mapping[str, Any]:

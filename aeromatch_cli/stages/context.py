@@ -84,7 +84,12 @@ class Context:
     @property
     def observed(self) -> Observed:
         """What was given, for mapping and adjustment."""
+        adjust = self.settings.adjust
+        switches: dict[str, bool] = {**dict.fromkeys(adjust.free, True), **dict.fromkeys(adjust.hold, False)}
         return Observed(
+            calibration=adjust.calibration,
+            switches=switches,
+            rolling_shutter=adjust.rolling_shutter,
             poses=self.given.poses,
             focal_sigmas=self.focal_sigmas,
             angles=self.angles,

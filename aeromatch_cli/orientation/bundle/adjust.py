@@ -48,11 +48,12 @@ _SHIFT_M, _LAG_S, _LEVER_M, _READOUT_S = 20.0, 1.0, 0.5, 0.03
 @dataclass(frozen=True)
 class Options:
     """tolerance: the adjustment ends when a step lowers the cost by a smaller share. final: whether standard deviations
-    are wanted, unknowns that are not determined held, and explanations of residuals tried. readout: whether a rolling
-    shutter is one of these."""
+    are wanted and explanations of residuals tried. choose: whether unknowns of lenses are held that are not determined.
+    readout: whether a rolling shutter is one of the explanations."""
 
     tolerance: float
     final: bool
+    choose: bool = True
     readout: bool = True
 
 
@@ -75,7 +76,7 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     stated = network
     network, state = _with_image_sigma(network, start, options.tolerance)
     if options.final:
-        held = _hold_undetermined(network, state, covariance(network, state))
+        held = _hold_undetermined(network, state, covariance(network, state)) if options.choose else network
         if held is not network:
             state = replace(state, lens=np.where(held.lens_sigmas > 0.0, state.lens, held.lens_prior))
             network, state = _with_image_sigma(held, state, options.tolerance)

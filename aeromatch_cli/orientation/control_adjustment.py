@@ -1,0 +1,217 @@
+"""Control points as observations of the adjustment, kept only where points that take no part in it get better.
+
+A control point is a point of the network whose coordinates are observed with their standard deviations, as are its
+image points. Positions of the images keep their shape: what all of a flight have in common (another geoid, another
+base station) is an unknown then, so that control and positions do not fight for the datum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.adjusting import Outcome, Work, take_outcome
+from aeromatch_cli.orientation.bundle.adjust import adjust
+from aeromatch_cli.orientation.bundle.network import Network, Unknowns
+from aeromatch_cli.orientation.bundle.solve import solve
+
+# Standard deviation of what the positions of a flight have in common, metres: from one geoid or datum to another.
+_DATUM_M = 100.0
+# A control point is wrong where the others, without it, put it farther away than so many times what they put each
+# other, and than so many of its standard deviations.
+_WRONG_RATIO, _WRONG_SIGMAS = 5.0, 5.0
+# So many points tell a wrong one.
+_TELLING = 4
+# An adjustment that starts from the solution of nearly the same network ends when a step lowers the cost by less.
+_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """A control point of the task. position_m: (3,); sigmas_m: (3,); pixels: (image number, x, y), from the centre of
+    the first pixel; check: it takes no part."""
+
+    name: str
+    position_m: tuple[float, ...]
+    sigmas_m: tuple[float, ...]
+    sigma_px: float
+    check: bool
+    pixels: tuple[tuple[int, float, float], ...]
+
+    @classmethod
+    def of_task(cls, entry: dict[str, Any]) -> Surveyed:
+        pixels = tuple((int(number), float(x), float(y)) for number, x, y in entry["pixels"])
+        return cls(
+            entry["name"],
+            tuple(entry["position_m"]),
+            tuple(entry["sigmas_m"]),
+            entry["sigma_px"],
+            entry["check"],
+            pixels,
+        )
+
+    def seen_by(self, images: Collection[int]) -> int:
+        return sum(number in images for number, _, _ in self.pixels)
+
+
+def with_control(
+    work: Work, model: Any, outcome: Outcome, surveyed: Sequence[Surveyed]
+) -> tuple[Outcome, dict[str, Any]]:
+    """The block adjusted once more with control points, where that makes held-out points better; and what was found.
+
+    Facts: "used", "wrong", "exchanged": names; "held_out_rms_m", "without_rms_m": root mean square (x, y, z) of points
+    that took no part, with and without control; "kept".
+    """
+    images = set(outcome.images)
+    seen = [point for point in surveyed if point.seen_by(images) >= 2]
+    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
+    if not control:
+        return outcome, {}
+    base = _Block(outcome.result.network, outcome.result.state, outcome)
+    without_m = np.array([base.error_m(point) for point in seen])
+    exchanged = _exchanged(base, control)
+    used = [point for point in control if point.name not in exchanged]
+    wrong: list[str] = []
+    solved = base.adjusted(work, used)
+    errors_m = _left_out(solved, used)
+    while len(used) >= _TELLING:
+        worst = _worst(used, errors_m)
+        if worst is None:
+            break
+        wrong.append(used[worst].name)
+        used = [point for k, point in enumerate(used) if k != worst]
+        solved = base.adjusted(work, used)
+        errors_m = _left_out(solved, used)
+    held_out = checks or (used if len(used) > 1 else [])
+    held_out_m = np.array([solved.error_m(point) for point in checks]) if checks else errors_m
+    before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
+    kept = not held_out or _size(held_out_m) <= _size(before_m)
+    facts = {
+        "used": [point.name for point in used] if kept else [],
+        "wrong": wrong,
+        "exchanged": exchanged,
+        "held_out": "check points" if checks else "leave one out",
+        "held_out_rms_m": _rms(held_out_m) if held_out else None,
+        "without_rms_m": _rms(before_m) if held_out else None,
+        "kept": kept,
+    }
+    if not kept:
+        return outcome, facts
+    taken = replace(outcome, result=replace(solved.outcome.result, stated=outcome.result.stated))
+    take_outcome(work, model, taken)
+    return taken, facts
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """A solved network; points of `outcome.points` come first, control points after them."""
+
+    network: Network
+    state: Unknowns
+    outcome: Outcome
+
+    def with_points(self, points: Sequence[Surveyed]) -> tuple[Network, Unknowns]:
+        """The network of tie points with these control points instead of what it has."""
+        ties = len(self.outcome.points)
+        own = self.network.point < ties
+        row = {number: k for k, number in enumerate(self.outcome.images)}
+        places = [
+            (row[n], ties + k, x, y, p.sigma_px) for k, p in enumerate(points) for n, x, y in p.pixels if n in row
+        ]
+        image, point, x, y, sigma_px = np.array(places).reshape(-1, 5).T
+        old = self.network
+        network = replace(
+            old,
+            image=np.concatenate([old.image[own], image.astype(np.int64)]),
+            point=np.concatenate([old.point[own], point.astype(np.int64)]),
+            xy_px=np.concatenate([old.xy_px[own], np.column_stack([x, y])]),
+            sigma_px=np.concatenate([old.sigma_px[own], sigma_px]),
+            control=ties + np.arange(len(points)),
+            control_m=np.array([p.position_m for p in points]).reshape(-1, 3),
+            control_sigmas_m=np.array([p.sigmas_m for p in points]).reshape(-1, 3),
+        )
+        start_m = network.control_m - self._datum_m(points)
+        state = replace(self.state, points_m=np.concatenate([self.state.points_m[:ties], start_m]))
+        return network, state
+
+    def _datum_m(self, points: Sequence[Surveyed]) -> FloatArray:
+        """(3,) by how much surveyed points lie off the block, where that is more than their relief: intersections start
+        from there."""
+        ground_m = np.median(self.state.points_m[: len(self.outcome.points)], axis=0)
+        off_m = np.median([p.position_m for p in points], axis=0) - ground_m if points else np.zeros(3)
+        return np.array([0.0, 0.0, off_m[2]])
+
+    def error_m(self, point: Surveyed) -> FloatArray:
+        """(3,) where the rays of the block meet, less the surveyed position."""
+        network, state = self.with_points([point])
+        only = network.point == len(self.outcome.points)
+        held = replace(
+            network,
+            image=network.image[only],
+            point=np.zeros(int(only.sum()), dtype=np.int64),
+            xy_px=network.xy_px[only],
+            sigma_px=network.sigma_px[only],
+            control=np.zeros(0, dtype=np.int64),
+            control_m=np.zeros((0, 3)),
+            control_sigmas_m=np.zeros((0, 3)),
+            held=np.ones_like(network.held),
+            lens_sigmas=np.zeros_like(network.lens_sigmas),
+            mount_sigmas=np.zeros_like(network.mount_sigmas),
+            flight_sigmas=np.zeros_like(network.flight_sigmas),
+        )
+        found = solve(held, replace(state, points_m=state.points_m[-1:]), 1e-9).state
+        return np.asarray(found.points_m[0] - np.array(point.position_m))
+
+    def adjusted(self, work: Work, points: Sequence[Surveyed]) -> _Block:
+        """The block with these control points, all else determined anew."""
+        network, state = self.with_points(points)
+        shifts = network.flight_sigmas.copy()
+        shifts[:, :3] = _DATUM_M
+        result = adjust(replace(network, flight_sigmas=shifts), state, work.options)
+        return _Block(result.network, result.state, replace(self.outcome, result=result))
+
+    def without(self, points: Sequence[Surveyed]) -> _Block:
+        """The block with these control points alone, weights and calibration's unknowns as they are."""
+        network, state = self.with_points(points)
+        return replace(self, network=network, state=solve(network, state, _TOLERANCE).state)
+
+
+def _left_out(block: _Block, used: Sequence[Surveyed]) -> FloatArray:
+    """(Q, 3) errors of each control point in the block that was adjusted to the others."""
+    rests = ([other for other in used if other is not point] for point in used)
+    return np.array([block.without(rest).error_m(point) for rest, point in zip(rests, used, strict=True)]).reshape(
+        -1, 3
+    )
+
+
+def _worst(used: Sequence[Surveyed], errors_m: FloatArray) -> int | None:
+    """The control point that the others contradict, None where there is none."""
+    off = np.linalg.norm(errors_m, axis=1)
+    sigmas = off / np.array([np.linalg.norm(point.sigmas_m) for point in used])
+    worst = int(np.argmax(off))
+    usual = float(np.median(np.delete(off, worst)))
+    return worst if off[worst] > _WRONG_RATIO * usual and sigmas[worst] > _WRONG_SIGMAS else None
+
+
+def _exchanged(base: _Block, control: Sequence[Surveyed]) -> list[str]:
+    """Names of two control points each of which lies where the other was surveyed, after what all have in common."""
+    if len(control) < _TELLING:
+        return []
+    found_m = np.array([base.error_m(point) + point.position_m for point in control])
+    stated_m = np.array([point.position_m for point in control])
+    common_m = np.median(found_m - stated_m, axis=0)
+    apart_m = np.linalg.norm(found_m[:, None] - common_m - stated_m[None], axis=2)
+    nearest = np.argmin(apart_m, axis=1)
+    return [p.name for k, p in enumerate(control) if nearest[k] != k and nearest[nearest[k]] == k]
+
+
+def _size(errors_m: FloatArray) -> float:
+    return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
+
+
+def _rms(errors_m: FloatArray) -> list[float]:
+    return [round(float(value), 4) for value in np.sqrt((errors_m**2).mean(axis=0))]
