@@ -85,6 +85,16 @@ def test_pix4d_accuracies_of_points_and_marks_and_check_points(tmp_path: Path) -
     assert {name: point.check for name, point in points.items()} == {"north": True, "south": False, "west": False}
 
 
+def test_the_crs_of_a_prj_beside(tmp_path: Path) -> None:
+    """Web Mercator, say, which the numbers do not tell."""
+    to_mercator = Transformer.from_crs(CODE, "EPSG:3857", always_xy=True)
+    lines = [",".join(map(str, (name, *to_mercator.transform(*grid(name)[:2]), grid(name)[2]))) for name in PLACES]
+    path = write(tmp_path, "gcps.csv", "\n".join(lines))
+    write(tmp_path, "marks.csv", MARKS)
+    write(tmp_path, "gcps.prj", CRS.from_epsg(3857).to_wkt("WKT1_ESRI"))
+    assert_the_points(read(path)[0], 1e-3)
+
+
 def test_northing_before_easting_is_put_right_by_the_block(tmp_path: Path) -> None:
     lines = [f"{name};{grid(name)[1]:.4f};{grid(name)[0]:.4f};{grid(name)[2]}".replace(".", ",") for name in PLACES]
     write(tmp_path, "marks.csv", MARKS)
