@@ -103,14 +103,15 @@ def test_northing_before_easting_is_put_right_by_the_block(tmp_path: Path) -> No
     assert remarks == ["gcps.csv: the coordinates of the control points are exchanged (x and y): they were put right"]
 
 
-def metashape_csv(wkt: str, *, geographic: bool = False) -> str:
+def metashape_csv(wkt: str, *, geographic: bool = False, words: bool = False) -> str:
     x, y = ("X/Longitude", "Y/Latitude") if geographic else ("X/Easting", "Y/Northing")
     rows = [f"# CoordinateSystem: {wkt}", f"#Label,Enable,{x},{y},Z/Altitude,Accuracy_X_(m),Accuracy_Y_(m),"
             "Accuracy_Z_(m),Error_(m),X_error,X_est,Y_est,Z_est"]  # fmt: skip
     for name in PLACES:
-        place = degrees(name) if geographic else grid(name)
+        east, north, up = degrees(name) if geographic else grid(name)
+        enabled = name != "south"
         rows.append(
-            f"{name},{int(name != 'south')},{place[0]:.11f},{place[1]:.11f},{place[2]},0.01,0.02,0.04,9,9,1,2,3"
+            f"{name},{enabled if words else int(enabled)},{east:.11f},{north:.11f},{up},0.01,0.02,0.04,9,9,1,2,3"
         )
     return "\n".join([*rows, "# Total error,,,,,0.1"]) + "\n"
 
@@ -118,7 +119,7 @@ def metashape_csv(wkt: str, *, geographic: bool = False) -> str:
 @pytest.mark.parametrize("geographic", [False, True])
 def test_metashapes_reference_with_projections(tmp_path: Path, geographic: bool) -> None:
     wkt = CRS.from_user_input("EPSG:4326" if geographic else CODE).to_wkt("WKT1_GDAL")
-    path = write(tmp_path, "markers.csv", metashape_csv(wkt, geographic=geographic))
+    path = write(tmp_path, "markers.csv", metashape_csv(wkt, geographic=geographic, words=geographic))
     write(tmp_path, "projections.csv", "gcp_name,image_name,image_u,image_v\n" + "".join(
         f"{name},DJI_{n},{x},{y}\n" for (name, n), (x, y) in PIXELS.items()))  # fmt: skip
     points, remarks = read(path)
