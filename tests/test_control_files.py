@@ -85,6 +85,16 @@ def test_pix4d_accuracies_of_points_and_marks_and_check_points(tmp_path: Path) -
     assert {name: point.check for name, point in points.items()} == {"north": True, "south": False, "west": False}
 
 
+def test_the_crs_of_a_prj_beside(tmp_path: Path) -> None:
+    """Web Mercator, say, which the numbers do not tell."""
+    to_mercator = Transformer.from_crs(CODE, "EPSG:3857", always_xy=True)
+    lines = [",".join(map(str, (name, *to_mercator.transform(*grid(name)[:2]), grid(name)[2]))) for name in PLACES]
+    path = write(tmp_path, "gcps.csv", "\n".join(lines))
+    write(tmp_path, "marks.csv", MARKS)
+    write(tmp_path, "gcps.prj", CRS.from_epsg(3857).to_wkt("WKT1_ESRI"))
+    assert_the_points(read(path)[0], 1e-3)
+
+
 def test_northing_before_easting_is_put_right_by_the_block(tmp_path: Path) -> None:
     lines = [f"{name};{grid(name)[1]:.4f};{grid(name)[0]:.4f};{grid(name)[2]}".replace(".", ",") for name in PLACES]
     write(tmp_path, "marks.csv", MARKS)
@@ -93,14 +103,15 @@ def test_northing_before_easting_is_put_right_by_the_block(tmp_path: Path) -> No
     assert remarks == ["gcps.csv: the coordinates of the control points are exchanged (x and y): they were put right"]
 
 
-def metashape_csv(wkt: str, *, geographic: bool = False) -> str:
+def metashape_csv(wkt: str, *, geographic: bool = False, words: bool = False) -> str:
     x, y = ("X/Longitude", "Y/Latitude") if geographic else ("X/Easting", "Y/Northing")
     rows = [f"# CoordinateSystem: {wkt}", f"#Label,Enable,{x},{y},Z/Altitude,Accuracy_X_(m),Accuracy_Y_(m),"
             "Accuracy_Z_(m),Error_(m),X_error,X_est,Y_est,Z_est"]  # fmt: skip
     for name in PLACES:
-        place = degrees(name) if geographic else grid(name)
+        east, north, up = degrees(name) if geographic else grid(name)
+        enabled = name != "south"
         rows.append(
-            f"{name},{int(name != 'south')},{place[0]:.11f},{place[1]:.11f},{place[2]},0.01,0.02,0.04,9,9,1,2,3"
+            f"{name},{enabled if words else int(enabled)},{east:.11f},{north:.11f},{up},0.01,0.02,0.04,9,9,1,2,3"
         )
     return "\n".join([*rows, "# Total error,,,,,0.1"]) + "\n"
 
@@ -108,7 +119,7 @@ def metashape_csv(wkt: str, *, geographic: bool = False) -> str:
 @pytest.mark.parametrize("geographic", [False, True])
 def test_metashapes_reference_with_projections(tmp_path: Path, geographic: bool) -> None:
     wkt = CRS.from_user_input("EPSG:4326" if geographic else CODE).to_wkt("WKT1_GDAL")
-    path = write(tmp_path, "markers.csv", metashape_csv(wkt, geographic=geographic))
+    path = write(tmp_path, "markers.csv", metashape_csv(wkt, geographic=geographic, words=geographic))
     write(tmp_path, "projections.csv", "gcp_name,image_name,image_u,image_v\n" + "".join(
         f"{name},DJI_{n},{x},{y}\n" for (name, n), (x, y) in PIXELS.items()))  # fmt: skip
     points, remarks = read(path)

@@ -10,7 +10,7 @@ import pytest
 from conftest import Site
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
-from aeromatch_cli.blocks.control import _text
+from aeromatch_cli.blocks.control_files import read_survey
 from aeromatch_cli.blocks.ground import open_dem
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.blocks.poses import _text as table_text
@@ -20,7 +20,7 @@ from aeromatch_cli.strategies.pairings.file import PairFile
 
 READERS: dict[str, Callable[[Path], object]] = {
     "cameras": read_camera_file,
-    "control": _text,
+    "control": lambda path: read_survey(path, None),
     "dem": lambda path: open_dem(path, "local", (0.0, 0.0, 0.0), [[0.0, 0.0, 0.0]]),
     "pairs": lambda path: PairFile(path=str(path)).check_files(128),
     "poses": lambda path: read_pose_file(path, "auto"),

@@ -178,3 +178,13 @@ def test_flights_and_velocities_of_a_folder(tmp_path: Path) -> None:
 def test_what_is_observed_has_them_by_default() -> None:
     observed = Observed({}, {}, {})
     assert (observed.flights, observed.velocities, observed.relative_heights_m, observed.control) == ({}, {}, {}, ())
+
+
+def test_a_battery_is_told_by_the_take_off_height_alone(tmp_path: Path) -> None:
+    """No capture times; the altitude of the second half is 15 m higher at the same height above the take-off point."""
+    for n in range(8):
+        xmp = DJI_XMP.format(yaw="0", pitch="-90", roll="0", relative=f"{60 + n % 3}")
+        up_m = 15.0 if n >= 4 else 0.0
+        write_image(tmp_path / f"DJI_{n:04d}.JPG", gps=gps_tags(52.5 + 3e-4 * n, 12.0, 100.0 + n % 3 + up_m), xmp=xmp)
+    inputs = read_inputs(tmp_path, "exif")
+    assert [inputs.flights[image.image_id] for image in inputs.images] == ["flight 1"] * 4 + ["flight 2"] * 4

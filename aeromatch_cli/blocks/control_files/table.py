@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def _beside(path: Path, wanted: _Format) -> Path:
     for other in sorted(path.parent.iterdir()):
         if other == path or other.suffix.lower() not in _SUFFIXES or not other.is_file():
             continue
-        if other.stat().st_size <= _LARGEST_BYTES and any(one.recognises(Source(other)) for one in formats):
+        if other.stat().st_size <= _LARGEST_BYTES and _is_one_of(formats, other):
             fit.append(other)
     if len(fit) == 1:
         return fit[0]
@@ -83,6 +83,15 @@ def _beside(path: Path, wanted: _Format) -> Path:
     raise ConfigError(
         f"{path} holds no {what}, and {fit[0].name} and {fit[1].name} beside it do: name the right one with {option}"
     )
+
+
+def _is_one_of(formats: Sequence[_Format], path: Path) -> bool:
+    """Whether a file that nobody has named is of one of these; one that cannot be read is of none."""
+    source = Source(path)
+    try:
+        return any(one.recognises(source) for one in formats)
+    except ConfigError:
+        return False
 
 
 def _joined(first: Path, one: Survey, second: Path, two: Survey) -> Survey:

@@ -62,8 +62,10 @@ def is_coordinates(source: Source) -> bool:
 def is_marks(source: Source) -> bool:
     """Whether a file is a table of image measurements."""
     header, names = _header(source, _MARKS)
-    if header and {"image", "label", "x", "y"} <= set(names):
+    if {"image", "label", "x", "y"} <= set(names):
         return True
+    if header or _header(source, _COORDINATES)[0]:
+        return False
     cells = _first(source)
     if len(cells) < 4 or not all(map(is_number, cells[2:4])):
         return False
