@@ -40,7 +40,8 @@ def residuals_text(residuals: Mapping[str, PoseResidual], images: Iterable[Image
     for image in sorted(images, key=lambda image: image.name):
         if image.image_id in residuals:
             values = fields_of(residuals[image.image_id])
-            rows.append((image.name, *(v if isinstance(v, int) else float(f"{v:.6g}") for v in values.values())))
+            # Rounding errors of positions that stay are no residuals; + 0.0 leaves no minus before a zero.
+            rows.append((image.name, *(v if isinstance(v, int) else round(v, 6) + 0.0 for v in values.values())))
     return csv_text(("image", *fields_of(None)), rows)
 
 
