@@ -40,12 +40,20 @@ class Pose:
     center_m: (3,) float64, projection centre in the world frame, metres.
     world_rotation: (3, 3) float64, rotation part of cam_from_world, or None where only the position is known.
     sigma_position_m, sigma_angle_deg: standard deviation of each coordinate and of each angle.
+    sigmas_m: standard deviations along x, y, z of the world frame where they differ, sigma_position_m being their root
+    mean square; None where each is sigma_position_m.
     """
 
     center_m: FloatArray
     world_rotation: FloatArray | None
     sigma_position_m: float
     sigma_angle_deg: float
+    sigmas_m: tuple[float, float, float] | None = None
+
+    @property
+    def axis_sigmas_m(self) -> FloatArray:
+        """(3,) standard deviations along x, y, z of the world frame."""
+        return np.full(3, self.sigma_position_m) if self.sigmas_m is None else np.array(self.sigmas_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,16 +99,38 @@ class AdjustedBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class ControlPoint:
-    """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in transformations.
+class PoseResidual:
+    """An adjusted pose beside the one given, and how well the image fits its points.
 
-    pixels: image_id -> (2,) stored pixel.
+    position_m: (3,) adjusted less given, x, y, z of the world. rotation_deg: (3,) rotation vector, about the same axes,
+    that turns the given attitude into the adjusted one. position_sigmas, rotation_sigmas: (3,) both in standard
+    deviations of what was given. NaN where nothing was given, and in a frame that no position ties to the world.
+    error_px: mean reprojection error; points: how many; images_per_point: mean of them. NaN without points.
+    """
+
+    position_m: FloatArray
+    position_sigmas: FloatArray
+    rotation_deg: FloatArray
+    rotation_sigmas: FloatArray
+    error_px: float
+    points: int
+    images_per_point: float
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoint:
+    """A surveyed point. position_m: (3,) in the world frame. check: it takes no part in any fit.
+
+    pixels: image_id -> (2,) stored pixel. sigmas_m: standard deviations of x, y, z; sigma_px: of each coordinate of a
+    pixel.
     """
 
     name: str
     position_m: FloatArray
     check: bool
     pixels: Mapping[str, FloatArray]
+    sigmas_m: tuple[float, float, float] = (0.02, 0.02, 0.03)
+    sigma_px: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -165,7 +195,8 @@ class Block:
     coordinates of that CRS. ground_source: where the ground came from, in words. gsd_m: the common ground sampling
     distance of the images, or None where no image has an attitude; reduced_gsd_m: of them as they are worked on, None
     where none is reduced. tied: pairs (image_id0, image_id1) that a first pass has matched; similar: pairs that look
-    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found.
+    alike, where that was asked for. outside: images without an attitude that `orient` has confirmed or found. metric:
+    whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary.
     """
 
     images: tuple[Image, ...]
@@ -180,6 +211,7 @@ class Block:
     similar: tuple[tuple[str, str], ...] = ()
     outside: frozenset[str] = frozenset()
     reduced_gsd_m: float | None = None
+    metric: bool = True
 
     @property
     def views_gsd_m(self) -> float | None:

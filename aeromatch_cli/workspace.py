@@ -83,6 +83,11 @@ class Workspace:
         return self.orientation / "adjusted.npz"
 
     @property
+    def residuals(self) -> Path:
+        """Adjusted poses beside those given."""
+        return self.orientation / "residuals.csv"
+
+    @property
     def final(self) -> Path:
         """The adjusted block without what only dropped matches have held; absent where that is nothing."""
         return self.orientation / "final.npz"

@@ -186,7 +186,19 @@ def readers() -> dict[str, Reader]:
         ),
         "control": Reader(
             lambda path: read_control(str(path), images, "EPSG:32633", (391000.0, 5818000.0, 0.0)),
-            _texts({"gcp_list.txt": control}),
+            _texts(
+                {
+                    "gcp_list.txt": control,
+                    "pix4d.csv": "north,390951.2,5818970.1,34.0,0.02,0.03\nsouth,390990,5818999,33.8,0.02,0.03\n",
+                    "marks.txt": "a.jpg,north,10.5,9.5,1\na.jpg,south,12.5,9.5,1\n",
+                    "markers.xml": "<document><chunk><cameras><camera id='3' label='a'/></cameras><markers>"
+                    "<marker id='0' label='north'><reference x='390951.2' y='5818970.1' z='34' sx='0.01' "
+                    "enabled='true'/></marker>"
+                    "</markers><frames><frame><markers><marker marker_id='0'><location camera_id='3' x='9' y='8' "
+                    "pinned='true'/></marker></markers></frame></frames><reference>EPSG:32633</reference></chunk>"
+                    "</document>",
+                }
+            ),
         ),
         "settings": Reader(lambda path: load(str(path)), _texts({"a.yaml": settings})),
         "exif": Reader(read_exif, pictures),

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from make_images import DJI_XMP, gps_tags, write_image
 
-from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.calibration import calibrated_camera, position_sigmas_m
 from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS, cameras_from_exif, focal_from_exif_px
 from aeromatch_cli.blocks.exif import ExifFacts, read_exif
 from aeromatch_cli.blocks.observations import observation_of_exif
-from aeromatch_cli.geometry.cameras import distort, focal_px, parameters
+from aeromatch_cli.geometry.cameras import distort, focal_px, parameters, pixels_of_rays
 
 DEWARP = "2021-03-04;3678.87,3671.84,10.10,27.29,-0.26,0.11,0.0001,-0.0002,-0.03"
 
@@ -24,12 +24,11 @@ def test_dewarp_data_of_the_full_picture() -> None:
     assert (found["fx"], found["fy"]) == (3678.87, 3671.84)
     assert (found["cx"], found["cy"]) == (pytest.approx(2735.5 + 10.10), pytest.approx(1823.5 + 27.29))
     assert (found["p1"], found["p2"]) == (0.0001, -0.0002)
-    # k1 and k2 stand for k1, k2 and k3: within 3 px over the picture, where k3 left out would cost 14 px.
-    radius = np.linspace(0.0, np.hypot(2736, 1824) / 3675, 30)
-    wanted = radius * (1 - 0.26 * radius**2 + 0.11 * radius**4 - 0.03 * radius**6)
-    got = radius * (1 + found["k1"] * radius**2 + found["k2"] * radius**4)
-    assert np.abs(got - wanted).max() * 3675 < 3.0
-    assert np.abs(0.03 * radius**7).max() * 3675 > 9.0
+    assert (found["k1"], found["k2"], found["k3"]) == (-0.26, 0.11, -0.03)
+    # u = 0.5, v = 0: r2 = 0.25; the radial factor is 1 - 0.065 + 0.006875 - 0.00046875 = 0.94140625.
+    x = 2735.5 + 10.10 + 3678.87 * (0.5 * 0.94140625 + 3 * -0.0002 * 0.25)
+    y = 1823.5 + 27.29 + 3671.84 * 0.0001 * 0.25
+    np.testing.assert_allclose(pixels_of_rays(camera, np.array([[0.5, 0.0]])), [[x, y]], atol=1e-9)
 
 
 def test_reduced_picture_gets_the_reduced_calibration() -> None:
@@ -63,10 +62,27 @@ def test_calibrated_focal_length_alone() -> None:
 
 def test_rtk_accuracy_is_the_position_s_sigma() -> None:
     xmp = {"drone-dji:RtkStdLon": "0.0112", "drone-dji:RtkStdLat": "0.0131", "drone-dji:RtkStdHgt": "0.0291"}
-    assert position_sigma_m(xmp) == 0.0291
-    assert position_sigma_m(dict.fromkeys(xmp, "0.004")) == 0.02
-    assert position_sigma_m(dict.fromkeys(xmp, "0")) is None
-    assert position_sigma_m({}) is None
+    assert position_sigmas_m(xmp) == ((0.02, 0.02, 0.0291), "")
+    assert position_sigmas_m(dict.fromkeys(xmp, "0.004")) == ((0.02, 0.02, 0.02), "")
+    assert position_sigmas_m(dict.fromkeys(xmp, "0")) == (None, "")
+    assert position_sigmas_m({}) == (None, "")
+
+
+@pytest.mark.parametrize(
+    ("flag", "sigmas_m", "said"),
+    [
+        ("50", (0.02, 0.03, 0.7), ""),
+        ("34", (0.5, 0.5, 0.7), "no fixed RTK solution"),
+        ("16", None, "no RTK solution"),
+        ("0", None, "no RTK solution"),
+    ],
+)
+def test_what_a_receiver_without_a_fix_states_is_not_believed(flag: str, sigmas_m: tuple | None, said: str) -> None:
+    xmp = {"RtkStdLon": "0.01", "RtkStdLat": "0.03", "RtkStdHgt": "0.7", "RtkFlag": flag}
+    found, remark = position_sigmas_m({f"drone-dji:{name}": value for name, value in xmp.items()})
+    assert found == sigmas_m
+    assert remark.startswith(said)
+    assert bool(remark) == bool(said)
 
 
 def test_an_image_file_is_read_with_both(tmp_path: Path) -> None:
@@ -78,7 +94,7 @@ def test_an_image_file_is_read_with_both(tmp_path: Path) -> None:
     assert focal_from_exif_px(facts) == (60.0, "XMP calibration")
     observation = observation_of_exif(facts, "auto")
     assert observation is not None
-    assert observation.sigma_position_m == 0.1
+    assert observation.sigmas_m == (0.05, 0.05, 0.1)
     found = cameras_from_exif({"a.jpg": facts}, {})
     assert set(found.focal_sigmas.values()) == {FOCAL_SIGMAS["XMP calibration"]}
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -53,6 +54,37 @@ def test_exif_groups() -> None:
     assert "b/4.jpg" in found.warnings[0]
     grouped = cameras_from_exif(facts, {"a/1.jpg": "left", "b/2.jpg": "right"})
     assert grouped.camera_ids["a/1.jpg"] != grouped.camera_ids["b/2.jpg"]
+
+
+def test_two_aircraft_of_one_model_are_two_cameras() -> None:
+    """And so are two lenses and the bands of a multispectral camera."""
+    one = ExifFacts(40, 30, make="DJI", model="FC6310", focal_mm=8.8, camera_serial="0K8A")
+    facts = {
+        "1": replace(one, lens="50 mm"), "2": replace(one, lens="50 mm"),
+        "3": replace(one, lens="50 mm", camera_serial="0K8B"), "4": replace(one, lens="35 mm F2.8"),
+        "5": replace(one, lens="24 mm F2.8"), "6": replace(one, band="NIR"), "7": replace(one, band="Green"),
+    }  # fmt: skip
+    found = cameras_from_exif(facts, {})
+    assert found.camera_ids["1"] == found.camera_ids["2"]
+    assert len(found.cameras) == 6
+    assert found.camera_ids["6"] == "dji-fc6310_0K8A_NIR_8.8mm_f30_40x30"
+    assert found.warnings == ()
+
+
+def test_a_lost_serial_number_splits_no_camera() -> None:
+    one = ExifFacts(40, 30, make="DJI", model="FC6310", focal_mm=8.8, camera_serial="0K8A", lens="8.8 mm")
+    stripped = replace(one, camera_serial="", lens="")
+    found = cameras_from_exif({"1": one, "2": stripped, "3": one}, {})
+    assert len(found.cameras) == 1
+    assert found.warnings == ()
+    other = replace(one, camera_serial="0K8B")
+    found = cameras_from_exif({"1": one, "2": stripped, "3": other}, {})
+    assert len(found.cameras) == 3
+    assert "1 of 3 images (2) have no serial number, and others of the same model have several" in found.warnings[0]
+    # Another size, or another folder's camera, tells nothing.
+    small = replace(stripped, width_px=20, height_px=15)
+    found = cameras_from_exif({"1": one, "2": small}, {})
+    assert found.camera_ids["2"] == "dji-fc6310_8.8mm_f15_20x15"
 
 
 def test_colmap_text(tmp_path: Path) -> None:
@@ -164,6 +196,7 @@ def test_a_fisheye_lens_is_named(tmp_path: Path, focal_35mm: int, fisheye: bool)
         write_image(tmp_path / f"{number}.jpg", (400, 300), exif={37386: 2.7, 41989: focal_35mm})
     warnings = read_inputs(tmp_path).warnings
     assert any("probably a fisheye lens" in warning for warning in warnings) == fisheye
+    assert any("give its camera as OPENCV_FISHEYE" in warning for warning in warnings) == fisheye
 
 
 def test_names_of_cameras_that_the_file_has_none_of_are_not_used(tmp_path: Path) -> None:

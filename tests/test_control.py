@@ -163,7 +163,9 @@ def test_names_of_images_are_paths_first(tmp_path: Path) -> None:
     path.write_text("EPSG:32633\n1 2 3 4 5 1.jpg p\n1 2 3 4 5 a/1.jpg p\n1 2 3 4 5 2.jpg p\n")
     ((point,), remarks) = read_control(str(path), images, "EPSG:32633", ORIGIN_M)
     assert (set(point.pixels), remarks) == ({"1_jpg", "a--1_jpg", "b--2_jpg"}, [])
-    with pytest.raises(ConfigError, match=r"several images are called 1\.jpg: write paths"):
+    with pytest.raises(
+        ConfigError, match=r"line 2, column image: '1\.jpg' may be a/1\.jpg or b/1\.jpg: write the path"
+    ):
         read_control(str(path), images[:2], "EPSG:32633", ORIGIN_M)
 
 
@@ -172,7 +174,7 @@ def test_names_of_images_are_paths_first(tmp_path: Path) -> None:
     [
         ("", "no control points"),
         ("EPSG:32633\n1 2 3 4 5\n", "line 2: 5 columns"),
-        ("EPSG:32633\n1 2 x 4 5 a.jpg\n", "line 2: could not convert"),
+        ("EPSG:32633\n1 2 x 4 5 a.jpg\n", "line 2, column z: 'x' is not a number"),
         ("nowhere\n1 2 3 4 5 a.jpg\n", "line 1: 'nowhere' is no CRS"),
         ("EPSG:32633\n1 2 3 4 5 a.jpg p\n1 2 9 4 5 b.jpg p\n", "line 3: p has other coordinates"),
     ],

@@ -218,9 +218,36 @@ def test_sensefly_states_accuracies(tmp_path: Path) -> None:
     space = 'xmlns:Camera="http://ns.sensefly.com/Camera/1.0/"'
     facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
     assert facts.angles == CameraAngles(10.0, 2.0, -1.0, "nadir")
-    assert (facts.sigma_position_m, facts.sigma_angle_deg) == (0.05, 5.0)
+    assert (facts.sigmas_m, facts.sigma_angle_deg) == ((0.03, 0.03, 0.05), 5.0)
+
+
+def test_bands_of_a_multispectral_camera(tmp_path: Path) -> None:
+    space = 'xmlns:Camera="http://pix4d.com/camera/1.0/"'
+    for inner, band in (
+        ("<rdf:Seq><rdf:li>Green</rdf:li></rdf:Seq>", "Green"),
+        ("<rdf:Seq><rdf:li>Red</rdf:li><rdf:li>Green</rdf:li></rdf:Seq>", ""),
+        ("NIR", "NIR"),
+    ):
+        body = f"<Camera:BandName>{inner}</Camera:BandName>"
+        facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
+        assert facts.band == band
 
 
 def test_a_positioning_error_in_the_gps_tags_is_a_standard_deviation(tmp_path: Path) -> None:
     facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0) | {31: 2.5}))
-    assert facts.sigma_position_m == 2.5
+    assert facts.sigmas_m == (2.5, 2.5, 5.0)  # it is the horizontal one
+
+
+def test_serial_number_offset_of_the_clock_and_speed(tmp_path: Path) -> None:
+    exif = {36867: "2016:11:22 16:32:34", 36881: "+02:00", 42033: "3Q4\0"}
+    more = 'drone-dji:FlightXSpeed="+1.50" drone-dji:FlightYSpeed="-4.0" drone-dji:FlightZSpeed="0.1" drone-dji:GimbalY'
+    xmp = DJI_XMP.format(yaw="1", pitch="-90", roll="0", relative="40").replace("drone-dji:GimbalY", more)
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif=exif, xmp=xmp))
+    assert (facts.serial, facts.utc_offset, facts.speed_m_s) == ("3Q4", "+02:00", (1.5, -4.0, 0.1))
+    xmp = xmp.replace("drone-dji:FlightXS", 'drone-dji:DroneSerialNumber="1581F" drone-dji:FlightXS')
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif=exif | {36881: "   :  "}, xmp=xmp))
+    assert (facts.serial, facts.camera_serial, facts.utc_offset) == ("1581F", "3Q4", "")
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={42033: "0000000000", 42036: "24 mm f/2.8", 42037: "77"}))
+    assert (facts.serial, facts.camera_serial, facts.lens) == ("", "", "24 mm f/2.8 77")
+    facts = read_exif(write_image(tmp_path / "a.jpg"))
+    assert (facts.serial, facts.utc_offset, facts.speed_m_s) == ("", "", None)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import MODELS, distort, focal_px, has_distortion, parameters, undistort
+from aeromatch_cli.geometry.cameras import FISHEYE, MODELS, distort, focal_px, has_distortion, parameters, undistort
 from aeromatch_cli.geometry.footprints import ground_footprint, view_angles_deg
 from aeromatch_cli.synthetic.flight_plans import FLIGHTS, SWEEP_ANGLES_DEG
 from aeromatch_cli.synthetic.flights import Flight, ground_area, gsd_m, noisy, plan_flight
@@ -367,7 +367,11 @@ def test_every_lens_is_one_to_one_over_the_picture(lens: str, focal_share: float
     assert (p["cx"], p["cy"]) == pytest.approx((402.7, 297.4))
     corner = np.array([[p["cx"] + 400.0, p["cy"] + 300.0]])
     moved = distort(camera, corner) - corner
-    if has_distortion(camera):
+    if lens == FISHEYE:
+        # Inwards of the equidistant place, f times the angle, by 1.5 % of it at the corner and less within.
+        equidistant = p["fx"] * np.arctan(500.0 / p["fx"])
+        assert 500.0 + moved[0] @ [0.8, 0.6] == pytest.approx(equidistant * 0.9865, rel=2.5e-3)
+    elif has_distortion(camera):
         # Barrel: inwards by 1.5 % of 500 px, and at most a fifth of that by decentring.
         assert moved[0] @ [-0.8, -0.6] == pytest.approx(7.5, abs=1.0)
     else:

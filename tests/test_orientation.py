@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z, tilt_deg
-from aeromatch_cli.orientation.dem import terrain_of, terrains_of
 from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share, grouped_images
 from aeromatch_cli.orientation.placing import _COMMON, LOCAL_FLYING_HEIGHT, _common, place, similarity
 from aeromatch_cli.orientation.resection import resected
@@ -304,38 +303,3 @@ def test_similarity_is_exact() -> None:
     assert scale == pytest.approx(2.5)
     np.testing.assert_allclose(rotation, rotation_z(40.0), atol=1e-12)
     np.testing.assert_allclose(shift, [1.0, 2.0, 3.0], atol=1e-12)
-
-
-def test_the_terrain_follows_the_surface_whatever_single_points_say() -> None:
-    rng = np.random.default_rng(4)
-    xy = rng.uniform([0, 0], [200, 150], (4000, 2))
-    points = np.column_stack([xy, surface(xy) + rng.normal(0.0, 0.1, len(xy))])
-    points[:200, 2] += rng.uniform(-60.0, 60.0, 200)
-    terrain = terrain_of(points, xy)
-    assert terrain is not None
-    rows, columns = terrain.heights_m.shape
-    x = terrain.west_m + terrain.cell_m * np.arange(columns)
-    y = terrain.north_m - terrain.cell_m * np.arange(rows)
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    inside = (grid > 5).all(axis=1) & (grid < [195, 145]).all(axis=1)
-    errors = np.abs(terrain.heights_m.reshape(-1) - surface(grid))[inside]
-    assert np.median(errors) < 0.25
-    assert errors.max() < 2.0
-    assert terrain_of(points[:5], xy) is None
-
-
-def test_flights_that_lie_apart_have_a_terrain_each() -> None:
-    xy = np.random.default_rng(1).uniform([-40, -40], [120, 100], (1500, 2))
-    here = np.column_stack([xy, surface(xy)])
-    centers = np.array([pose.center_m for pose in flight().values()])
-    away = np.array([100_000.0, 0.0, 500.0])
-    half = centers[:6], centers[6:]
-    parts = [(here[:700], half[0]), (here[:400] + away, centers + away), (here[700:], half[1])]
-    found = terrains_of(parts)
-    assert len(found) == 2
-    assert found[0].cell_m < 10.0  # both halves of the flight here
-    whole = terrain_of(here, centers[:, :2])
-    assert whole is not None
-    assert found[0].heights_m.shape == whole.heights_m.shape
-    assert np.median(found[1].heights_m) == pytest.approx(500.0, abs=5.0)
-    assert found[1].west_m > 99_000.0

@@ -93,8 +93,12 @@ def test_yaw_counts_from_true_north_in_grid_coordinates_too(tmp_path: Path) -> N
 
 
 def test_accuracies_become_standard_deviations(tmp_path: Path) -> None:
-    for name in ("odm/geo.txt", "metashape/ypr.txt", "pix4d-ypr/geolocation.csv", "opensfm-exif/exif_overrides.json"):
-        assert read(tmp_path, name, WORLD[name]).rows[0].sigma_position_m == 0.05
+    by_axis, overall = (0.03, 0.03, 0.05), (0.05, 0.05, 0.05)
+    for name, sigmas_m in {
+        "odm/geo.txt": by_axis, "metashape/ypr.txt": by_axis, "pix4d-ypr/geolocation.csv": by_axis,
+        "opensfm-exif/exif_overrides.json": overall,
+    }.items():  # fmt: skip
+        assert read(tmp_path, name, WORLD[name]).rows[0].sigmas_m == sigmas_m
 
 
 @pytest.mark.parametrize(
@@ -128,7 +132,8 @@ def test_an_mrk_names_exposures_by_number(tmp_path: Path) -> None:
     rows, remarks = matched_rows(found, names, "list")
     assert [rows[name].line for name in names] == [1, 1, 2]
     assert rows[names[0]].position == (51.101, -115.38282037, 1368.367)
-    assert rows[names[0]].sigma_position_m == 0.020323
+    assert rows[names[0]].sigmas_m == (0.010182, 0.012445, 0.020323)  # north stands before east
+    assert rows[names[2]].sigmas_m == (0.5, 0.5, 0.5)  # a floating solution
     assert found.rows[2].position is None
     assert len(remarks) == 1
     assert [word in " ".join(found.warnings) for word in ("1 exposures had no fix", "1 of 3 exposures had no fixed")]
@@ -261,7 +266,7 @@ def test_metashape_accuracies_of_position_and_angles_are_used(tmp_path: Path) ->
         "a,13.39384028,52.50098746,140.6,-4.3,0.9,0.2,0.02,0.03,0.04,2,1,0.5\n"
     )
     row = read_pose_file(path).rows[0]
-    assert (row.sigma_position_m, row.sigma_angle_deg) == (0.04, 2.0)
+    assert (row.sigmas_m, row.sigma_angle_deg) == ((0.02, 0.03, 0.04), 2.0)
 
 
 @pytest.mark.parametrize("form", ["csv", "csv -n", "json"])
@@ -290,7 +295,7 @@ def test_exiftools_tables(tmp_path: Path, form: str) -> None:
     assert row.image == "imgs/a.jpg"
     np.testing.assert_allclose(row.position or (), (-33.51, -70.25, 12.5), atol=1e-9)
     assert (row.attitude, row.forward) == (((10.0, -90.0, 0.0), True) if form == "csv" else ((10.0, 0.0, 0.0), False))
-    assert row.sigma_position_m == (0.05 if form == "csv -n" else None)
+    assert row.sigmas_m == ((0.04, 0.04, 0.05) if form == "csv -n" else None)
 
 
 def test_a_crs_with_its_shift_to_wgs84_is_the_crs_itself(tmp_path: Path) -> None:

@@ -137,15 +137,35 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, values: list[tuple
     assert [(*row.position, *row.attitude) for row in poses.rows if row.position and row.attitude] == values
 
 
-def test_the_largest_deviation_of_an_axis_counts(tmp_path: Path) -> None:
+def test_deviations_by_axis(tmp_path: Path) -> None:
     rows = read_poses(
         write(tmp_path, "image,lat,lon,alt,sdn(m),sde(m),sdu(m)\na.jpg,48,12,300,0.011,0.012,0.03\n")
     ).rows
-    assert rows[0].sigma_position_m == 0.03
+    assert rows[0].sigmas_m == (0.012, 0.011, 0.03)
+    assert rows[0].sigma_position_m == pytest.approx(0.019706, abs=1e-6)
     rows = read_poses(write(tmp_path, "image,x,y,z,accuracy,sigma_z_m\na.jpg,1,2,3,0.5,0.03\n")).rows
-    assert rows[0].sigma_position_m == 0.5
+    assert rows[0].sigmas_m == (0.5, 0.5, 0.03)
     with pytest.raises(ConfigError, match="a standard deviation is positive"):
         read_poses(write(tmp_path, "image,x,y,z,sigma_z_m\na.jpg,1,2,3,-1\n"))
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "sigmas_m"),
+    [
+        ("sigma_xy_m,sigma_z_m", "0.02,0.05", (0.02, 0.02, 0.05)),
+        ("Horizontal accuracy (m),Vertical accuracy (m)", "0.02,0.05", (0.02, 0.02, 0.05)),
+        ("accuracy_xy,accuracy_z", "0.02,0.05", (0.02, 0.02, 0.05)),
+        ("std_x,std_y,std_z", "0.02,0.03,0.05", (0.02, 0.03, 0.05)),
+        ("Easting RMS,Northing RMS,Elevation RMS", "0.02,0.03,0.05", (0.02, 0.03, 0.05)),
+        ("sigma_xy_m", "0.02", (0.02, 0.02, 0.04)),  # heights are about twice as inexact
+        ("sigma_z_m", "0.05", (0.05, 0.05, 0.05)),
+        ("sigma_position_m", "0.05", (0.05, 0.05, 0.05)),
+        ("sigma_x_m,sigma_y_m,sigma_z_m", ",,", None),
+    ],
+)
+def test_names_of_deviations(tmp_path: Path, columns: str, cells: str, sigmas_m: tuple | None) -> None:
+    (row,) = read_poses(write(tmp_path, f"image,x,y,z,{columns}\na.jpg,1,2,3,{cells}\n")).rows
+    assert row.sigmas_m == sigmas_m
 
 
 def test_latitudes_beyond_90_degrees_are_longitudes(tmp_path: Path) -> None:
@@ -186,6 +206,6 @@ def test_our_own_orientation_is_read_again(tmp_path: Path) -> None:
         "b.jpg,1,2,3,0,0,9,0.1,0.2,0.3,0.01,0.02,0.03,1,own 1\n"
     )
     found = read_poses(path)
-    assert (found.rows[0].sigma_position_m, found.rows[0].sigma_angle_deg) == (0.3, 0.03)
+    assert (found.rows[0].sigmas_m, found.rows[0].sigma_angle_deg) == ((0.1, 0.2, 0.3), 0.03)
     assert (found.rows[1].position, found.rows[1].attitude) == (None, None)
     assert found.warnings == ("orientation.csv, line 3: in a frame of its own, treated as unposed: b.jpg",)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from make_images import PARROT_XMP, gps_tags, write_dji, write_image
+from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_dji, write_image
 from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.crs import WorldFrame
@@ -238,7 +238,7 @@ def test_a_list_without_heights(tmp_path: Path) -> None:
         write_image(tmp_path / name)
     inputs = read_inputs(tmp_path, table)
     assert [pose.center_m.tolist() for pose in inputs.poses.values()] == [[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]]
-    assert [pose.sigma_position_m for pose in inputs.poses.values()] == [10.0, 10.0]
+    assert [pose.axis_sigmas_m.tolist() for pose in inputs.poses.values()] == [[0.5, 0.5, 10.0]] * 2
     assert any("a level flight at 0 m, so that heights count from the flight, is assumed" in w for w in inputs.warnings)
 
 
@@ -383,3 +383,23 @@ def test_names_with_control_characters_are_passed_over(tmp_path: Path) -> None:
     assert all("control characters" in failure.reason for failure in failures)
     listed, passed_over = scan_files({"a\nb.jpg": 5, "plain.jpg": 5})
     assert (listed, [failure.name for failure in passed_over]) == (["plain.jpg"], ["a?b.jpg"])
+
+
+def test_positions_have_the_deviations_of_their_axes(tmp_path: Path) -> None:
+    """Fixed, floating and single RTK solutions; and a horizontal positioning error."""
+    for n, flag in enumerate((50, 34, 16)):
+        rtk = f'drone-dji:RtkFlag="{flag}" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.04" '
+        xmp = DJI_XMP.format(yaw=0, pitch=-90, roll=0, relative=50).replace(
+            "drone-dji:GimbalYaw", f'{rtk}drone-dji:RtkStdHgt="0.6" drone-dji:GimbalYaw'
+        )
+        write_image(tmp_path / f"{n}.jpg", gps=gps_tags(46.8 + 1e-4 * n, 12.0, 300.0), xmp=xmp)
+    write_image(tmp_path / "3.jpg", gps=gps_tags(46.81, 12.0, 300.0) | {31: 1.5})
+    inputs = read_inputs(tmp_path, "exif")
+    assert [inputs.poses[f"{n}_jpg"].axis_sigmas_m.tolist() for n in range(4)] == [
+        [0.03, 0.04, 0.6], [0.5, 0.5, 0.6], [2.0, 2.0, 2.0], [1.5, 1.5, 3.0],
+    ]  # fmt: skip
+    assert inputs.poses["0_jpg"].sigma_position_m == pytest.approx(np.sqrt((0.03**2 + 0.04**2 + 0.6**2) / 3.0))
+    assert inputs.poses["2_jpg"].sigmas_m is None
+    said = " ".join(inputs.warnings)
+    assert "1 of 4 images: no fixed RTK solution, so that the position counts with 0.5 m at least" in said
+    assert "1 of 4 images: no RTK solution, so that the stated accuracy of the position does not count" in said

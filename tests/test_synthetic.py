@@ -14,7 +14,7 @@ from make_scenes import NOON_WEST, make_scene, make_truth, make_view, one_box
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError
-from aeromatch_cli.geometry.cameras import MODELS, colmap_params
+from aeromatch_cli.geometry.cameras import MODELS, corner_params
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.synthetic import Truth, load_truth, render_block, transfer
 from aeromatch_cli.synthetic.render import render_image
@@ -315,7 +315,7 @@ def test_poses_and_camera_round_trip(folder: Path, truth: Truth) -> None:
         assert np.array_equal(truth.poses[row["image"]].world_rotation, rotation)
     lens = json.loads((folder / "block.json").read_text())["cameras"]["1"]
     assert {(c.model, c.width_px, c.height_px) for c in truth.cameras.values()} == {("SIMPLE_RADIAL", WIDTH, HEIGHT)}
-    assert all(list(colmap_params(camera)) == lens["params"] for camera in truth.cameras.values())
+    assert all(list(corner_params(camera)) == lens["params"] for camera in truth.cameras.values())
 
 
 @pytest.mark.parametrize("lens", MODELS)
@@ -331,12 +331,16 @@ def test_any_lens_model_is_rendered_exactly(lens: str, tmp_path: Path) -> None:
     x, y, z = ((surface - pose.center_m) @ np.asarray(pose.world_rotation).T).T
     u, v = x / z, y / z
     r2 = u * u + v * v
-    k1, k2, p1, p2 = (given.get(k, 0.0) for k in ("k1", "k2", "p1", "p2"))
-    radial = 1 + k1 * r2 + k2 * r2 * r2
+    k1, k2, k3, k4, p1, p2 = (given.get(k, 0.0) for k in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    radial = 1 + k1 * r2 + k2 * r2 * r2 + k3 * r2**3
+    if lens == "OPENCV_FISHEYE":
+        angle = np.arctan(np.sqrt(r2))
+        radial = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8) / np.sqrt(r2)
     du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
     dv = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
     fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
-    places = np.stack([fx * du + given["cx"] - 0.5, fy * dv + given["cy"] - 0.5], axis=1)
+    fx, skew = fx + given.get("b1", 0.0), given.get("b2", 0.0)
+    places = np.stack([fx * du + skew * dv + given["cx"] - 0.5, fy * dv + given["cy"] - 0.5], axis=1)
     assert np.abs(places - pixels).max() < 1e-6
 
 

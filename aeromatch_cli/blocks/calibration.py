@@ -2,7 +2,8 @@
 
 DJI's namespace `drone-dji`: DewarpData ("date;fx,fy,cx,cy,k1,k2,p1,p2,k3", pixels, cx and cy from the picture's centre,
 distortion as in OpenCV), CalibratedFocalLength (pixels), CalibratedOpticalCenterX (pixels, of the picture that both
-were measured in), DewarpFlag (1: the picture is free of distortion already), RtkStdLon, RtkStdLat, RtkStdHgt (metres).
+were measured in), DewarpFlag (1: the picture is free of distortion already), RtkStdLon, RtkStdLat, RtkStdHgt (metres),
+RtkFlag (status of the RTK solution, see `accuracies`).
 Source: DJI, Phantom 4 RTK and Zenmuse P1 user manuals.
 """
 
@@ -11,10 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
-from aeromatch_cli.data import Camera, FloatArray
-from aeromatch_cli.geometry.cameras import resized
+from aeromatch_cli.blocks.accuracies import Sigmas, believed_sigmas_m, completed_sigmas_m
+from aeromatch_cli.data import Camera
+from aeromatch_cli.geometry.cameras import brown_camera, focal_px, resized
 
 # Antenna and shutter add to what the receiver states.
 _LEAST_SIGMA_M = 0.02
@@ -42,19 +42,27 @@ def calibrated_camera(xmp: Mapping[str, str], width_px: int, height_px: int) -> 
         camera = Camera("SIMPLE_RADIAL", full_width, full_height, (focal[0], *middle, 0.0))
     else:
         return None
-    if not _LEAST_FOCAL < camera.params[0] / max(full_width, full_height) < _LARGEST_FOCAL:
+    if not _LEAST_FOCAL < focal_px(camera) / max(full_width, full_height) < _LARGEST_FOCAL:
         return None
     if (full_width, full_height) == (width_px, height_px):
         return camera
     return resized(camera, width_px / full_width, width_px, height_px)
 
 
-def position_sigma_m(xmp: Mapping[str, str]) -> float | None:
-    """Standard deviation of a coordinate, the largest of those stated by the RTK receiver (DJI) or as GPSXYAccuracy and
-    GPSZAccuracy (senseFly, Pix4D); None where XMP states none."""
+def position_sigmas_m(xmp: Mapping[str, str]) -> tuple[Sigmas | None, str]:
+    """Standard deviations of a position to the east, to the north and of the height, as the RTK receiver (DJI) or
+    GPSXYAccuracy and GPSZAccuracy (senseFly, Pix4D) state them; None where XMP states none that can be believed. And
+    what is said of that."""
     rtk = _positive(xmp, [f"drone-dji:RtkStd{name}" for name in ("Lon", "Lat", "Hgt")])
-    stated = rtk or _positive(xmp, ["Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"])
-    return max(_LEAST_SIGMA_M, *stated) if stated else None
+    flag = _numbers(xmp.get("drone-dji:RtkFlag", ""))
+    if rtk:
+        x_m, y_m, z_m = (max(_LEAST_SIGMA_M, value) for value in rtk)
+        return believed_sigmas_m((x_m, y_m, z_m), flag[0] if len(flag) == 1 else None)
+    stated = _positive(xmp, ["Camera:GPSXYAccuracy", "Camera:GPSZAccuracy"])
+    if not stated:
+        return None, ""
+    across_m, up_m = (max(_LEAST_SIGMA_M, value) for value in stated)
+    return completed_sigmas_m(z_m=up_m, across_m=across_m), ""
 
 
 def angle_sigma_deg(xmp: Mapping[str, str]) -> float | None:
@@ -74,20 +82,8 @@ def _of_dewarp(values: tuple[float, ...], width_px: int, height_px: int, dewarpe
     cx, cy = (width_px - 1) / 2.0 + cx, (height_px - 1) / 2.0 + cy
     if dewarped:
         return Camera("PINHOLE", width_px, height_px, (fx, fy, cx, cy))
-    k1, k2 = _two_terms(np.array([k1, k2, k3]), math.hypot(width_px, height_px) / (fx + fy))
-    return Camera("OPENCV", width_px, height_px, (fx, fy, cx, cy, k1, k2, p1, p2))
-
-
-def _two_terms(terms: FloatArray, largest_radius: float) -> tuple[float, float]:
-    """The k1 and k2 whose distortion comes nearest that of k1, k2, k3 over the picture, by least squares.
-
-    largest_radius: of the picture's corner, in units of the focal length. Rings count by their area.
-    """
-    radius = np.linspace(0.02, 1.0, 50) * largest_radius
-    powers = radius[:, None] ** [3, 5, 7]
-    weights = np.sqrt(radius)[:, None]
-    found = np.linalg.lstsq(powers[:, :2] * weights, (powers @ terms)[:, None] * weights, rcond=None)[0].ravel()
-    return float(found[0]), float(found[1])
+    lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}
+    return brown_camera((width_px, height_px), lens)
 
 
 def _numbers(text: str) -> tuple[float, ...]:

@@ -1,6 +1,8 @@
-"""Cameras from files: COLMAP's cameras.txt, YAML or JSON, and the block.json of a shared block.
+"""Cameras from files: COLMAP's cameras.txt, YAML or JSON, the block.json of a shared block, OpenSfM's and ODM's
+cameras.json, and the calibration that Metashape writes as XML.
 
 Parameters follow COLMAP: its order and its corner origin (cx = W / 2 is the centre); here they become this project's.
+BROWN, which COLMAP does not have, stands there in the same way.
 
 YAML and JSON: NAME: {model, width, height, params}, for every camera, or the same below a key `cameras`, beside which
 `crs` (a code) and `ground_z` (a height, or percentiles with p50) may stand. One camera may stand without its NAME.
@@ -14,11 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.lenses import Nearest, of_colmap
+from aeromatch_cli.blocks.lenses import of_metashape, of_opensfm, remark
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes
-from aeromatch_cli.geometry.cameras import MODELS, colmap_params, focal_px
+from aeromatch_cli.geometry.cameras import FULL_OPENCV, MODELS, corner_params, focal_px
+from aeromatch_cli.geometry.lenses import Nearest, of_colmap
 
 _ENTRY_KEYS = ("model", "width", "height", "params")
 
@@ -43,7 +46,10 @@ def read_camera_file(path: Path) -> CameraFile:
         raise ConfigError(
             f"camera file {path} cannot be read ({reason}): give a COLMAP cameras.txt, YAML or JSON, or exif or folder"
         ) from error
-    content = _colmap(path, text) if path.suffix.lower() == ".txt" else _tree(path, text)
+    if text.lstrip().startswith("<"):
+        content = _calibration(path, text)
+    else:
+        content = _colmap(path, text) if path.suffix.lower() == ".txt" else _tree(path, text)
     if not content.cameras:
         raise ConfigError(f"camera file {path} names no camera: add one, or use --cameras exif")
     return content
@@ -62,6 +68,29 @@ def _colmap(path: Path, text: str) -> CameraFile:
             raise ConfigError(f"{where}: camera {fields[0]} is defined twice: keep one")
         cameras[fields[0]] = _camera(where, fields[1], fields[2], fields[3], fields[4:])
     return _file(path, cameras)
+
+
+def _calibration(path: Path, text: str) -> CameraFile:
+    """Metashape's calibration (Agisoft Camera Calibration)."""
+    from xml.etree.ElementTree import ParseError
+
+    from defusedxml import DefusedXmlException
+    from defusedxml.ElementTree import fromstring
+
+    try:
+        root = fromstring(text.encode())
+        if root.tag != "calibration":
+            raise ValueError(f"its root is {root.tag}")
+        size = int(root.findtext("width", "")), int(root.findtext("height", ""))
+    except (ParseError, DefusedXmlException, ValueError, LookupError) as error:
+        raise ConfigError(
+            f"camera file {path} is no calibration of Metashape ({error}): export one by Tools > Camera Calibration > "
+            "Save, or give the cameras.xml with --poses"
+        ) from error
+    lens = of_metashape(root, root.findtext("projection", "frame"), *size)
+    if lens is None:
+        raise ConfigError(f"camera file {path}: the focal length f is missing, or something is no number")
+    return _file(path, {path.stem: _plausible(str(path), lens)})
 
 
 def _tree(path: Path, text: str) -> CameraFile:
@@ -100,13 +129,18 @@ def _file(
     path: Path, lenses: Mapping[str, Nearest], crs: str | None = None, ground_z_m: float | None = None
 ) -> CameraFile:
     cameras = {name: lens.camera for name, lens in lenses.items() if lens.camera is not None}
-    remarks = [lens.remark(f"{path.name}, camera {name}") for name, lens in lenses.items()]
+    remarks = [remark(lens, f"{path.name}, camera {name}") for name, lens in lenses.items()]
     return CameraFile(cameras, crs, ground_z_m, tuple(filter(None, remarks)))
 
 
 def _entry(where: str, entry: Any) -> Nearest:
     if not isinstance(entry, dict):
         raise ConfigError(f"{where}: must be {{model, width, height, params}}, got {entry!r}")
+    if "projection_type" in entry:
+        lens = of_opensfm(entry)
+        if lens is None:
+            raise ConfigError(f"{where}: a value of this OpenSfM camera is missing or no number")
+        return _plausible(where, lens)
     for key in _ENTRY_KEYS:
         if key not in entry:
             raise ConfigError(f"{where}: key {key!r} is missing: a camera needs {', '.join(_ENTRY_KEYS)}")
@@ -130,11 +164,16 @@ def _camera(where: str, model: str, width: Any, height: Any, params: list[Any]) 
         lens = of_colmap(model, *size, values)
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from error
+    return _plausible(where, lens)
+
+
+def _plausible(where: str, lens: Nearest) -> Nearest:
+    """The lens. Raises ConfigError where none is, or where it does not fit its picture."""
     camera = lens.camera
     if camera is None:
-        raise ConfigError(f"{lens.remark(where)}: give one of {', '.join(MODELS)}")
-    names = MODELS[camera.model]
-    named = dict(zip(names, colmap_params(camera), strict=True))
+        raise ConfigError(f"{remark(lens, where)}: give one of {', '.join((*MODELS, FULL_OPENCV))}")
+    names, size = MODELS[camera.model], (camera.width_px, camera.height_px)
+    named = dict(zip(names, corner_params(camera), strict=True))
     if focal_px(camera) <= 0 or not (0 <= named["cx"] <= size[0] and 0 <= named["cy"] <= size[1]):
         raise ConfigError(
             f"{where}: focal length {focal_px(camera):g} px and principal point ({named['cx']:g}, {named['cy']:g}) px "

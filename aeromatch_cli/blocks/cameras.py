@@ -6,7 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from zlib import crc32
 
@@ -88,20 +88,24 @@ def _contradicts(first_px: float, second_px: float) -> bool:
 
 
 def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str]) -> CameraAssignment:
-    """One camera per make, model, focal length, size and group; facts and groups by image name.
+    """One camera per make, model, serial number, lens, band, focal length, size and group; facts and groups by image
+    name.
 
     groups: what else keeps cameras apart (folder or column of the pose list), "" for nothing. A camera depends on
-    the image's own header alone, so it does not change when images are added. Model SIMPLE_RADIAL without distortion,
+    the image's own header alone, so it does not change when images are added; but an image whose header has lost serial
+    number or lens is taken for one of the only camera that it may be of. Model SIMPLE_RADIAL without distortion,
     but for cameras whose calibration is in XMP.
     """
     cameras: dict[str, Camera] = {}
     camera_ids: dict[str, str] = {}
     sources: dict[str, str] = {}
+    facts, lost = _with_lost_numbers(facts, groups)
     for name, fact in facts.items():
         focal, sources[name] = focal_from_exif_px(fact)
         focal = round(focal, 2)
         lens = re.sub(r"[^a-z0-9._]+", "-", _full_model(fact).lower()).strip("-")
         parts = [identifier(groups.get(name, "")), lens or "unknown"]
+        parts += [identifier(part) for part in (fact.camera_serial, fact.lens, fact.band) if part]
         parts += [f"{fact.focal_mm:.4g}mm"] if fact.focal_mm else []
         parts += [f"f{focal:g}", f"{fact.width_px}x{fact.height_px}"]
         parts += [f"{crc32(repr(fact.calibrated).encode()):08x}"] if fact.calibrated else []
@@ -120,7 +124,36 @@ def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str])
         else ()
     )
     sigmas = {camera_ids[name]: FOCAL_SIGMAS[source] for name, source in sources.items()}
-    return CameraAssignment(cameras, camera_ids, {}, (*warnings, *_contradictions(facts), *_fisheyes(facts)), sigmas)
+    said = (*warnings, *lost, *_contradictions(facts), *_fisheyes(facts))
+    return CameraAssignment(cameras, camera_ids, {}, said, sigmas)
+
+
+def _with_lost_numbers(
+    facts: Mapping[str, ExifFacts], groups: Mapping[str, str]
+) -> tuple[dict[str, ExifFacts], tuple[str, ...]]:
+    """Headers in which the serial number of the camera, and the lens, that some have lost are put in where all others
+    of the same kind have the same one; and a word on those of which that is not known."""
+    found = dict(facts)
+    unclear: list[str] = []
+    for field_name in ("camera_serial", "lens"):
+        kinds: dict[tuple[object, ...], list[str]] = defaultdict(list)
+        for name, fact in found.items():
+            size = fact.width_px, fact.height_px
+            kinds[groups.get(name, ""), fact.make, fact.model, fact.focal_mm, size, fact.band].append(name)
+        for names in kinds.values():
+            stated = {value for name in names if (value := getattr(found[name], field_name))}
+            lacking = [name for name in names if not getattr(found[name], field_name)]
+            if len(stated) == 1:
+                found |= {name: replace(found[name], **{field_name: next(iter(stated))}) for name in lacking}
+            elif stated and field_name == "camera_serial":
+                unclear += lacking
+    if not unclear:
+        return found, ()
+    return found, (
+        f"{len(unclear)} of {len(facts)} images ({listed(unclear)}) have no serial number, and others of the same "
+        "model have several: they count as a camera of their own; better keep cameras apart by folders (--cameras "
+        "folder)",
+    )
 
 
 def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
@@ -151,8 +184,8 @@ def _fisheyes(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
     degrees = 2.0 * math.degrees(math.atan(0.5 / _FISHEYE_FOCAL))
     return (
         f"the field of view of {len(wide)} of {len(facts)} images ({listed(wide)}) is wider than {degrees:.0f} degrees "
-        "by EXIF: probably a fisheye lens, which no camera model here describes; give undistorted images, and their "
-        "camera with --cameras",
+        "by EXIF: probably a fisheye lens, of which EXIF does not tell enough; give its camera as OPENCV_FISHEYE, by "
+        "--cameras or a pose file that has it, or undistorted images with theirs",
     )
 
 

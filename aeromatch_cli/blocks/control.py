@@ -1,142 +1,234 @@
-"""Ground control points: ODM's gcp_list.txt.
+"""Ground control points in the block: their coordinates in its world, and the images that show them.
 
-First line: the CRS of the coordinates, as a code (EPSG:32633), a PROJ string, or "WGS84 UTM 33N". Then one line for
-every point in every image, separated by blanks or tabs:
-
-  geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check]
-
-im_x, im_y: pixels from the upper left corner of the image. A point without a name is known by its coordinates. A point
-with the word "check" (or "checkpoint") behind its name takes no part in the transformation. Lines that start with # are
-comments.
+The files of ODM, Pix4D and Metashape that hold them are read by `control_files`.
 """
 
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
+from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
 from aeromatch_cli.blocks.crs import LOCAL
+from aeromatch_cli.blocks.image_names import matched_names
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+
+ControlUse = Literal["adjust", "check"]
 
 # Control points so many extents of the block, and so many metres more, from its middle are elsewhere.
 _FAR_EXTENTS, _FAR_M = 5.0, 2000.0
-_CHECK = ("check", "checkpoint", "check_point")
-_COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check]"
+_WGS84 = "EPSG:4326"
+_LATITUDE_DEG, _LONGITUDE_DEG = 90.0, 180.0
 
 
 def read_control(
-    name: str, images: tuple[Image, ...], crs: str, origin_m: tuple[float, float, float]
+    name: str,
+    images: tuple[Image, ...],
+    crs: str,
+    origin_m: tuple[float, float, float],
+    *,
+    marks: str = "",
+    poses: Mapping[str, Pose] | None = None,
+    use: ControlUse = "adjust",
 ) -> tuple[tuple[ControlPoint, ...], list[str]]:
-    """Points in the world frame, and remarks on images that the block does not have; nothing of no file ("").
+    """Points in the world frame that images of the block show, and remarks; nothing of no file ("").
 
-    crs, origin_m: of the block; a local block takes the coordinates as they are. Raises ConfigError with file and line
-    where the file is malformed, or its CRS cannot be brought to the block's.
+    crs, origin_m: of the block; a local block takes the coordinates as they are. marks: file of the image measurements
+    where they stand apart, "" to look for it beside. poses: of the block, to tell exchanged coordinates and degrees by.
+    use: "check": all are check points. Raises ConfigError with file and line where a file is malformed, or its CRS
+    cannot be brought to the block's.
     """
     if not name:
         return (), []
     path = Path(name)
-    lines = [(n, line.strip()) for n, line in enumerate(_text(path).splitlines(), start=1)]
-    lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
-    if len(lines) < 2:
-        raise ConfigError(f"{path}: no control points: the first line names the CRS, then {_COLUMNS}")
-    alike = Counter(Path(image.name).name for image in images)
-    ids = {base: image.image_id for image in images if alike[base := Path(image.name).name] == 1}
-    ids |= {image.name: image.image_id for image in images}
-    rows = [_row(path, number, line) for number, line in lines[1:]]
-    positions = _to_block(path, lines[0][1], crs, np.array([row.position for row in rows])) - np.array(origin_m)
-    places: dict[str, FloatArray] = {}
-    pixels: dict[str, dict[str, FloatArray]] = {}
-    for row, position_m in zip(rows, positions, strict=True):
-        if not np.allclose(places.setdefault(row.name, position_m), position_m):
-            raise ConfigError(f"{path}, line {row.line}: {row.name} has other coordinates than before: one is wrong")
-        seen = pixels.setdefault(row.name, {})
-        if row.image in ids:
-            seen[ids[row.image]] = np.array(row.pixel) - COLMAP_OFFSET_PX
-    checks = {row.name for row in rows if row.check}
-    points = tuple(ControlPoint(name, place_m, name in checks, pixels[name]) for name, place_m in places.items())
-    if unclear := sorted({row.image for row in rows if row.image not in ids and alike[row.image] > 1}):
-        raise ConfigError(f"{path}: several images are called {unclear[0]}: write paths relative to the images folder")
-    absent = sorted({row.image for row in rows} - ids.keys())
-    count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
-    return points, [f"{path.name} names {count} that the block does not have: {listed(absent)}"] if absent else []
+    survey = read_survey(path, Path(marks) if marks else None)
+    places_m, remarks = _places(survey, path, crs, np.array(origin_m), poses or {})
+    measured, said = _measured(survey.marks, survey.measured_in, images)
+    remarks = [*survey.remarks, *remarks, *said]
+    points, unseen = [], []
+    for point, place_m in zip(survey.points, places_m, strict=True):
+        seen = measured.pop(point.name, [])
+        if not seen:
+            unseen.append(point.name)
+            continue
+        more: dict[str, Any] = {} if point.sigmas_m is None else {"sigmas_m": point.sigmas_m}
+        sigmas_px = [mark.sigma_px for _, mark in seen if mark.sigma_px is not None]
+        more |= {"sigma_px": float(np.median(sigmas_px))} if sigmas_px else {}
+        pixels = {image_id: np.array(mark.pixel) - COLMAP_OFFSET_PX for image_id, mark in seen}
+        points.append(ControlPoint(point.name, place_m, point.check or use == "check", pixels, **more))
+    if unseen:
+        count = f"{len(unseen)} of {len(survey.points)} control points"
+        remarks.append(f"{count} are measured in no image of the block: left out: {listed(unseen)}")
+    if measured:
+        what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
+        remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
+    return tuple(points), remarks + far_control(points, poses or {}, name)
 
 
 def far_control(points: Sequence[ControlPoint], poses: Mapping[str, Pose], name: str) -> list[str]:
-    """One sentence where control points lie far outside the block: in another CRS, or with exchanged columns."""
-    if len(points) == 0 or len(poses) < 2:
-        return []
-    places_m = np.array([pose.center_m[:2] for pose in poses.values()])
-    middle_m = np.median(places_m, axis=0)
-    extent_m = float(np.linalg.norm(np.ptp(places_m, axis=0)))
-    apart_m = float(np.linalg.norm(np.median([point.position_m[:2] for point in points], axis=0) - middle_m))
-    if apart_m <= _FAR_EXTENTS * extent_m + _FAR_M:
+    """One sentence where control points lie far outside the block: in another CRS."""
+    places_m = np.array([point.position_m for point in points]).reshape(-1, 3)
+    apart_m = _apart_m(places_m, poses)
+    if apart_m is None:
         return []
     return [
-        f"the control points of {Path(name).name} lie {apart_m / 1000.0:,.1f} km from the images: is the CRS in its "
-        "first line right, or are x and y exchanged?"
+        f"the control points of {Path(name).name} lie {apart_m / 1000.0:,.1f} km from the images: is the CRS that the "
+        "file states right?"
     ]
 
 
-@dataclass(frozen=True)
-class _Row:
-    line: int
-    position: tuple[float, ...]
-    pixel: tuple[float, ...]
-    image: str
-    name: str
-    check: bool
+def _apart_m(places_m: FloatArray, poses: Mapping[str, Pose]) -> float | None:
+    """How far places (N, 3) are from the block, None where they are as near as control points are, or that is not
+    known."""
+    if len(places_m) == 0 or len(poses) < 2:
+        return None
+    centers_m = np.array([pose.center_m[:2] for pose in poses.values()])
+    extent_m = float(np.linalg.norm(np.ptp(centers_m, axis=0)))
+    apart_m = float(np.linalg.norm(np.median(places_m[:, :2], axis=0) - np.median(centers_m, axis=0)))
+    return None if apart_m <= _FAR_EXTENTS * extent_m + _FAR_M else apart_m
 
 
-def _text(path: Path) -> str:
-    try:
-        return given_bytes(path).decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        said = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise ConfigError(f"control points {path} cannot be read ({said}): give ODM's gcp_list.txt") from error
-
-
-def _row(path: Path, number: int, line: str) -> _Row:
-    cells = [cell.strip() for cell in line.split("\t")] if "\t" in line else line.split()
-    if len(cells) < 6:
-        raise ConfigError(f"{path}, line {number}: {len(cells)} columns, expected {_COLUMNS}")
-    try:
-        values = tuple(float(cell) for cell in cells[:5])
-    except ValueError as error:
-        raise ConfigError(f"{path}, line {number}: {error}: expected {_COLUMNS}") from error
-    extras = [cell.lower() for cell in cells[6:]]
-    name = cells[6] if len(cells) > 6 and extras[0] not in _CHECK else " ".join(cells[:3])
-    return _Row(number, values[:3], values[3:], cells[5], name, any(extra in _CHECK for extra in extras))
-
-
-def _to_block(path: Path, stated: str, crs: str, positions: FloatArray) -> FloatArray:
-    """Positions (N, 3) in the block's CRS; heights stay as they are."""
+def _places(
+    survey: Survey, path: Path, crs: str, origin_m: FloatArray, poses: Mapping[str, Pose]
+) -> tuple[FloatArray, list[str]]:
+    """Positions (N, 3) of the points in the world frame, and a remark where the file has them exchanged."""
+    stated = _stated(survey, crs)
+    given = np.array([point.position for point in survey.points], dtype=np.float64).reshape(-1, 3)
     if crs == LOCAL:
-        return positions
-    from pyproj import CRS, Transformer
+        if stated is not None and stated.is_geographic:
+            raise ConfigError(
+                f"{survey.crs_where}: the control points are in degrees, and the block has no CRS that they could be "
+                "brought to: give one with --crs, such as EPSG:32633"
+            )
+        return given - origin_m, []
+    if stated is None:
+        stated = _crs(crs)
+    degrees = _as_degrees(given)
+    exchanged = given[:, [1, 0, 2]]
+    said = f"{path.name}: the coordinates of the control points are exchanged (x and y): they were put right"
+    if stated.is_geographic and not degrees:
+        if _as_degrees(exchanged):
+            return _to_block(survey, stated, crs, exchanged) - origin_m, [said]
+        raise ConfigError(
+            f"{survey.points[0].where}: {given[0, 0]:g}, {given[0, 1]:g} are no degrees, and {stated.name} counts in "
+            "degrees: name the projected CRS of the coordinates, such as EPSG:32633"
+        )
+    places_m = _to_block(survey, stated, crs, given) - origin_m
+    if _apart_m(places_m, poses) is None:
+        return places_m, []
+    turned_m = _to_block(survey, stated, crs, exchanged, strict=False) - origin_m
+    if np.isfinite(turned_m).all() and _apart_m(turned_m, poses) is None:
+        return turned_m, [said]
+    for order in (given, exchanged) if not stated.is_geographic else ():
+        if _as_degrees(order):
+            as_degrees_m = _to_block(survey, _crs(_WGS84), crs, order, strict=False) - origin_m
+            if np.isfinite(as_degrees_m).all() and _apart_m(as_degrees_m, poses) is None:
+                raise ConfigError(
+                    f"{survey.crs_where}: the coordinates of the control points are degrees, and {stated.name} counts "
+                    f"in metres: name {_WGS84} there"
+                )
+    return places_m, []
+
+
+def _as_degrees(positions: FloatArray) -> bool:
+    """Whether x and y may be longitudes and latitudes."""
+    largest = np.abs(positions[:, :2]).max(axis=0, initial=0.0)
+    return bool(largest[0] <= _LONGITUDE_DEG and largest[1] <= _LATITUDE_DEG)
+
+
+def _stated(survey: Survey, crs: str) -> Any:
+    """The CRS of the coordinates, None for the block's own. crs: the block's."""
     from pyproj.exceptions import CRSError
 
+    if survey.crs is None:
+        return _crs(_WGS84) if survey.geographic else None
+    text = survey.crs.strip()
+    if text.lower() == LOCAL or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
+        return None
     try:
-        source = CRS.from_user_input(_code(stated))
+        found = _crs(text)
     except CRSError as error:
+        if crs == LOCAL:
+            return None
         raise ConfigError(
-            f"{path}, line 1: {stated!r} is no CRS: write a code such as EPSG:32633, or WGS84 UTM 33N"
+            f"{survey.crs_where}: {text[:60]!r} is no CRS: write a code such as EPSG:32633, or WGS84 UTM 33N"
         ) from error
-    x, y = Transformer.from_crs(source.to_2d(), crs, always_xy=True).transform(positions[:, 0], positions[:, 1])
-    return np.column_stack([x, y, positions[:, 2]])
+    if found.is_geocentric:
+        raise ConfigError(f"{survey.crs_where}: geocentric coordinates: export them in a projected CRS or in degrees")
+    return found
 
 
-def _code(stated: str) -> str:
-    """A code or PROJ string; "WGS84 UTM 33N" becomes a code."""
-    utm = re.fullmatch(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", stated, re.IGNORECASE)
-    if utm is None:
-        return stated
-    return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
+def _crs(text: str) -> Any:
+    """Of a code, a PROJ string, WKT, or "WGS84 UTM 33N"; heights do not count."""
+    from pyproj import CRS
+
+    utm = re.fullmatch(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", text, re.IGNORECASE)
+    found: Any = CRS.from_user_input(
+        f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
+    )
+    if found.is_bound:  # a CRS that is written with its shift to WGS84 (TOWGS84)
+        found = found.source_crs
+    return found.to_2d()
+
+
+def _to_block(survey: Survey, stated: Any, crs: str, positions: FloatArray, *, strict: bool = True) -> FloatArray:
+    """Positions (N, 3) in the block's CRS; heights stay as they are. strict: raise ConfigError for those that cannot be
+    brought there."""
+    from pyproj import Transformer
+
+    x, y = Transformer.from_crs(stated, crs, always_xy=True).transform(positions[:, 0], positions[:, 1])
+    places = np.column_stack([x, y, positions[:, 2]])
+    bad = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    if strict and len(bad):
+        point = survey.points[int(bad[0])]
+        raise ConfigError(f"{point.where}: {point.name} is no place in {stated.name}: is it the right CRS?")
+    return places
+
+
+def _measured(
+    marks: Sequence[Mark], path: Path, images: Sequence[Image]
+) -> tuple[dict[str, list[tuple[str, Mark]]], list[str]]:
+    """Point -> image_id and measurement of every image that shows it, and remarks on those that do not count."""
+    by_name = {image.name: image for image in images}
+    lines: dict[str, int] = {}
+    for mark in marks:
+        lines.setdefault(mark.image, mark.line)
+    known, absent = matched_names(lines, list(by_name), str(path))
+    found: dict[str, dict[str, Mark]] = defaultdict(dict)
+    outside, twice, turned = [], [], 0
+    for mark in marks:
+        if mark.image not in known:
+            continue
+        image = by_name[known[mark.image]]
+        x, y = mark.pixel
+        words = f"{mark.point} in {image.name}"
+        if not _inside(image, x, y):
+            outside.append(f"{words} at {x:g}, {y:g}")
+            turned += _inside(image, y, x)
+        elif found[mark.point].setdefault(image.image_id, mark).pixel != mark.pixel:
+            twice.append(words)
+    remarks = []
+    if absent:
+        count = f"{len(absent)} image{'s' if len(absent) > 1 else ''}"
+        remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
+    if twice:
+        remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")
+    if outside:
+        question = "are pixel x and y exchanged?" if turned == len(outside) else "were they measured in these pictures?"
+        remarks.append(
+            f"{len(outside)} of {len(marks)} measurements of control points lie outside their image and are left out "
+            f"({listed(outside)}): {question}"
+        )
+    return {point: list(seen.items()) for point, seen in found.items() if seen}, remarks
+
+
+def _inside(image: Image, x: float, y: float) -> bool:
+    return 0.0 <= x <= image.width_px and 0.0 <= y <= image.height_px

@@ -5,6 +5,7 @@ What XMP says is read by `xmp` and `calibration`.
 
 from __future__ import annotations
 
+import re
 import struct
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,7 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigma_m
+from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
+from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
 from aeromatch_cli.blocks.png import late_chunks
 from aeromatch_cli.blocks.xmp import (
     ALTITUDES,
@@ -23,7 +25,10 @@ from aeromatch_cli.blocks.xmp import (
     CameraAngles,
     tag_number,
     xmp_angles,
+    xmp_band,
     xmp_properties,
+    xmp_serial,
+    xmp_speed_m_s,
 )
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
@@ -32,11 +37,13 @@ from aeromatch_cli.images.gdal import check_pixels
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
-_DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL = 36867, 37520, 37521
+_DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL = 36867, 37520, 37521, 36881
+_BODY_SERIAL, _CAMERA_SERIAL, _LENS_MODEL, _LENS_SERIAL = 42033, 50735, 42036, 42037
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
+_XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 # What Pillow raises on headers that are cut or scrambled.
@@ -51,8 +58,11 @@ class ExifFacts:
     focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigma_position_m: standard
-    deviation of each coordinate, by an RTK receiver or as GPS tags state it; sigma_angle_deg: of the angles.
+    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the
+    position to the east, to the north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg:
+    of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
+    that of the aircraft. lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as
+    "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
     georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
     be used.
     """
@@ -73,9 +83,15 @@ class ExifFacts:
     relative_altitude_m: float | None = None
     angles: CameraAngles | None = None
     calibrated: Camera | None = None
-    sigma_position_m: float | None = None
+    sigmas_m: Sigmas | None = None
     sigma_angle_deg: float | None = None
     georeferenced: bool = False
+    serial: str = ""
+    camera_serial: str = ""
+    lens: str = ""
+    band: str = ""
+    utc_offset: str = ""
+    speed_m_s: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -104,6 +120,7 @@ def read_exif(path: Path) -> ExifFacts:
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     orientation = tag_number(tags.get(_ORIENTATION)) or 1.0
+    body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
     return ExifFacts(
         width_px=width_px,
         height_px=height_px,
@@ -121,9 +138,15 @@ def read_exif(path: Path) -> ExifFacts:
         relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
         angles=xmp_angles(xmp),
         calibrated=calibrated_camera(xmp, width_px, height_px),
-        sigma_position_m=position_sigma_m(xmp) or _positive(header.gps.get(_POSITIONING_ERROR)),
+        sigmas_m=_sigmas_m(header.gps, xmp, notes),
         sigma_angle_deg=angle_sigma_deg(xmp),
         georeferenced=bool(_GEOTIFF & tags.keys()),
+        serial=xmp_serial(xmp) or body,
+        camera_serial=body or xmp_serial(xmp),
+        lens=" ".join(part for part in (_text(exif.get(_LENS_MODEL)), _serial(exif.get(_LENS_SERIAL))) if part),
+        band=xmp_band(xmp),
+        utc_offset=_utc_offset(exif),
+        speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
     )
 
@@ -292,10 +315,29 @@ def _time(tags: Mapping[int, Any], exif: Mapping[int, Any]) -> str:
     return ""
 
 
+def _utc_offset(exif: Mapping[int, Any]) -> str:
+    offset = _text(exif.get(_OFFSET_ORIGINAL))
+    return offset if re.fullmatch(r"[+-](0\d|1[0-4]):[0-5]\d", offset) else ""
+
+
+def _sigmas_m(gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]) -> Sigmas | None:
+    sigmas_m, remark = position_sigmas_m(xmp)
+    if remark:
+        notes.append(remark)
+        return sigmas_m
+    return sigmas_m or completed_sigmas_m(across_m=_positive(gps.get(_POSITIONING_ERROR)))
+
+
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+
+
+def _serial(value: Any) -> str:
+    """A serial number; zeros stand for none."""
+    text = _text(value)
+    return text if text.strip("0 ") else ""
 
 
 def _positive(value: Any) -> float | None:

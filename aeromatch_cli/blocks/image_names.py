@@ -24,17 +24,45 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
     Running numbers (DJI's MRK, PATB) stand in the names, of one folder. Raises ConfigError where two images fit a line,
     or two lines an image.
     """
+    rows, absent = _matches(pose_list.rows, names, source)
+    if names and not rows:
+        raise ConfigError(
+            f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
+            f"folder holds {names[0]}; write paths relative to the images folder"
+        )
+    remarks = []
+    if absent:
+        what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
+        remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
+    unnamed = [name for name in names if name not in rows]
+    if unnamed:
+        remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
+    return rows, remarks
+
+
+def matched_names(lines: Mapping[str, int], names: Sequence[str], source: str) -> tuple[dict[str, str], list[str]]:
+    """Name as a file has it -> the image that it means, by the same rules, and those that mean none.
+
+    lines: name as the file has it -> the line where it stands first. Raises ConfigError as `matched_rows`.
+    """
+    written = [PoseRow(name, line, None, "grid", None, "none") for name, line in lines.items()]
+    rows, absent = _matches(written, names, source)
+    return {row.image: name for name, row in rows.items()}, absent
+
+
+def _matches(written: Sequence[PoseRow], names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
+    """Image name -> its line, and names of lines that mean no image."""
     by_key: dict[str, list[str]] = defaultdict(list)
     for name in names:
         path = PurePosixPath(name)
         for key in {name.lower(), path.name.lower(), path.stem.lower(), str(path.with_suffix("")).lower()}:
             by_key[key].append(name)
-    by_number = _numbered(names, {int(float(row.image)) for row in pose_list.rows if row.numbered})
-    alike = Counter(PurePosixPath(row.image.lower()).name for row in pose_list.rows)
+    by_number = _numbered(names, {int(float(row.image)) for row in written if row.numbered})
+    alike = Counter(PurePosixPath(row.image.lower()).name for row in written)
     exact = set(names)
-    rows: dict[str, PoseRow] = {row.image: row for row in pose_list.rows if row.image in exact}
+    rows: dict[str, PoseRow] = {row.image: row for row in written if row.image in exact}
     absent: list[str] = []
-    for row in pose_list.rows:
+    for row in written:
         if row.image in exact:
             continue
         # Programs write paths of the machine that they ran on.
@@ -53,19 +81,7 @@ def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tupl
             absent.append(row.image)
         else:
             rows[image] = row
-    if names and not rows:
-        raise ConfigError(
-            f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
-            f"folder holds {names[0]}; write paths relative to the images folder"
-        )
-    remarks = []
-    if absent:
-        what = "1 image that is" if len(absent) == 1 else f"{len(absent)} images that are"
-        remarks.append(f"{source} names {what} not in the folder: {listed(absent)}")
-    unnamed = [name for name in names if name not in rows]
-    if unnamed:
-        remarks.append(f"{len(unnamed)} of {len(names)} images are not in {source}: {listed(unnamed)}")
-    return rows, remarks
+    return rows, absent
 
 
 def _only(row: PoseRow, found: Sequence[str], rows: Mapping[str, PoseRow], source: str) -> str | None:

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from aeromatch_cli.blocks.accuracies import Sigmas, overall_sigma_m
 from aeromatch_cli.blocks.crs import (
     LOCAL,
     WorldFrame,
@@ -34,6 +35,7 @@ _LEVEL_SIGMA_M = 10.0
 class Observation:
     """Where and how one image was taken, as stated. Units and kinds as in `poses.PoseRow`; a height may be NaN.
 
+    sigmas_m: standard deviations to the east, to the north and of the height.
     forward: for yaw, pitch, roll: True where the optical axis is body x (gimbal), False where it is down (nadir).
     true_north: as in `poses.PoseRow`.
     """
@@ -43,7 +45,7 @@ class Observation:
     attitude: tuple[float, ...] | None
     attitude_kind: AttitudeKind
     forward: bool
-    sigma_position_m: float | None = None
+    sigmas_m: Sigmas | None = None
     sigma_angle_deg: float | None = None
     true_north: bool = False
 
@@ -59,7 +61,7 @@ def observation_of_row(row: PoseRow, angles: AngleConvention) -> Observation | N
         attitude=row.attitude,
         attitude_kind=row.attitude_kind,
         forward=stated if angles == "auto" else angles != "nadir",
-        sigma_position_m=row.sigma_position_m,
+        sigmas_m=row.sigmas_m,
         sigma_angle_deg=row.sigma_angle_deg,
         true_north=row.true_north,
     )
@@ -73,11 +75,11 @@ def observation_of_exif(facts: ExifFacts, angles: AngleConvention) -> Observatio
     position = (facts.latitude_deg, facts.longitude_deg, altitude_m)
     found = facts.angles
     if found is None:
-        return Observation(position, "geographic", None, "none", forward=True, sigma_position_m=facts.sigma_position_m)
+        return Observation(position, "geographic", None, "none", forward=True, sigmas_m=facts.sigmas_m)
     convention = found.convention if angles == "auto" else angles
     attitude = (found.yaw_deg, found.pitch_deg, found.roll_deg)
     forward = convention == "gimbal"
-    sigmas = facts.sigma_position_m, facts.sigma_angle_deg
+    sigmas = facts.sigmas_m, facts.sigma_angle_deg
     return Observation(position, "geographic", attitude, "yaw_pitch_roll", forward, *sigmas)
 
 
@@ -148,21 +150,25 @@ def oriented(
     frame = WorldFrame(code, _origin_m(code, list(grid.values()), known_frame))
     stated = {name: _angles(observations[name], turns[name]) for name in grid}
     angles = {name: one for name, one in stated.items() if one is not None}
-    poses = {
-        name: Pose(
+    poses = {}
+    for name, center_m in grid.items():
+        sigmas_m = _sigmas_m(observations[name], sigma_position_m)
+        poses[name] = Pose(
             center_m=center_m - np.array(frame.origin_m),
             world_rotation=angles[name].rotation if name in angles else None,
-            sigma_position_m=max(
-                observations[name].sigma_position_m or sigma_position_m,
-                _LEVEL_SIGMA_M if np.isnan(observations[name].position[2]) else 0.0,
-            ),
+            sigma_position_m=overall_sigma_m(sigmas_m),
             sigma_angle_deg=observations[name].sigma_angle_deg or sigma_angle_deg,
+            sigmas_m=sigmas_m if len(set(sigmas_m)) > 1 else None,
         )
-        for name, center_m in grid.items()
-    }
     unusable = {f"lie outside the area of {code}": outside, "have the position (0, 0)": zeros}
     faults = {words: names for words, names in unusable.items() if names}
     return Located(frame, poses, angles, faults, level, level_m)
+
+
+def _sigmas_m(observation: Observation, usual_m: float) -> Sigmas:
+    """Standard deviations of a position along x, y, z: east and north by the list are taken for those of the grid."""
+    x_m, y_m, z_m = observation.sigmas_m or (usual_m, usual_m, usual_m)
+    return x_m, y_m, max(z_m, _LEVEL_SIGMA_M) if np.isnan(observation.position[2]) else z_m
 
 
 def _grid_turns(code: str, observations: Mapping[str, Observation], grid: Mapping[str, FloatArray]) -> dict[str, float]:

@@ -3,13 +3,19 @@ which images, and what to do."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Block, BoolArray, FloatArray
-from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR, sees_horizon
+from aeromatch_cli.geometry.footprints import (
+    MAX_DISTANCE_FACTOR,
+    Degenerate,
+    block_footprints,
+    degenerate_words,
+    sees_horizon,
+)
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, from_yaw_pitch_roll, rotation_z
 
 # Image names (N,) as an array, so that masks select them.
@@ -35,9 +41,11 @@ def warnings_of(block: Block, unpaired: Collection[str] = ()) -> tuple[str, ...]
     names_by_id = {image.image_id: image.name for image in block.images}
     names = np.array([names_by_id[image_id] for image_id in ids], dtype=object)
     centers = np.array([block.poses[image_id].center_m for image_id in ids]).reshape(-1, 3)
+    degenerate = {i: one.degenerate for i, one in block_footprints(block).items() if one.degenerate is not None}
     found = [
         *_position_warnings(block, names, centers),
-        *_height_warnings(block, names, centers),
+        *_height_warnings(block, names, centers, np.array([i in degenerate for i in ids], dtype=bool)),
+        *_degenerate_warnings(block, degenerate),
         *_attitude_warnings(block, ids, names),
     ]
     if unpaired and len(block.images) > 1:
@@ -54,7 +62,7 @@ def _position_warnings(block: Block, names: Names, centers: FloatArray) -> list[
             "images are paired by name"
         )
     rest = centers[~null_island, :2]
-    if len(rest) >= 2:
+    if len(rest) >= 2 and block.metric:
         spread = float(np.hypot(*np.ptp(rest, axis=0)))
         if spread < 1e-3:
             found.append(
@@ -83,14 +91,27 @@ def _at_null_island(block: Block, centers: FloatArray) -> BoolArray:
     return np.asarray(at_zero | ((np.abs(easting) < 1.0) & (np.abs(northing) < 1.0)))
 
 
-def _height_warnings(block: Block, names: Names, centers: FloatArray) -> list[str]:
-    if block.ground is None or len(centers) == 0:
+def _degenerate_warnings(block: Block, degenerate: Mapping[str, Degenerate]) -> list[str]:
+    if not degenerate:
+        return []
+    names = [image.name for image in block.images if image.image_id in degenerate]
+    first = next(iter(degenerate.values()))
+    return [
+        f"{_some(names)} with a {degenerate_words(first, block)}: the ground of the images around is used "
+        "instead; if cameras fly low beside steep ground, give --ground"
+    ]
+
+
+def _height_warnings(block: Block, names: Names, centers: FloatArray, elsewhere: BoolArray) -> list[str]:
+    """elsewhere: (N,) whether another ground than that below the camera is used."""
+    # Heights in units of arbitrary length are odd in no sense.
+    if block.ground is None or len(centers) == 0 or not block.metric:
         return []
     found = []
     ground = block.ground.height_m(centers[:, :2])
     heights = centers[:, 2] - ground
     altitudes, ground_altitude = centers[:, 2] + block.origin_m[2], float(np.median(ground)) + block.origin_m[2]
-    below = heights <= 0.0
+    below = (heights <= 0.0) & ~elsewhere
     if 2 * below.sum() > len(below) and (np.abs(altitudes) < _RELATIVE_ALTITUDE_M).all() and (altitudes > 0.0).all():
         found.append(
             f"the altitudes ({altitudes.min():.0f} to {altitudes.max():.0f} m) look relative to the take-off point: "
@@ -107,7 +128,7 @@ def _height_warnings(block: Block, names: Names, centers: FloatArray) -> list[st
             f"the ground lies at {ground_altitude:.0f} m, so the altitudes look relative to the take-off point: fine "
             "within this block, but a DEM or another flight will not fit; give absolute altitudes if that matters"
         )
-    odd = ~below & ((heights < _LOWEST_HEIGHT_M) | (heights > _HIGHEST_HEIGHT_M))
+    odd = ~below & ~elsewhere & ((heights < _LOWEST_HEIGHT_M) | (heights > _HIGHEST_HEIGHT_M))
     if odd.any():
         found.append(
             f"{_some(names[odd])} flown {heights[odd].min():,.1f} to {heights[odd].max():,.1f} m above ground: check "

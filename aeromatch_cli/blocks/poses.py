@@ -9,8 +9,9 @@ Columns, in any order and case (aliases in brackets):
   yaw_deg pitch_deg roll_deg [yaw pitch roll]     yaw against grid north with x y z, true north with lat lon alt, or
   qw qx qy qz                   cam_from_world, relative to the grid, or no attitude at all
   camera                        name of the camera (optional)
-  sigma_position_m sigma_angle_deg                standard deviations (optional), or for each axis
-  sigma_x_m sigma_y_m sigma_z_m [sde sdn sdu, std_e std_n std_u]     as PPK results have them; the largest counts
+  sigma_position_m sigma_angle_deg                standard deviations (optional); of the position also by axis:
+  sigma_x_m sigma_y_m sigma_z_m [sde sdn sdu, std_e std_n std_u, accuracy_x ..., sd_x ...]   as PPK results have them
+  sigma_xy_m                    of both horizontal axes [accuracy_xy, horizontal_accuracy, horz_accuracy, hrms]
   sigma_omega_deg sigma_phi_deg sigma_kappa_deg   the largest counts
   frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
 
@@ -34,6 +35,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
+from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -48,20 +50,33 @@ _ATTITUDES: dict[AttitudeKind, tuple[str, ...]] = {
     "quaternion": ("qw", "qx", "qy", "qz"),
 }
 _SIGMAS = ("sigma_position_m", "sigma_angle_deg")
-_AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+_AXIS_SIGMAS = ("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_xy_m")
 # What orientation.csv says of images whose place is arbitrary.
 _OWN_FRAME = "own"
 _ANGLE_SIGMAS = ("sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg")
 _ALL_SIGMAS = (*_SIGMAS, *_AXIS_SIGMAS, *_ANGLE_SIGMAS)
 _KNOWN = ("image", *sum([*_POSITIONS.values(), *_ATTITUDES.values()], ()), "camera", "frame", *_ALL_SIGMAS)
 _LONGEST_NAME = 100  # characters of a column
+
+
+def _axis_names(column: str, *axes: str) -> dict[str, str]:
+    """Other names of a standard deviation's column: std_x, sd_x, sdx, x_accuracy, easting_rms, ..."""
+    words = ("sigma", "std", "sd", "rms", "accuracy")
+    joined = {f"{word}_{axis}" for word in words for axis in axes} | {
+        f"{axis}_{word}" for word in words for axis in axes
+    }
+    return dict.fromkeys(sorted(joined | {f"sd{axis}" for axis in axes} | {f"{name}_m" for name in joined}), column)
+
+
 _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
-    **dict.fromkeys(("sde", "std_e", "sigma_x"), "sigma_x_m"),
-    **dict.fromkeys(("sdn", "std_n", "sigma_y"), "sigma_y_m"),
-    **dict.fromkeys(("sdu", "std_u", "sigma_z"), "sigma_z_m"),
+    **_axis_names("sigma_x_m", "x", "e", "easting"),
+    **_axis_names("sigma_y_m", "y", "n", "northing"),
+    **_axis_names("sigma_z_m", "z", "u", "elevation", "vertical", "vert", "altitude"),
+    **_axis_names("sigma_xy_m", "xy", "horizontal", "horz"),
+    **{"hrms": "sigma_xy_m", "vrms": "sigma_z_m", "gpsxyaccuracy": "sigma_xy_m", "gpszaccuracy": "sigma_z_m"},
     **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
 }
@@ -92,7 +107,8 @@ class PoseRow:
     says; None with "none". camera: "" where not given. forward: of yaw, pitch, roll, whether the optical axis is body x
     (gimbal) or down (nadir) at zero angles; None where the format leaves it open. true_north: angles and quaternions of
     grid positions count from true north instead of grid north; those of latitudes and longitudes, too. numbered: the
-    image is named by its running number alone.
+    image is named by its running number alone. sigmas_m: standard deviations to the east, to the north and of the
+    height.
     """
 
     image: str
@@ -102,11 +118,16 @@ class PoseRow:
     attitude: tuple[float, ...] | None
     attitude_kind: AttitudeKind
     camera: str = ""
-    sigma_position_m: float | None = None
+    sigmas_m: Sigmas | None = None
     sigma_angle_deg: float | None = None
     forward: bool | None = None
     true_north: bool = False
     numbered: bool = False
+
+    @property
+    def sigma_position_m(self) -> float | None:
+        """The root mean square of those of the axes."""
+        return None if self.sigmas_m is None else overall_sigma_m(self.sigmas_m)
 
 
 @dataclass(frozen=True)
@@ -329,12 +350,10 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         return tuple(_number(path, number, name, record[name]) for name in names)
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
-    axes = [numbers((name,))[0] for name in _AXIS_SIGMAS if name in record]
+    x_m, y_m, z_m, across_m = (numbers((name,))[0] if name in record else None for name in _AXIS_SIGMAS)
     turns = [value for name in _ANGLE_SIGMAS if name in record and (value := numbers((name,))[0]) is not None]
     if sigmas[1] is None and turns:
         sigmas[1] = max(turns)
-    if sigmas[0] is None and axes and None not in axes:
-        sigmas[0] = max(axis for axis in axes if axis is not None)
     across = _POSITIONS[layout.position_kind][:2]
     x, y = numbers(across)
     height = _POSITIONS[layout.position_kind][2]
@@ -366,7 +385,7 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         attitude=whole or None,
         attitude_kind=layout.attitude_kind if whole else "none",
         camera=record.get("camera", ""),
-        sigma_position_m=sigmas[0],
+        sigmas_m=completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=sigmas[0]),
         sigma_angle_deg=sigmas[1],
         numbered=image.isdigit(),
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, get_args
 
@@ -38,7 +38,8 @@ from aeromatch_cli.blocks.observations import (
 )
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.scan import KINDS, ScanFailure, image_ids
-from aeromatch_cli.data import Camera, Image, Pose
+from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
+from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.angles import Angles
 
@@ -62,7 +63,8 @@ class BlockInputs:
     the ground as the input states it, or None; ground_hint_source: where it came from, in words, "" for None;
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
     deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
-    recognised: what the pose file was read as, and how many images it has, "" without one.
+    recognised: what the pose file was read as, and how many images it has, "" without one. flights, velocities: as in
+    `sorties`. relative_heights_m: image_id -> height above the take-off point.
     """
 
     images: tuple[Image, ...]
@@ -79,6 +81,9 @@ class BlockInputs:
     warnings: tuple[str, ...]
     failures: tuple[ReadFailure, ...]
     recognised: str = ""
+    flights: Mapping[str, str] = field(default_factory=dict)
+    velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +170,11 @@ def block_inputs(
     hint_z_m, hint_source = stated or _relative_ground({} if _all_level(located) else named_poses, facts)
     angles |= _angles_alone(lists, facts, angles)
     ids = image_ids(facts)
+    images = _images(ids, facts, assignment.camera_ids)
+    captures = captures_of(images, facts, located.poses, located.frame)
+    flight_of = flights(captures)
     return BlockInputs(
-        images=_images(ids, facts, assignment.camera_ids),
+        images=images,
         cameras=assignment.cameras,
         poses={ids[name]: pose for name, pose in named_poses.items()},
         angles={ids[name]: one for name, one in angles.items()},
@@ -180,6 +188,11 @@ def block_inputs(
         warnings=tuple(warnings),
         failures=tuple(sorted(failures)),
         recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
+        flights=flight_of,
+        velocities=velocities(captures, flight_of),
+        relative_heights_m={
+            ids[name]: height_m for name, fact in facts.items() if (height_m := fact.relative_altitude_m) is not None
+        },
     )
 
 

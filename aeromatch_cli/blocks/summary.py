@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from aeromatch_cli.blocks.plausibility import warnings_of
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.geometry.rotations import tilt_deg
 
 
@@ -18,8 +20,9 @@ from aeromatch_cli.geometry.rotations import tilt_deg
 class BlockSummary:
     """Figures of a block; NaN where nothing is known. Heights are above the ground below each camera.
 
-    extent_m: east-west and north-south extent of the projection centres. best_overlap: mean over the paired images of
-    the overlap with their best neighbour. warnings: one sentence each: what, which images, what to do.
+    metric: whether lengths are metres; else the frame is the pictures' own. extent_m: east-west and north-south extent
+    of the projection centres. best_overlap: mean over the paired images of the overlap with their best neighbour.
+    warnings: one sentence each: what, which images, what to do.
     """
 
     images: int
@@ -27,6 +30,7 @@ class BlockSummary:
     positioned: int
     oriented: int
     crs: str
+    metric: bool
     origin_m: tuple[float, float, float]
     ground_source: str
     flying_height_m: tuple[float, float, float]
@@ -53,16 +57,21 @@ class BlockSummary:
         low, median, high = self.flying_height_m
         east, north = self.extent_m
         found = [f"ground           {self.ground_source or 'unknown'}"]
+        length = partial(length_words, metric=self.metric)
+        if not self.metric:
+            found.append("scale            arbitrary: no position ties the frame to metres, or to north")
         if self.positioned:
-            found.append(f"extent           {east:.1f} m east-west, {north:.1f} m north-south")
+            along = ("east-west", "north-south") if self.metric else ("along x", "along y")
+            found.append(f"extent           {length(east)} {along[0]}, {length(north)} {along[1]}")
         if np.isfinite(median):
-            found.append(f"flying height    {median:.1f} m ({low:.1f} to {high:.1f}) above ground")
+            found.append(f"flying height    {length(median)} ({low:.1f} to {high:.1f}) above ground")
         if np.isfinite(self.mean_tilt_deg):
             found.append(
                 f"tilt             {self.mean_tilt_deg:.1f} degrees on average, {self.max_tilt_deg:.1f} at most"
             )
         if np.isfinite(self.gsd_m):
-            found.append(f"ground sampling  {100.0 * self.gsd_m:.2f} cm per pixel")
+            spacing = f"{100.0 * self.gsd_m:.2f} cm" if self.metric else length(self.gsd_m, 4)
+            found.append(f"ground sampling  {spacing} per pixel")
         if self.positioned < self.images:
             found.append(f"without position {self.images - self.positioned}: paired by name and time")
         if self.oriented < self.positioned:
@@ -79,10 +88,12 @@ class BlockSummary:
         return found
 
     def figures(self) -> dict[str, Any]:
-        """Every field, JSON-ready: pairs_by_reason as a mapping, None for what is unknown."""
-        return {key: _plain(value) for key, value in asdict(self).items()} | {
-            "pairs_by_reason": dict(self.pairs_by_reason)
-        }
+        """Every field, JSON-ready: pairs_by_reason as a mapping, None for what is unknown, and for lengths that are no
+        metres."""
+        found = {key: _plain(value) for key, value in asdict(self).items()}
+        if not self.metric:
+            found |= dict.fromkeys(("flying_height_m", "gsd_m", "extent_m"))
+        return found | {"pairs_by_reason": dict(self.pairs_by_reason)}
 
 
 def _plain(value: Any) -> Any:
@@ -116,6 +127,7 @@ def summarise(block: Block, pairs: Sequence[Pair] | None = None) -> BlockSummary
         positioned=len(poses),
         oriented=len(tilts),
         crs=block.crs,
+        metric=block.metric,
         origin_m=block.origin_m,
         ground_source=block.ground_source,
         flying_height_m=(low, median, high),

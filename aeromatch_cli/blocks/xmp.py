@@ -1,9 +1,12 @@
-"""What aircraft write into the XMP of their pictures: angles of the camera, positions.
+"""What aircraft write into the XMP of their pictures: angles of the camera, positions, speed, serial number.
 
 Angles come from the camera's tags, never the aircraft's (Flight*Degree): DJI's and newer Autels' Gimbal*Degree,
 Skydio's CameraOrientationNED and Parrot's Camera*Degree count from level (`gimbal`: pitch -90 looks down);
 Camera:Yaw, Pitch, Roll of the Pix4D namespace (senseFly, MicaSense, Sequoia, older Autels, integrators of Sony
 cameras) from straight down with the image's top to the north (`nadir`). Yaw is against true north in all.
+
+DJI's FlightXSpeed, FlightYSpeed and FlightZSpeed are those of the aircraft to true north, to the east and, in the
+same axes as its angles (NED), down, in metres per second (Mavic 3E and Zenmuse P1 user manuals, list of XMP fields).
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ LONGITUDES = (
     "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude", "drone-skydio:Longitude",
 )  # fmt: skip
 ALTITUDES = ("drone-dji:AbsoluteAltitude", "drone-skydio:AbsoluteAltitude")
+_SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber")
 _PREFIXES = ("drone-dji", "drone-skydio", "drone-parrot")
+_BAND = "BandName"
 # Structures whose members carry the names of others.
 _STRUCTURE = "CameraOrientationNED"
 _MEMBERS = ("Yaw", "Pitch", "Roll")
@@ -71,7 +76,10 @@ def xmp_properties(packet: Any, notes: list[str]) -> dict[str, str]:
 
 
 def _add(properties: dict[str, str], element: Any, inside: str = "") -> None:
-    for name, value in [*element.attrib.items(), (element.tag, element.text or "")]:
+    text = element.text or ""
+    if element.tag.endswith(_BAND):  # a list
+        text = text.strip() or ",".join(part.text or "" for part in element.iter() if part.tag.endswith("}li"))
+    for name, value in [*element.attrib.items(), (element.tag, text)]:
         namespace, _, local = name.rpartition("}")
         prefix = _prefix(namespace)
         if prefix and value.strip():
@@ -96,6 +104,23 @@ def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
             yaw, pitch, roll = (float(value) for value in values if value is not None)
             return CameraAngles(yaw, pitch, roll, convention)
     return None
+
+
+def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
+    """Of the aircraft to true north, to the east and down, metres per second; None where XMP does not state all."""
+    north, east, down = (tag_number(xmp.get(f"drone-dji:Flight{axis}Speed")) for axis in "XYZ")
+    return None if north is None or east is None or down is None else (north, east, down)
+
+
+def xmp_band(xmp: Mapping[str, str]) -> str:
+    """Name of the band of a multispectral camera, "" where XMP states none, or several: those of a colour picture."""
+    band = xmp.get(f"Camera:{_BAND}", "") or xmp.get(f"drone-dji:{_BAND}", "")
+    return "" if "," in band else band
+
+
+def xmp_serial(xmp: Mapping[str, str]) -> str:
+    """Serial number of the aircraft, "" where XMP states none."""
+    return next((xmp[name] for name in _SERIALS if xmp.get(name, "").strip("0 ")), "")
 
 
 def tag_number(value: Any) -> float | None:

@@ -48,7 +48,7 @@ class _Commands(TyperGroup):
 
 
 # Options whose value is a place: an unset variable of a script leaves it empty, and that would be the current folder.
-_PLACES = ("workspace", "images", "poses", "cameras", "masks", "gcp", "ground", "out", "truth", "log-file")
+_PLACES = ("workspace", "images", "poses", "cameras", "masks", "gcp", "gcp-marks", "ground", "out", "truth", "log-file")
 
 
 def _refuse_empty(written: list[str]) -> None:

@@ -92,7 +92,10 @@ def synth(
         ),
     ] = None,
     lens: Annotated[
-        str, typer.Option("--lens", metavar="MODEL", help="Camera model by COLMAP's name: PINHOLE, RADIAL, OPENCV ...")
+        str,
+        typer.Option(
+            "--lens", metavar="MODEL", help="Camera model: PINHOLE, RADIAL, OPENCV, BROWN, OPENCV_FISHEYE ..."
+        ),
     ] = "SIMPLE_RADIAL",
     sun: Annotated[
         str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first flight, degrees.")

@@ -122,7 +122,29 @@ ControlFile = Annotated[
         envvar="AEROMATCH_GCP",
         show_envvar=False,
         rich_help_panel=_BLOCK,
-        help="Ground control points (ODM's gcp_list.txt) to compare the result with.",
+        help="Ground control points: ODM's gcp_list.txt, or a file of Pix4D or Metashape.",
+    ),
+]
+ControlMarks = Annotated[
+    Path | None,
+    typer.Option(
+        "--gcp-marks",
+        metavar="FILE",
+        envvar="AEROMATCH_GCP_MARKS",
+        show_envvar=False,
+        rich_help_panel=_BLOCK,
+        help="Their image measurements where these stand in a file of their own.",
+    ),
+]
+ControlPurpose = Annotated[
+    str | None,
+    typer.Option(
+        "--gcp-use",
+        metavar="adjust|check",
+        envvar="AEROMATCH_GCP_USE",
+        show_envvar=False,
+        rich_help_panel=_BLOCK,
+        help="Use control points for the fit (default), or all as check points.",
     ),
 ]
 WorkspaceDir = Annotated[

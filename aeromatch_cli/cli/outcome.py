@@ -33,7 +33,11 @@ class PairsFacts(Facts):
 
     images: int | None = Field(None, description="Images of the block.")
     summary: list[str] = Field([], description="What is printed of the block, line by line.")
-    block: dict[str, Any] = Field({}, description="The same in figures: crs, gsd_m, flying_height_m, pairs ...")
+    block: dict[str, Any] = Field(
+        {},
+        description="The same in figures: crs, gsd_m, flying_height_m, pairs ... With metric: false the scale is "
+        "arbitrary, and lengths are null.",
+    )
     warnings: list[str] = Field([], description="What a person should look at.")
 
 
@@ -61,9 +65,12 @@ class AdjustFacts(Facts):
     points: int | None = Field(None, description="Points in space.")
     track_length: float | None = Field(None, description="Images per point, mean.")
     reprojection_error_px: float | None = Field(None, description="Mean, pixels.")
-    sigma_position_m: float | None = Field(None, description="Standard deviation of the positions, metres, median.")
+    sigma_position_m: float | None = Field(None, description="Of the positions, metres, median; null without metres.")
     sigma_angle_deg: float | None = Field(None, description="Of the attitudes, degrees, median.")
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
+    residuals: dict[str, Any] = Field(
+        {}, description="Adjusted less given positions and attitudes: rms, median, worst image; see residuals.csv."
+    )
 
 
 class RefineFacts(Facts):

@@ -13,6 +13,8 @@ from aeromatch_cli.cli.options import (
     Cameras,
     Config,
     ControlFile,
+    ControlMarks,
+    ControlPurpose,
     Crs,
     ExecutorName,
     Ground,
@@ -142,6 +144,8 @@ def stage_command(name: str) -> Callable[..., None]:
         ground: Ground = None,
         masks: Masks = None,
         gcp: ControlFile = None,
+        gcp_marks: ControlMarks = None,
+        gcp_use: ControlPurpose = None,
         workspace: WorkspaceDir = None,
         set_: Set = None,
         max_size: MaxSize = None,
@@ -157,7 +161,8 @@ def stage_command(name: str) -> Callable[..., None]:
         quiet: Quiet = False,
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
-        block |= {"pose_format": pose_format, "masks": masks, "gcp": gcp, "max_size_px": max_size}
+        block |= {"pose_format": pose_format, "masks": masks, "max_size_px": max_size}
+        block |= {"gcp": gcp, "gcp_marks": gcp_marks, "gcp_use": gcp_use}
         run = {"jobs": jobs, "memory": memory, "executor": executor, "keep_images": keep_images or None}
         run |= {"scheduler": scheduler, "executor": executor or ("dask" if scheduler else None)}
 

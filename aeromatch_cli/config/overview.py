@@ -184,7 +184,7 @@ block:
   ground: auto
   # Folder of masks in COLMAP's naming, or one mask for all images.
   # masks: masks
-  # Ground control points (ODM's gcp_list.txt).
+  # Ground control points (ODM's gcp_list.txt, or files of Pix4D or Metashape).
   # gcp: gcp_list.txt
 
 # More keypoints: more matches, more time.

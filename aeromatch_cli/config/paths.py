@@ -10,7 +10,7 @@ from typing import Any
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.strategies import Strategy
 
-PATH_KEYS = ("images", "poses", "cameras", "ground", "masks", "gcp")
+PATH_KEYS = ("images", "poses", "cameras", "ground", "masks", "gcp", "gcp_marks")
 
 _WORDS = {"poses": ("exif", "none"), "cameras": ("exif", "folder"), "ground": ("auto",)}
 

@@ -67,8 +67,8 @@ class BlockSettings(_Section):
     )
     cameras: str = Field(
         "exif",
-        description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, focal length and size); or "
-        "`folder` (one camera per folder).",
+        description="COLMAP cameras.txt, YAML or JSON; `exif` (grouped by make, model, serial number, lens, band, "
+        "focal length and size); or `folder` (one camera per folder).",
     )
     crs: str = Field(
         "auto",
@@ -86,8 +86,18 @@ class BlockSettings(_Section):
     )
     gcp: str = Field(
         "",
-        description="Ground control points in the layout of ODM's gcp_list.txt; the adjusted block is compared with "
-        "them.",
+        description="Ground control points: ODM's gcp_list.txt, Pix4D's or Metashape's coordinates (CSV), or "
+        "Metashape's markers (XML).",
+    )
+    gcp_marks: str = Field(
+        "",
+        description="Image measurements of the control points where they stand in a file of their own (image, label, "
+        "x, y); empty: the one beside the coordinates.",
+    )
+    gcp_use: Literal["adjust", "check"] = Field(
+        "adjust",
+        description="What control points are for: the fit, except those that are marked as check points (adjust), or "
+        "none of them (check).",
     )
     angles: Literal["auto", "gimbal", "nadir"] = Field(
         "auto",

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, IntArray, Pose
-from aeromatch_cli.geometry.cameras import parameters, undistort
+from aeromatch_cli.geometry.cameras import poselib_camera, undistort, without_skew
 from aeromatch_cli.geometry.epipolar import relative_pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
 
@@ -112,7 +111,12 @@ def pose_error_deg(
         "max_iterations": _POSE_ITERATIONS[1],
     }
     found, _ = poselib.estimate_relative_pose(
-        points0[usable], points1[usable], _pinhole(camera0), _pinhole(camera1), ransac, {}
+        without_skew(camera0, points0[usable]),
+        without_skew(camera1, points1[usable]),
+        poselib_camera(camera0),
+        poselib_camera(camera1),
+        ransac,
+        {},
     )
     rotation, translation = relative_pose(pose0, pose1)
     return angle_between_deg(np.asarray(found.R), rotation), _direction_angle_deg(np.asarray(found.t), translation)
@@ -123,10 +127,3 @@ def _direction_angle_deg(found: FloatArray, true: FloatArray) -> float:
         return float("nan")
     across, along = float(np.linalg.norm(np.cross(found, true))), float(found @ true)
     return float(np.rad2deg(np.arctan2(across, along)))
-
-
-def _pinhole(camera: Camera) -> dict[str, Any]:
-    """The camera of undistorted pixels, in PoseLib's words."""
-    p = parameters(camera)
-    size = {"width": camera.width_px, "height": camera.height_px}
-    return {"model": "PINHOLE", "params": [p["fx"], p["fy"], p["cx"], p["cy"]], **size}

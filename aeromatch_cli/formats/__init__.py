@@ -23,6 +23,8 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 - `format_version`: 1.
 - `crs`: code of the CRS, or `local`. `origin_m`: [x, y, z] that is subtracted from it. `given_crs`, `given_origin_m`:
   those of the given positions, which differ where the orientation could not use them.
+- `metric`: whether lengths are metres; false in a frame of the pictures' own, whose scale is arbitrary: there every
+  length of the workspace, whatever its name, counts in units of that frame.
 - `ground_source`: where the ground height comes from, in words. `ground_z_m`: world height, null with a DEM or none.
 - `gsd_m`: common ground sampling distance of the views, metres per pixel; null without attitudes.
 - `ground_fingerprint`: of the setting that the ground comes from.
@@ -42,8 +44,8 @@ One line per image: `image_id` (unique slug of the relative path), `name` (relat
 
 ### cameras.csv
 
-`camera_id`, `model` (COLMAP's name), `width_px`, `height_px`, `params`: separated by spaces, in COLMAP's order. cx and
-cy are in this workspace's pixel frame (COLMAP's minus 0.5).
+`camera_id`, `model` (COLMAP's name, or BROWN), `width_px`, `height_px`, `params`: separated by spaces, in the order of
+cameras.md. cx and cy are in this workspace's pixel frame (COLMAP's minus 0.5).
 
 ### poses.csv
 
@@ -98,15 +100,29 @@ CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_
 are not known, too small in blocks of more than 1,500 images, where each is taken with the others as known; `camera`:
 camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary,
 standard deviations hold within the group), or `predicted` of an image that is not oriented: the position given, the
-attitude given or that of its strip, empty where nothing is known.
+attitude given or that of its strip, empty where nothing is known; `unit`: of all lengths of the line, `m`, or
+`arbitrary` in a frame of its own.
+
+### orientation/residuals.csv
+
+Written by `adjust`: the adjusted block beside what was given, and how well its images fit their points. One line per
+adjusted image: `image` (its name); `dx_m`, `dy_m`, `dz_m`: adjusted less given position; `rotation_x_deg`,
+`rotation_y_deg`, `rotation_z_deg`: rotation vector about the axes of the world that turns the given attitude into the
+adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in standard deviations
+of what was given. All are empty where nothing was given, and in a frame of its own. `error_px`: mean reprojection
+error; `points`: of the image; `images_per_point`: how many images see them, mean.
 
 ### orientation/adjusted.json
 
-- `fingerprint`; `files`: SHA-256 of `adjusted.npz` and `orientation.csv`.
+- `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
 - `facts`: `images`, `points`, `track_length` (images per point, mean), `reprojection_error_px` (mean),
-  `sigma_position_m`, `sigma_angle_deg` (medians over the images), `groups` (the same figures of each), `outside`
+  `sigma_position_m` (median over the images whose frame has metres, else null), `sigma_angle_deg` (median), `groups`
+  (the same figures of each), `outside`
   (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
-  `control` (errors at ground control points, or null).
+  `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
+  `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
+  (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was
+  given; `positions`, `rotations`: how many were compared; `error_px_median`, `error_px_worst`: of the images' means.
 
 ### orientation/adjusted.npz
 
@@ -166,7 +182,7 @@ enhanced have none.
 ### simulated/<id>/views.json, <view>.png
 
 - `fingerprint`, `files`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views
-  were made of.
+  were made of. `remark`: why another ground than the terrain below the image is looked at, else empty.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
   With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image, a few pixels
@@ -288,7 +304,8 @@ the page tells of. Both hold SHA-256 digests; what differs is made again.
 `database.db` and `sparse/{cameras,images,points3D}.txt` in COLMAP's own formats and pixel frame (this workspace's plus
 0.5). `sparse/` holds the adjusted block: cameras, oriented images with their keypoints, and triangulated points with
 their tracks; without orientation the given poses alone. The pose priors of the database are the given positions.
-`orientation.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here plus the origin.
+`orientation.csv`, `residuals.csv`: as above. `world.json`: `crs`, `origin_m`; a coordinate in the CRS is the one here
+plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 """
 
 

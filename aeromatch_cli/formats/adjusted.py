@@ -77,7 +77,8 @@ def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
     """orientation.csv: one line per image of known place, in the block's CRS.
 
     x, y, z: projection centre, metres. omega, phi, kappa: degrees, photogrammetric, against the grid of the CRS.
-    sigma_*: their standard deviations. frame: "world"; "own N" of images in a frame of their own, whose place, north
+    sigma_*: their standard deviations. unit: of all lengths of the line, "m", or "arbitrary" in a frame whose scale is.
+    frame: "world"; "own N" of images in a frame of their own, whose place, north
     and scale are arbitrary; "predicted" of images that are not oriented, by the pose that is known of them.
     """
     header = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
@@ -99,8 +100,9 @@ def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
         deviations = [float(f"{v:.3g}") for v in sigmas[:3]] + [
             "" if rotation is None else float(f"{v:.3g}") for v in sigmas[3:]
         ]
-        rows.append((image.name, *place, *angles, *deviations, image.camera_id, frame))
-    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame"), rows)
+        unit = "m" if block.metric and not frame.startswith("own") else "arbitrary"
+        rows.append((image.name, *place, *angles, *deviations, image.camera_id, frame, unit))
+    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame", "unit"), rows)
 
 
 def _rows(values: list[FloatArray]) -> FloatArray:

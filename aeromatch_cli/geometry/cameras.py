@@ -20,6 +20,10 @@ from the axis (Kannala and Brandt, IEEE TPAMI 28(8), 2006). docs/cameras.md has 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray
@@ -27,6 +31,9 @@ from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 
 BROWN = "BROWN"
 FISHEYE = "OPENCV_FISHEYE"
+# COLMAP's model with k3; its last three terms divide, which no model here does.
+FULL_OPENCV = "FULL_OPENCV"
+FULL_OPENCV_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # Model name -> parameter names, in COLMAP's order where COLMAP has the model.
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -40,6 +47,8 @@ MODELS: dict[str, tuple[str, ...]] = {
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 _MAX_ITERATIONS = 50
+# The inverse of a squared radius beyond everything that a camera sees.
+_LEAST_ROOT = 1e-12
 
 
 def parameters(camera: Camera) -> dict[str, float]:
@@ -57,9 +66,14 @@ def as_brown(camera: Camera) -> Camera:
     """The same camera as BROWN. Raises ValueError for a fisheye lens, which BROWN does not describe."""
     if is_fisheye(camera):
         raise ValueError(f"{FISHEYE} is no special case of {BROWN}")
-    p = parameters(camera)
-    values = {**p, "f": p["fy"], "b1": p["fx"] - p["fy"], "b2": p["skew"]}
-    return Camera(BROWN, camera.width_px, camera.height_px, tuple(values[name] for name in MODELS[BROWN]))
+    return brown_camera((camera.width_px, camera.height_px), parameters(camera))
+
+
+def brown_camera(size_px: tuple[int, int], values: Mapping[str, float]) -> Camera:
+    """BROWN of fx, fy, cx, cy and, where they are not zero, skew, k1 to k3, p1, p2. size_px: width, height."""
+    f = values["fy"]
+    named = {**values, "f": f, "b1": values["fx"] - f, "b2": values.get("skew", 0.0)}
+    return Camera(BROWN, *size_px, tuple(named.get(name, 0.0) for name in MODELS[BROWN]))
 
 
 def is_fisheye(camera: Camera) -> bool:
@@ -104,11 +118,16 @@ def _distort_normalised(p: dict[str, float], uv: FloatArray) -> FloatArray:
     return np.stack([u * radial + du, v * radial + dv], axis=1)
 
 
+# A block has few lenses, and asks for each again and again.
+@lru_cache(maxsize=4096)
 def _smallest_root(coefficients: tuple[float, ...]) -> float:
-    """The smallest s > 0 where 1 + c1 s + c2 s^2 + ... is zero, inf where there is none."""
-    roots = np.roots([*reversed(coefficients), 1.0])
-    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots.real), 1.0)) & (roots.real > 0.0)]
-    return float(real.min(initial=np.inf))
+    """The smallest s > 0 where 1 + c1 s + c2 s^2 + ... is zero, inf where there is none.
+
+    As one over the largest root of s^n + c1 s^(n-1) + ..., whose leading coefficient is never near zero.
+    """
+    roots = np.roots([1.0, *coefficients])
+    largest = float(roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)].max(initial=0.0))
+    return 1.0 / largest if largest > _LEAST_ROOT else float("inf")
 
 
 def _largest_radius(p: dict[str, float]) -> float:
@@ -127,9 +146,7 @@ def _fisheye_radius(p: dict[str, float], angle: FloatArray) -> FloatArray:
 
 def _fisheye_slope(p: dict[str, float], angle: FloatArray) -> FloatArray:
     square = angle * angle
-    return 1.0 + square * (
-        3.0 * p["k1"] + square * (5.0 * p["k2"] + square * (7.0 * p["k3"] + square * 9.0 * p["k4"]))
-    )
+    return 1.0 + square * (3.0 * p["k1"] + square * (5.0 * p["k2"] + square * (7.0 * p["k3"] + square * 9.0 * p["k4"])))
 
 
 def _largest_angle(p: dict[str, float]) -> float:
@@ -181,7 +198,7 @@ def _from_brown(p: dict[str, float], target: FloatArray) -> FloatArray:
         residual = _distort_normalised(p, uv) - target
         step = _solve_2x2(_distortion_jacobian(p, uv), residual)
         uv = uv - step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-13:
+        if not np.fmax.reduce(np.abs(step), axis=None, initial=0.0) > 1e-13:
             break
     bad = (np.abs(_distort_normalised(p, uv) - target) > 1e-9).any(axis=1)
     bad |= np.hypot(uv[:, 0], uv[:, 1]) > _largest_radius(p)
@@ -192,14 +209,18 @@ def _from_brown(p: dict[str, float], target: FloatArray) -> FloatArray:
 def _from_fisheye(p: dict[str, float], target: FloatArray) -> FloatArray:
     radius = np.hypot(target[:, 0], target[:, 1])
     most = _largest_angle(p)
+    low, high = np.zeros_like(radius), np.full_like(radius, most)
     angle = np.minimum(radius, most)
     for _ in range(_MAX_ITERATIONS):
-        slope = _fisheye_slope(p, angle)
-        step = (_fisheye_radius(p, angle) - radius) / np.where(slope > 1e-6, slope, 1e-6)
-        angle = np.clip(angle - step, 0.0, most)
-        if not np.abs(step).max(initial=0.0) > 1e-13:
+        off = _fisheye_radius(p, angle) - radius
+        low, high = np.where(off < 0.0, angle, low), np.where(off > 0.0, angle, high)
+        newton = angle - off / np.maximum(_fisheye_slope(p, angle), 1e-6)
+        # A step that leaves the interval which holds the angle halves it instead.
+        best = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        step, angle = best - angle, best
+        if not np.fmax.reduce(np.abs(step), initial=0.0) > 1e-13:
             break
-    bad = (np.abs(_fisheye_radius(p, angle) - radius) > 1e-9) | (angle >= np.pi / 2.0 - 1e-6)
+    bad = ~(np.abs(_fisheye_radius(p, angle) - radius) < 1e-9) | (angle >= np.pi / 2.0 - 1e-6)
     uv = _scaled_to(target, radius, np.tan(np.where(bad, 0.0, angle)))
     uv[bad] = np.nan
     return uv
@@ -231,6 +252,15 @@ def normalise(camera: Camera, points_px: FloatArray) -> FloatArray:
     return _normalised(parameters(camera), undistort(camera, points_px))
 
 
+def pixels_of_rays(camera: Camera, rays: FloatArray) -> FloatArray:
+    """Stored pixels (N, 2) of normalised coordinates (N, 2) by the formula alone, beyond where it folds back too."""
+    p = parameters(camera)
+    if is_fisheye(camera):
+        radius = np.hypot(rays[:, 0], rays[:, 1])
+        return _pixels(p, _scaled_to(rays, radius, _fisheye_radius(p, np.arctan(radius))))
+    return _pixels(p, _distort_normalised(p, rays))
+
+
 def project(camera: Camera, world_rotation: FloatArray, center_m: FloatArray, points_m: FloatArray) -> FloatArray:
     """Stored pixels (N, 2) of world points (N, 3); NaN behind the camera or outside the lens model."""
     rays = (np.asarray(points_m, dtype=np.float64) - center_m) @ np.asarray(world_rotation).T
@@ -246,20 +276,63 @@ def world_rays(camera: Camera, world_rotation: FloatArray, points_px: FloatArray
 
 
 def from_colmap(model: str, width_px: int, height_px: int, params: tuple[float, ...]) -> Camera:
-    """Camera of COLMAP parameters (corner origin). Raises ValueError on an unknown model or a wrong count."""
-    if model not in MODELS:
-        raise ValueError(f"camera model {model!r} is not supported; use one of {', '.join(MODELS)}")
-    names = MODELS[model]
+    """Camera of COLMAP parameters (corner origin), FULL_OPENCV without dividing terms as BROWN.
+
+    Raises ValueError on an unknown model, a wrong count, and FULL_OPENCV with k4, k5 or k6 (see lenses.of_colmap).
+    """
+    names = FULL_OPENCV_NAMES if model == FULL_OPENCV else MODELS.get(model)
+    if names is None:
+        known = ", ".join((*MODELS, FULL_OPENCV))
+        raise ValueError(f"camera model {model!r} is not supported; use one of {known}")
     if len(params) != len(names):
         raise ValueError(f"camera model {model} has the {len(names)} parameters {', '.join(names)}, got {len(params)}")
     shifted = tuple(v - COLMAP_OFFSET_PX if n in ("cx", "cy") else v for n, v in zip(names, params, strict=True))
-    return Camera(model, width_px, height_px, shifted)
+    if model != FULL_OPENCV:
+        return Camera(model, width_px, height_px, shifted)
+    if any(params[9:]):
+        raise ValueError(f"{BROWN} has no place for the terms k4, k5, k6 of {FULL_OPENCV}, which divide")
+    return brown_camera((width_px, height_px), dict(zip(names, shifted, strict=True)))
+
+
+def corner_params(camera: Camera) -> tuple[float, ...]:
+    """Parameters of the camera's own model with the corner of the first pixel as origin: of a camera file."""
+    names = MODELS[camera.model]
+    return tuple(v + COLMAP_OFFSET_PX if n in ("cx", "cy") else v for n, v in zip(names, camera.params, strict=True))
+
+
+def colmap_camera(camera: Camera) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters (corner origin). BROWN becomes OPENCV, or FULL_OPENCV where it has k3.
+
+    COLMAP has no place for b2, which is left out: lenses.nearest_of finds the camera without it that comes nearest.
+    """
+    if camera.model != BROWN:
+        return camera.model, corner_params(camera)
+    named = parameters(camera) | {"k4": 0.0, "k5": 0.0, "k6": 0.0}
+    named |= {"cx": named["cx"] + COLMAP_OFFSET_PX, "cy": named["cy"] + COLMAP_OFFSET_PX}
+    model, names = (FULL_OPENCV, FULL_OPENCV_NAMES) if named["k3"] else ("OPENCV", MODELS["OPENCV"])
+    return model, tuple(named[name] for name in names)
 
 
 def colmap_params(camera: Camera) -> tuple[float, ...]:
-    """Parameters in COLMAP's corner-origin frame."""
-    names = MODELS[camera.model]
-    return tuple(v + COLMAP_OFFSET_PX if n in ("cx", "cy") else v for n, v in zip(names, camera.params, strict=True))
+    """Parameters of colmap_camera."""
+    return colmap_camera(camera)[1]
+
+
+def poselib_camera(camera: Camera) -> dict[str, Any]:
+    """The camera of undistorted pixels in PoseLib's words, which know no skew: of pixels by without_skew."""
+    p = parameters(camera)
+    size = {"width": camera.width_px, "height": camera.height_px}
+    return {"model": "PINHOLE", "params": [p["fx"], p["fy"], p["cx"], p["cy"]], **size}
+
+
+def without_skew(camera: Camera, undistorted_px: FloatArray) -> FloatArray:
+    """Undistorted pixels (N, 2) as a camera without skew would have them, all else the same."""
+    p = parameters(camera)
+    if p["skew"] == 0.0:
+        return undistorted_px
+    points = np.array(undistorted_px, dtype=np.float64)
+    points[:, 0] -= p["skew"] * (points[:, 1] - p["cy"]) / p["fy"]
+    return points
 
 
 def resized(camera: Camera, scale: float, width_px: int, height_px: int) -> Camera:

@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Ground, Pose
 from aeromatch_cli.geometry.cameras import focal_px, normalise
+from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.geometry.rotations import tilt_deg
 from aeromatch_cli.geometry.warps import border_px
 
 # Ground farther away than this many flying heights is seen at less than 11 degrees: too flat to match.
 MAX_DISTANCE_FACTOR = 5.0
 
+# Ground that an image sees so many times finer than usual, and than the plane of the images around it, is no ground
+# but a wrong height near the camera. How many images around count.
+_LEAST_SHARE, _IMAGES_AROUND = 0.25, 8
 _BORDER_POINTS_PER_SIDE = 8
 _CUT_SIDES = 32
 
@@ -30,7 +34,7 @@ class Footprint:
 
     polygon_m: (N, 2) world x, y, in the order of the image border. ground_z_m: height of the plane it lies on.
     middle_m: (3,) centroid of the polygon on that plane. gsd_m: see `ground_sampling_distance_m`.
-    tilt_deg: angle between the optical axis and straight down.
+    tilt_deg: angle between the optical axis and straight down. degenerate: the terrain's own plane, which was not used.
     """
 
     polygon_m: FloatArray
@@ -38,6 +42,19 @@ class Footprint:
     middle_m: FloatArray
     gsd_m: float
     tilt_deg: float
+    degenerate: Degenerate | None = None
+
+
+@dataclass(frozen=True)
+class Degenerate:
+    """A plane of the terrain that reaches up to the camera, or above it: a wrong terrain, or a camera beside a wall.
+
+    ground_z_m: world height of the terrain. width_px, height_px: of the ground view that it would make.
+    """
+
+    ground_z_m: float
+    width_px: int
+    height_px: int
 
 
 @functools.lru_cache(maxsize=256)
@@ -166,31 +183,73 @@ def image_footprint(
     polygon = ground_footprint(camera, pose, foot_z, max_distance_factor * (float(pose.center_m[2]) - foot_z))
     if len(polygon) < 3:
         return None
-    ground_z = float(ground.height_m(polygon_centroid_m(polygon)[None])[0])
-    if ground_z != foot_z:
-        polygon = ground_footprint(camera, pose, ground_z, max_distance_factor * (float(pose.center_m[2]) - ground_z))
-    gsd = ground_sampling_distance_m(camera, pose, ground_z, max_distance_factor)
-    if len(polygon) < 3 or gsd is None:
+    return _plane_footprint(
+        camera, pose, float(ground.height_m(polygon_centroid_m(polygon)[None])[0]), max_distance_factor
+    )
+
+
+def _plane_footprint(camera: Camera, pose: Pose, ground_z_m: float, max_distance_factor: float) -> Footprint | None:
+    """The same over a plane."""
+    polygon = ground_footprint(camera, pose, ground_z_m, max_distance_factor * (float(pose.center_m[2]) - ground_z_m))
+    gsd = ground_sampling_distance_m(camera, pose, ground_z_m, max_distance_factor)
+    if len(polygon) < 3 or gsd is None or pose.world_rotation is None:
         return None
-    middle = np.append(polygon_centroid_m(polygon), ground_z)
-    return Footprint(polygon, ground_z, middle, gsd, tilt_deg(pose.world_rotation))
+    middle = np.append(polygon_centroid_m(polygon), ground_z_m)
+    return Footprint(polygon, ground_z_m, middle, gsd, tilt_deg(pose.world_rotation))
 
 
 @functools.lru_cache(maxsize=8)
 def block_footprints(block: Block, max_distance_factor: float = MAX_DISTANCE_FACTOR) -> Mapping[str, Footprint]:
     """Footprints by image_id of every image that has an attitude and sees ground; empty without a ground. Made once of
-    a block: ask for it, do not change it."""
+    a block: ask for it, do not change it.
+
+    Where the terrain reaches up to a camera, but not to those around it, the footprint lies on the median plane of
+    theirs, and says so: that of the terrain would be a few pixels wide.
+    """
     if block.ground is None:
         return {}
+    cameras = {image.image_id: block.camera(image) for image in block.images}
+    poses = {
+        i: pose
+        for i in cameras
+        if (pose := block.poses.get(i)) is not None
+        and pose.world_rotation is not None
+        and np.isfinite(pose.center_m).all()
+    }
     found = {}
-    for image in block.images:
-        pose = block.poses.get(image.image_id)
-        if pose is None or not np.isfinite(pose.center_m).all():
-            continue
-        footprint = image_footprint(block.camera(image), pose, block.ground, max_distance_factor)
+    for image_id, pose in poses.items():
+        footprint = image_footprint(cameras[image_id], pose, block.ground, max_distance_factor)
         if footprint is not None:
-            found[image.image_id] = footprint
-    return found
+            found[image_id] = footprint
+    least_m = _LEAST_SHARE * (common_gsd_m(found) or 0.0)
+    sound = {i: footprint for i, footprint in found.items() if footprint.gsd_m >= least_m}
+    for image_id in poses.keys() - sound.keys() if sound else ():
+        pose, terrain = poses[image_id], found.get(image_id)
+        z_m = float(block.ground.height_m(pose.center_m[None, :2])[0]) if terrain is None else terrain.ground_z_m
+        if terrain is None and z_m < pose.center_m[2]:
+            continue  # it looks at the sky
+        plane = _plane_footprint(cameras[image_id], pose, _plane_around_m(pose, poses, sound), max_distance_factor)
+        if plane is not None and (terrain is None or terrain.gsd_m < _LEAST_SHARE * plane.gsd_m):
+            camera = cameras[image_id]
+            share = 0.0 if terrain is None else terrain.gsd_m / plane.gsd_m
+            size = Degenerate(z_m, round(share * camera.width_px), round(share * camera.height_px))
+            found[image_id] = replace(plane, degenerate=size)
+    return {i: found[i] for i in cameras if i in found}
+
+
+def _plane_around_m(pose: Pose, poses: Mapping[str, Pose], footprints: Mapping[str, Footprint]) -> float:
+    """Median ground height of the images nearest to one. footprints: at least one."""
+    centers_m = np.array([poses[i].center_m[:2] for i in footprints])
+    nearest = np.argsort(np.linalg.norm(centers_m - pose.center_m[:2], axis=1), kind="stable")[:_IMAGES_AROUND]
+    heights_m = np.array([footprint.ground_z_m for footprint in footprints.values()])
+    return float(np.median(heights_m[nearest]))
+
+
+def degenerate_words(degenerate: Degenerate, block: Block) -> str:
+    """In words; the height counts in the block's CRS."""
+    height = length_words(degenerate.ground_z_m + block.origin_m[2], 0, metric=block.metric)
+    size = f"{degenerate.width_px}x{degenerate.height_px} px"
+    return f"degenerate ground view ({size}: the terrain there, {height}, is nearly as high as the camera)"
 
 
 def common_gsd_m(footprints: Mapping[str, Footprint], scales: Mapping[str, float] | None = None) -> float | None:

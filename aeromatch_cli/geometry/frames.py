@@ -1,6 +1,7 @@
 """Every frame and unit of the project, stated once, and the 3x3 / 4x4 bookkeeping between them.
 
-World   a projected CRS in metres minus a rounded, recorded origin; float64; x east, y north, z up.
+World   a projected CRS in metres minus a rounded, recorded origin; float64; x east, y north, z up. Without positions a
+        frame of the pictures' own: z up, x and y anyhow, and units of arbitrary length (`Block.metric`).
 Camera  x right, y down, z forward. Poses are `cam_from_world`: x_cam = R x_world + t, centre C = -R^T t.
 Photo   the photogrammetric camera: x right, y up, z back (Kraus; Luhmann et al., Close-Range Photogrammetry).
 Pixel   (x, y); (0, 0) is the centre of the top-left pixel of the stored raster. EXIF Orientation changes nothing.
@@ -21,6 +22,11 @@ COLMAP_OFFSET_PX = 0.5
 
 # Photogrammetric axes (x right, y up, z back) to computer-vision axes (x right, y down, z forward), and back.
 CAM_FROM_PHOTO = np.diag([1.0, -1.0, -1.0])
+
+
+def length_words(length: float, digits: int = 1, *, metric: bool) -> str:
+    """A length with its unit: metres, but in a frame of arbitrary scale units of that."""
+    return f"{length:,.{digits}f} {'m' if metric else 'units'}"
 
 
 def resize_matrix(scale: float) -> FloatArray:

@@ -111,3 +111,10 @@ def angle_between_deg(rotation0: FloatArray, rotation1: FloatArray) -> float:
 def tilt_deg(world_rotation: FloatArray) -> float:
     """Angle between the optical axis and straight down, degrees."""
     return float(np.rad2deg(np.arccos(np.clip(-world_rotation[2, 2], -1.0, 1.0))))
+
+
+def cross_matrices(vectors: FloatArray) -> FloatArray:
+    """(N, 3, 3) matrices [v]x of vectors (N, 3): [v]x w = v x w."""
+    x, y, z = np.asarray(vectors).T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

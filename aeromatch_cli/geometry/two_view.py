@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, Camera, FloatArray, PairGeometry
-from aeromatch_cli.geometry.cameras import parameters, undistort
+from aeromatch_cli.data import BoolArray, FloatArray, PairGeometry
+from aeromatch_cli.geometry.cameras import poselib_camera, undistort, without_skew
 from aeromatch_cli.geometry.epipolar import essential, fundamental
 
 # Wrong matches that tell the share of 1 % within a band to a sixth; each match is joined with 16 others at most.
@@ -88,8 +88,9 @@ def estimate(
     if model == "fundamental":
         matrix, info = poselib.estimate_fundamental(points0_px, points1_px, options, {})
         return TwoView("F", np.asarray(matrix), np.asarray(matrix), None, np.asarray(info["inliers"], dtype=bool))
-    cameras = [_pinhole(camera) for camera in (geometry.camera0, geometry.camera1)]
-    pose, info = poselib.estimate_relative_pose(points0_px, points1_px, *cameras, options, {})
+    both = (geometry.camera0, geometry.camera1)
+    points = [without_skew(camera, places) for camera, places in zip(both, (points0_px, points1_px), strict=True)]
+    pose, info = poselib.estimate_relative_pose(*points, *map(poselib_camera, both), options, {})
     rotation = np.asarray(pose.R)
     matrix = essential(rotation, np.asarray(pose.t))
     pixel_matrix = fundamental(matrix, geometry.camera0, geometry.camera1)
@@ -142,10 +143,3 @@ def _log10_binomial(n: int, k: int) -> float:
     from math import lgamma, log
 
     return (lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)) / log(10.0)
-
-
-def _pinhole(camera: Camera) -> dict[str, Any]:
-    """The camera of undistorted pixels, in PoseLib's words."""
-    p = parameters(camera)
-    size = {"width": camera.width_px, "height": camera.height_px}
-    return {"model": "PINHOLE", "params": [p["fx"], p["fy"], p["cx"], p["cy"]], **size}

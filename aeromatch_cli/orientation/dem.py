@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, IntArray, Pose
+from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.orientation.judgement import PairPoints, explained_matches, triangulated
 
 # A cell is as wide as holds about this many points; no more cells a side than that.
 _POINTS_PER_CELL = 4.0
@@ -20,6 +22,84 @@ _MIN_POINTS = 12
 _MOST_POINTS = 50_000
 # A terrain of more pictures is the same up to this share of the flying height.
 _SAME_SHARE = 0.02
+# No ground lies nearer below the lowest of so many cameras around it than this share of the flying height, and none
+# farther below than so many flying heights: wrong matches meet anywhere on their rays.
+_NEAREST_SHARE, _FARTHEST, _CAMERAS_AROUND = 0.2, 4.0, 4
+# Heights with a larger standard deviation, as a share of the flying height, say nothing: the rays are near-parallel.
+_LARGEST_SIGMA = 0.05
+# The surroundings of a point are so many places of about so many points each: by area, so that many points of one wrong
+# pair do not speak for them.
+_PLACES, _POINTS_PER_PLACE = 25, 16.0
+# What differs from its surroundings by more than this share of the flying height must be seen by several pairs, which
+# agree up to the second share, or up to so many standard deviations.
+_DEPARTS, _AGREES, _AGREES_SIGMAS = 0.1, 0.04, 3.0
+_PAIRS_THAT_AGREE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPoints:
+    """Points that pairs of oriented images show, some of them wrong.
+
+    points_m: (P, 3) world points. sigmas_m: (P,) standard deviations of their heights. pair_idx: (P,) which pair has
+    shown each.
+    """
+
+    points_m: FloatArray
+    sigmas_m: FloatArray
+    pair_idx: IntArray
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def take(self, which: IntArray | BoolArray | slice) -> GroundPoints:
+        return GroundPoints(self.points_m[which], self.sigmas_m[which], self.pair_idx[which])
+
+    @classmethod
+    def joined(cls, parts: Sequence[GroundPoints]) -> GroundPoints:
+        """Of several sets of pairs, no pair of which is in two."""
+        shifts = np.cumsum([0, *(int(part.pair_idx.max(initial=-1)) + 1 for part in parts)])
+        return cls(
+            np.concatenate([np.zeros((0, 3)), *(part.points_m for part in parts)]),
+            np.concatenate([np.zeros(0), *(part.sigmas_m for part in parts)]),
+            np.concatenate(
+                [np.zeros(0, np.int64), *(p.pair_idx + shift for p, shift in zip(parts, shifts, strict=False))]
+            ),
+        )
+
+
+def ground_points(
+    pairs: Sequence[PairPoints],
+    poses: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    limits_px: Mapping[str, float],
+) -> GroundPoints:
+    """The matches of posed pairs in space, without those that the poses contradict or whose rays are near-parallel.
+
+    cameras, limits_px: by image_id; the second are the largest errors of right matches, stored pixels.
+    """
+    parts = [GroundPoints.joined([])]
+    for pair, points_m in zip(pairs, triangulated(pairs, poses, cameras), strict=True):
+        good = np.isfinite(points_m).all(axis=1) & explained_matches(pair, poses, cameras, limits_px)
+        if good.any():
+            ends = pair.image_id0, pair.image_id1
+            turns = [limits_px[i] / focal_px(cameras[i]) for i in ends]
+            sigmas_m = _height_sigmas_m(points_m[good], [poses[i].center_m for i in ends], turns)
+            parts.append(GroundPoints(points_m[good], sigmas_m, np.zeros(len(sigmas_m), np.int64)))
+    return GroundPoints.joined(parts)
+
+
+def _height_sigmas_m(points_m: FloatArray, centers_m: Sequence[FloatArray], turns: Sequence[float]) -> FloatArray:
+    """Standard deviations (P,) of heights from rays whose directions have the standard deviations `turns`, radians.
+
+    A ray of length r says nothing of a point along itself, and r times its deviation across: the inverse of the sum of
+    these weights is the point's covariance (Foerstner and Wrobel 2016, section 13.4.1).
+    """
+    weights = np.zeros((len(points_m), 3, 3))
+    for center_m, turn in zip(centers_m, turns, strict=True):
+        rays = points_m - center_m
+        squares = (rays**2).sum(axis=1)[:, None, None]
+        weights += (np.eye(3) - rays[:, :, None] * rays[:, None] / squares) / (squares * turn**2)
+    return np.sqrt(np.linalg.inv(weights)[:, 2, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,23 +116,24 @@ class Terrain:
     cell_m: float
 
 
-def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
-    """Heights over the area of a block, None from too few points.
+def terrain_of(points: GroundPoints, centers_m: FloatArray) -> Terrain | None:
+    """Heights below a flight, None from too few points.
 
-    points_m: (P, 3) triangulated points, some of them wrong. area_m: (N, 2) world points that the grid must enclose
-    (the points are enclosed in any case). A cell's height is the median of the points nearest to its centre, so that
-    the surface that most pictures see counts, and single wrong points do not; beyond the points the nearest go on.
+    centers_m: (N, 3) projection centres, which the grid must enclose (the points are enclosed in any case). A cell's
+    height is the median of the points nearest to its centre, weighted by their standard deviations, so that the surface
+    that most pictures see counts, and single wrong points do not; beyond the points the nearest go on.
     """
     from scipy.ndimage import gaussian_filter
     from scipy.spatial import cKDTree
 
-    points_m = _without_outliers(points_m[:: 1 + len(points_m) // _MOST_POINTS])
-    if len(points_m) < _MIN_POINTS:
+    points = _without_outliers(points.take(slice(None, None, 1 + len(points) // _MOST_POINTS)), centers_m)
+    if len(points) < _MIN_POINTS:
         return None
-    around = np.concatenate([points_m[:, :2], np.asarray(area_m).reshape(-1, 2)])
+    places, heights_m = points.points_m[:, :2], points.points_m[:, 2]
+    around = np.concatenate([places, centers_m[:, :2]])
     low, high = around.min(axis=0), around.max(axis=0)
     # The distance to the fourth nearest point tells the density where most points lie.
-    near, _ = cKDTree(points_m[:, :2]).query(points_m[:, :2], k=5)
+    near, _ = cKDTree(places).query(places, k=5)
     spacing = float(np.median(near[:, 4])) * np.sqrt(np.pi / 4.0)
     extent = float((high - low).max())
     cell = max(spacing * np.sqrt(_POINTS_PER_CELL), extent / _MAX_CELLS, 1e-6)
@@ -60,19 +141,27 @@ def terrain_of(points_m: FloatArray, area_m: FloatArray) -> Terrain | None:
     x = low[0] + cell * np.arange(columns)
     y = low[1] + cell * np.arange(rows)[::-1]
     centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    _, nearest = cKDTree(points_m[:, :2]).query(centres, k=min(_NEIGHBOURS, len(points_m)))
-    heights = np.median(points_m[:, 2][nearest], axis=1).reshape(rows, columns)
+    _, nearest = cKDTree(places).query(centres, k=min(_NEIGHBOURS, len(points)))
+    heights = _weighted_medians(heights_m[nearest], 1.0 / points.sigmas_m[nearest]).reshape(rows, columns)
     heights = gaussian_filter(heights, 0.7, mode="nearest").astype(np.float32)
     return Terrain(heights, float(x[0]), float(y[0]), cell)
 
 
-def terrains_of(parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[Terrain, ...]:
+def _weighted_medians(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Medians (N,) along the second axis of (N, K); with equal weights the lower of two middle values."""
+    order = np.argsort(values, axis=1)
+    summed = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+    middle = np.argmax(summed >= 0.5 * summed[:, -1:], axis=1)
+    return np.take_along_axis(values, np.take_along_axis(order, middle[:, None], axis=1), axis=1)[:, 0]
+
+
+def terrains_of(parts: Sequence[tuple[GroundPoints, FloatArray]]) -> tuple[Terrain, ...]:
     """Terrains of flights that may lie anywhere, in the order of the first of them: one for all that lie together.
 
-    parts: of every group of images, its points (P, 3) and its projection centres (N, 3). Flights far apart in one grid
-    would have cells as wide as a valley.
+    parts: of every group of images, its points and its projection centres (N, 3). Flights far apart in one grid would
+    have cells as wide as a valley.
     """
-    flights: list[list[tuple[FloatArray, FloatArray]]] = []
+    flights: list[list[tuple[GroundPoints, FloatArray]]] = []
     for part in parts:
         near = [flight for flight in flights if any(_meet(part[1], other[1]) for other in flight)]
         joined = [one for flight in near for one in flight]
@@ -80,7 +169,7 @@ def terrains_of(parts: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[Terrain
         flights.append([*joined, part])
     flights.sort(key=lambda flight: min(n for n, part in enumerate(parts) if any(part is one for one in flight)))
     found = [
-        terrain_of(np.concatenate([points for points, _ in flight]), np.concatenate([c[:, :2] for _, c in flight]))
+        terrain_of(GroundPoints.joined([points for points, _ in flight]), np.concatenate([c for _, c in flight]))
         for flight in flights
     ]
     return tuple(terrain for terrain in found if terrain is not None)
@@ -145,19 +234,69 @@ def _sampled(terrain: Terrain, places_m: FloatArray) -> FloatArray:
     return np.asarray(map_coordinates(terrain.heights_m.astype(float), [rows, columns], order=1, mode="nearest"))
 
 
-def _without_outliers(points_m: FloatArray) -> FloatArray:
-    """Points (P, 3) that are finite and near the median height of their neighbours, and not far off sideways."""
+def _without_outliers(points: GroundPoints, centers_m: FloatArray) -> GroundPoints:
+    """Points that can be ground: not far off sideways, well below the cameras, of a known height, and either near the
+    height of their surroundings or shown by several pairs. centers_m: (N, 3)."""
     from scipy.spatial import cKDTree
 
-    points_m = points_m[np.isfinite(points_m).all(axis=1)]
-    if len(points_m) < _MIN_POINTS:
-        return points_m
-    middle = np.median(points_m, axis=0)
-    far = np.linalg.norm(points_m[:, :2] - middle[:2], axis=1)
-    points_m = points_m[far <= 5.0 * float(np.percentile(far, 75)) + 1e-9]
-    _, nearest = cKDTree(points_m[:, :2]).query(points_m[:, :2], k=min(_NEIGHBOURS, len(points_m)))
-    around = points_m[:, 2][nearest]
-    off = np.abs(points_m[:, 2] - np.median(around, axis=1))
-    usual = np.median(np.abs(around - np.median(around, axis=1)[:, None]), axis=1)
+    if len(points) < _MIN_POINTS:
+        return points
+    middle = np.median(points.points_m[:, :2], axis=0)
+    far = np.linalg.norm(points.points_m[:, :2] - middle, axis=1)
+    points = points.take(far <= 5.0 * float(np.percentile(far, 75)) + 1e-9)
+    _, near = cKDTree(centers_m[:, :2]).query(
+        points.points_m[:, :2], k=range(1, 1 + min(_CAMERAS_AROUND, len(centers_m)))
+    )
+    below_m = centers_m[near, 2].min(axis=1) - points.points_m[:, 2]
+    flying_m = float(np.median(below_m[below_m > 0.0])) if (below_m > 0.0).any() else 0.0
+    points = points.take((below_m >= _NEAREST_SHARE * flying_m) & (below_m <= _FARTHEST * flying_m))
+    if len(points) < _MIN_POINTS:
+        return points
+    points = points.take(points.sigmas_m <= max(_LARGEST_SIGMA * flying_m, 2.0 * float(np.median(points.sigmas_m))))
+    points = points.take(_is_supported(points, flying_m))
+    if len(points) < _MIN_POINTS:
+        return points
+    _, nearest = cKDTree(points.points_m[:, :2]).query(points.points_m[:, :2], k=min(_NEIGHBOURS, len(points)))
+    heights_m = points.points_m[:, 2][nearest]
+    middles_m = np.median(heights_m, axis=1)
+    off = np.abs(points.points_m[:, 2] - middles_m)
+    usual = np.median(np.abs(heights_m - middles_m[:, None]), axis=1)
     limit = _OUTLIER_DEVIATIONS * np.maximum(usual, float(np.median(usual))) + 1e-9
-    return points_m[off <= limit]
+    return points.take(off <= limit)
+
+
+def _is_supported(points: GroundPoints, flying_m: float) -> BoolArray:
+    """(P,) whether a point lies near the height of its surroundings, or several pairs show others beside it as high.
+
+    A tower or a cliff is shown by all pairs that look at it; a wrong pair, or repetitive texture, is alone with what
+    it shows. Of one pair there is no other to ask.
+    """
+    from scipy.spatial import cKDTree
+
+    xy_m, heights_m = points.points_m[:, :2], points.points_m[:, 2]
+    departs = np.abs(heights_m - _surroundings_m(points.points_m)) > _DEPARTS * flying_m
+    _, near = cKDTree(xy_m).query(xy_m, k=min(_NEIGHBOURS, len(points)))
+    limits_m = np.maximum(_AGREES * flying_m, _AGREES_SIGMAS * points.sigmas_m)
+    agrees = np.abs(heights_m[near] - heights_m[:, None]) <= limits_m[:, None]
+    shown_by = np.sort(np.where(agrees, points.pair_idx[near], -1), axis=1)
+    # Of sorted numbers each rise is one pair more, the first too where it follows on -1.
+    pairs = (np.diff(shown_by, axis=1) > 0).sum(axis=1) + (shown_by[:, 0] >= 0)
+    needed = min(_PAIRS_THAT_AGREE, len(np.unique(points.pair_idx)))
+    return np.asarray(~departs | (pairs >= needed))
+
+
+def _surroundings_m(points_m: FloatArray) -> FloatArray:
+    """(P,) median height of the places around each point."""
+    from scipy.spatial import cKDTree
+
+    xy_m = points_m[:, :2]
+    near, _ = cKDTree(xy_m).query(xy_m, k=5)
+    # The circle to the fourth nearest point holds four.
+    side_m = max(float(np.median(near[:, 4])) * np.sqrt(np.pi / 4.0 * _POINTS_PER_PLACE), 1e-6)
+    _, place = np.unique(np.floor(xy_m / side_m).astype(np.int64), axis=0, return_inverse=True)
+    place = place.ravel()
+    order = np.lexsort((points_m[:, 2], place))
+    starts = np.searchsorted(place[order], np.arange(place.max() + 2))
+    middles = order[(starts[:-1] + starts[1:]) // 2]  # the point of median height of each place
+    _, around = cKDTree(xy_m[middles]).query(xy_m, k=range(1, 1 + min(_PLACES, len(middles))))
+    return np.asarray(np.median(points_m[middles, 2][around], axis=1))

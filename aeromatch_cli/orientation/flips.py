@@ -20,8 +20,9 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.orientation.adjusting import MIN_OBSERVATIONS
+from aeromatch_cli.orientation.bundle.of_model import image_numbers
 from aeromatch_cli.orientation.placing import Placement
-from aeromatch_cli.orientation.results import BEHIND_PX, image_numbers
+from aeromatch_cli.orientation.results import BEHIND_PX
 
 # An image farther than so many standard deviations from its position is tried with its other pose, and turned back if
 # that brings it nearer than this share of the distance.

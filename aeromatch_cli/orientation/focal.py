@@ -70,7 +70,7 @@ def with_focal_length(camera: Camera, wanted_px: float) -> Camera:
     """The camera with another focal length, and what else it has."""
     factor = wanted_px / focal_px(camera)
     named = zip(MODELS[camera.model], camera.params, strict=True)
-    params = tuple(value * factor if name in ("f", "fx", "fy") else value for name, value in named)
+    params = tuple(value * factor if name in ("f", "fx", "fy", "b1", "b2") else value for name, value in named)
     return replace(camera, params=params)
 
 

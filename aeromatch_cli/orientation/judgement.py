@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Ground, IntArray, Pose
+from aeromatch_cli.data import BoolArray, Camera, FloatArray, Ground, IntArray, Pose
 from aeromatch_cli.geometry.cameras import undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
@@ -40,14 +40,22 @@ class PairPoints:
 def explained_share(
     pair: PairPoints, poses: Mapping[str, Pose], cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
 ) -> float:
-    """Share of a pair's matches that both given poses explain, 0 where one has no attitude.
+    """Share of a pair's matches that both given poses explain, 0 where one has no attitude."""
+    explained = explained_matches(pair, poses, cameras, thresholds_px)
+    return float(explained.mean()) if len(explained) else 0.0
+
+
+def explained_matches(
+    pair: PairPoints, poses: Mapping[str, Pose], cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
+) -> BoolArray:
+    """Which of a pair's matches (M,) both given poses explain, none where one has no attitude.
 
     A match is explained when it lies near its epipolar line, and its rays do not meet behind a camera: epipolar lines
     alone do not tell a flight from the same flown backwards.
     """
     first, second = poses.get(pair.image_id0), poses.get(pair.image_id1)
     if first is None or second is None or first.world_rotation is None or second.world_rotation is None:
-        return 0.0
+        return np.zeros(len(pair.indices), dtype=bool)
     camera0, camera1 = cameras[pair.image_id0], cameras[pair.image_id1]
     matrix = fundamental_from_poses(camera0, first, camera1, second)
     errors = sampson_distance_px(matrix, undistort(camera0, pair.points0_px), undistort(camera1, pair.points1_px))
@@ -56,7 +64,7 @@ def explained_share(
     flat = (rays0 * rays1).sum(axis=1) > np.cos(np.deg2rad(_MIN_RAY_ANGLE_DEG))
     behind = ~flat & ~np.isfinite(triangulate(first.center_m, rays0, second.center_m, rays1)).all(axis=1)
     limit = max(thresholds_px[pair.image_id0], thresholds_px[pair.image_id1])
-    return float(((errors <= limit) & ~behind).mean())
+    return np.asarray((errors <= limit) & ~behind)
 
 
 def explained_images(

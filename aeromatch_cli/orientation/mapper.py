@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -18,14 +19,19 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.orientation.adjusting import (
-    GIVEN_DISTORTION_IMAGES,
+    Given,
+    Work,
     adjusted,
     believed_tilts,
     drop_far_images,
     drop_weak_images,
+    images_by_camera,
     reset_lenses,
+    state_errors,
 )
+from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.flips import turned_back
+from aeromatch_cli.orientation.placing import Placement
 from aeromatch_cli.orientation.process import quiet_pycolmap
 from aeromatch_cli.orientation.results import arrays, figures
 
@@ -45,6 +51,9 @@ LARGE_BLOCK = 100
 # There focal lengths are found before by a rough mapping of so few tracks per image: 8 s for 300 images, where a start
 # that has to be made again takes 30 s.
 _ROUGH_TRACKS = 30
+# Fewer images of a camera determine no distortion while they are mapped: a distortion that nobody has given is worse
+# than what few images tell (seneca).
+_DISTORTION_IMAGES = 10
 # Adjustments end when a step lowers the cost by a smaller share: exact enough for views and search.
 _COST_TOLERANCE = 1e-4
 
@@ -57,30 +66,38 @@ def solve(folder: Path) -> None:
     models = _mapped(pycolmap, folder, task["mapper"])
     if _far_from_priors(models, task["cameras"]):
         models = _with_priors(pycolmap, folder, task, models)
+    work = Work.of_task(pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=False))
+    given = Given.of_file(priors)
     facts = []
     for number, model in enumerate(models):
-        reset_lenses(model, task["cameras"])
+        work.lenses.clear()
+        work.start(model)
+        reset_lenses(work, model)
         drop_far_images(model)
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
-        observed = priors["positions_m"], priors["sigmas_m"]
-        ups = believed_tilts(pycolmap, model, *observed, priors["ups"], priors["rotations"])
-        adjust = partial(
-            adjusted, pycolmap, cameras=task["cameras"], positions_m=observed[0], sigmas_m=observed[1], ups=ups,
-            tolerance=_COST_TOLERANCE,
-        )  # fmt: skip
-        upright = turned_back(pycolmap, model, adjust(model), *observed, adjust)
+        ups = believed_tilts(pycolmap, model, given)
+        believed = replace(given, ups=ups)
+        adjust = partial(_placement, work, given=believed)
+        upright = turned_back(pycolmap, model, adjust(model), given.positions_m, given.mean_sigmas_m, adjust)
         model, placement = upright.model, upright.placement
-        reset_lenses(model, task["cameras"])  # few points determine no lens
         drop_weak_images(model)
         if model.num_reg_images() < _MIN_IMAGES:
             continue
+        state_errors(work, model, given)
         name = f"model{number}.npz"
-        np.savez(folder / name, **arrays(model))
+        lenses = {n: work.lens(model, n) for n in images_by_camera(model)}
+        np.savez(folder / name, **arrays(model, lenses))
         known = {"contradiction": placement.contradiction, "turned_back": upright.turned, **figures(model)}
         facts.append({"file": name, "kind": placement.kind, **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+
+
+def _placement(work: Work, model: Any, given: Given) -> Placement:
+    placement = adjusted(work, model, given).placement
+    assert placement is not None
+    return placement
 
 
 def _mapped(pycolmap: ModuleType, folder: Path, mapper: str) -> list[Any]:
@@ -181,6 +198,8 @@ def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict
 
 def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     with pycolmap.Database.open(database) as opened:
+        # Terms that divide follow noise; a camera of that model has a calibration to begin with.
+        divided = any(camera.model.name == "FULL_OPENCV" for camera in opened.read_all_cameras())
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
     options = pycolmap.GlobalPipelineOptions()
@@ -191,7 +210,7 @@ def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
     options.mapper.bundle_adjustment.refine_focal_length = free
-    options.mapper.bundle_adjustment.refine_extra_params = free and most >= GIVEN_DISTORTION_IMAGES
+    options.mapper.bundle_adjustment.refine_extra_params = free and most >= _DISTORTION_IMAGES and not divided
     return options
 
 

@@ -11,15 +11,17 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, IntArray, Pose
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, ControlPoint, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.cameras import colmap_params, focal_px, from_colmap
+from aeromatch_cli.geometry.cameras import colmap_params, focal_px
+from aeromatch_cli.geometry.lenses import in_colmap
+from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, lens_prior
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
@@ -49,13 +51,24 @@ class Model:
 class Observed:
     """What was given of a block, as observations.
 
-    poses: image_id -> pose whose centre is one, with sigma_position_m. focal_sigmas: camera_id -> standard deviation of
-    its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt counts.
+    poses: image_id -> pose whose centre is one, with its standard deviations. focal_sigmas: camera_id -> standard
+    deviation of its focal length, as a share of it. angles: image_id -> attitude as it was given, of which the tilt
+    counts. cameras: camera_id -> Camera as it was stated; of others the block's own count. calibration, switches: what
+    is free of them, see `calibration.freed`. flights: image_id -> name of its flight. velocities: image_id -> (3,) of
+    the aircraft in the world frame, metres per second, where it is known. relative_heights_m: image_id -> height above
+    the take-off point of its flight, where it is stated. control: surveyed points.
     """
 
     poses: Mapping[str, Pose]
     focal_sigmas: Mapping[str, float]
     angles: Mapping[str, Angles]
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    calibration: Calibration = "auto"
+    switches: Mapping[str, bool] = field(default_factory=dict)
+    flights: Mapping[str, str] = field(default_factory=dict)
+    velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
+    control: tuple[ControlPoint, ...] = ()
 
 
 def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> tuple[Model, ...]:
@@ -113,7 +126,7 @@ def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: 
     first = 0
     for arrays in reversed(archives):
         cameras |= {
-            camera_ids[n - 1]: _camera(block.cameras[camera_ids[n - 1]], arrays[f"params{n}"])
+            camera_ids[n - 1]: camera_of(arrays[f"lens{n}"], block.cameras[camera_ids[n - 1]])
             for n in arrays["cameras"]
         }
     for arrays, kind in zip(archives, kinds, strict=True):
@@ -147,26 +160,40 @@ def _task(contents: ExportContents, observed: Observed) -> Iterator[Path]:
         folder = Path(scratch) / "task"
         Colmap(raw_matches=False, pose_priors=False)(contents, folder)
         cameras = {
-            str(number): {
-                "params": colmap_params(contents.block.cameras[k]),
-                "focal_px": focal_px(contents.block.cameras[k]),
-                "sigma": observed.focal_sigmas[k],
-            }
+            str(number): _camera_task(contents.block, k, observed)
             for number, k in enumerate(sorted(contents.block.cameras), start=1)
         }
         (folder / "task.json").write_text(json.dumps({"cameras": cameras}), encoding="utf-8")
         nowhere, untold = np.full(3, np.nan), np.full((3, 3), np.nan)
+        flights = sorted(set(observed.flights.values()))
         ups = {i: one.rotation[:, 2] for i, one in observed.angles.items()}
         turns = {i: pose.world_rotation for i, pose in positions.items() if pose.world_rotation is not None}
         np.savez(
             folder / "priors.npz",
             positions_m=np.array([positions[i].center_m if i in positions else nowhere for i in image_ids]),
-            sigmas_m=np.array([positions[i].sigma_position_m if i in positions else np.nan for i in image_ids]),
+            sigmas_m=np.array([positions[i].axis_sigmas_m if i in positions else nowhere for i in image_ids]),
             ups=np.array([ups.get(i, nowhere) for i in image_ids]),
             rotations=np.array([turns.get(i, untold) for i in image_ids]),
             sigmas_deg=np.array([positions[i].sigma_angle_deg if i in positions else np.nan for i in image_ids]),
+            flights=np.array([flights.index(observed.flights[i]) if i in observed.flights else -1 for i in image_ids]),
+            velocities_m_s=np.array([observed.velocities.get(i, np.zeros(3)) for i in image_ids]),
         )
         yield folder
+
+
+def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, Any]:
+    """What a process knows of a camera: its prior, which unknowns are free, and what mapping starts from."""
+    stated = observed.cameras.get(camera_id, block.cameras[camera_id])
+    prior = lens_prior(stated, observed.focal_sigmas[camera_id])
+    images = sum(image.camera_id == camera_id for image in block.images)
+    return {
+        "lens": prior.lens.tolist(),
+        "sigmas": freed(prior, observed.calibration, observed.switches, images).tolist(),
+        "fisheye": prior.fisheye,
+        "params": colmap_params(in_colmap(block.cameras[camera_id]).camera or block.cameras[camera_id]),
+        "focal_px": focal_px(stated),
+        "sigma": observed.focal_sigmas[camera_id],
+    }
 
 
 def _solved(folder: Path, process: str, task: Mapping[str, Any], what: str) -> list[dict[str, Any]]:
@@ -183,7 +210,7 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
     names = [image_ids[number - 1] for number in arrays["images"]]
     facts["turned_back"] = [image_ids[number - 1] for number in facts["turned_back"]]
     given = block.cameras
-    cameras = {camera_ids[n - 1]: _camera(given[camera_ids[n - 1]], arrays[f"params{n}"]) for n in arrays["cameras"]}
+    cameras = {camera_ids[n - 1]: camera_of(arrays[f"lens{n}"], given[camera_ids[n - 1]]) for n in arrays["cameras"]}
     return Model(
         rotations=dict(zip(names, arrays["rotations"], strict=True)),
         centers_m=dict(zip(names, arrays["centers_m"], strict=True)),
@@ -192,8 +219,3 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
         kind=str(facts.pop("kind")),
         figures=facts,
     )
-
-
-def _camera(given: Camera, params: FloatArray) -> Camera:
-    """The given camera with what the mapper found, which counts pixels from the corner of the first."""
-    return from_colmap(given.model, given.width_px, given.height_px, tuple(float(value) for value in params))

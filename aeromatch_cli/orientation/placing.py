@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 
 # Without positions the median flying height becomes this many units.
 LOCAL_FLYING_HEIGHT = 100.0
@@ -121,6 +121,61 @@ def place(
     if vertical is not by_terrain and _off_level(found, measured, by_terrain, vertical):
         vertical = by_terrain
     return _levelled(found, measured, vertical)[0]
+
+
+def height_steps_m(
+    centers: FloatArray,
+    points: FloatArray,
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    ups: FloatArray,
+    flights: IntArray,
+) -> FloatArray:
+    """(N,) by how much the given heights of an image's flight lie above those of the flight of most images.
+
+    Two batteries, two zeros of the barometer or the receiver: between parallel strips such a step tilts the block. It
+    is taken for one where the measured tilts agree with each other, contradict the positions, and agree with them once
+    the flights' heights are moved; else all are zero. Arguments as of `place`; flights: (N,) numbers.
+    """
+    none = np.zeros(len(centers))
+    by_terrain = _terrain(centers, points)
+    vertical = _vertical(by_terrain, ups)
+    known = np.isfinite(positions_m).all(axis=1)
+    numbers, counts = np.unique(flights[known], return_counts=True)
+    if (
+        vertical is by_terrain
+        or len(numbers) < 2
+        or not _contradict(centers[known], positions_m[known], sigmas_m[known], by_terrain, vertical)
+    ):
+        return none
+    level = _Measured(centers[known], positions_m[known], 1.0)
+    turned = centers @ _level_start(level, vertical.up).T
+    scale = _Measured(turned[known] * [1.0, 1.0, 0.0], positions_m[known] * [1.0, 1.0, 0.0], 1.0).fit(np.eye(3))[0]
+    above_m = positions_m[:, 2] - scale * turned[:, 2]
+    of_flight = {n: float(np.median(above_m[known & (flights == n)])) for n in numbers.tolist()}
+    most = of_flight[int(numbers[np.argmax(counts)])]
+    steps_m = np.array([of_flight.get(int(n), most) - most for n in flights])
+    moved_m = positions_m - steps_m[:, None] * [0.0, 0.0, 1.0]
+    still = _contradict(centers[known], moved_m[known], sigmas_m[known], by_terrain, vertical)
+    return none if still else steps_m
+
+
+def _contradict(
+    centers: FloatArray,
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    by_terrain: _Vertical,
+    by_tilts: _Vertical,
+) -> bool:
+    """Whether measured tilts contradict what positions and terrain say together of where up is; also where positions
+    say nothing."""
+    found = _by_positions(centers, positions_m, sigmas_m)
+    if found is None or found.agreeing.sum() < 2:
+        return True
+    used, used_m = centers[found.agreeing], positions_m[found.agreeing]
+    stated_m = float(np.median(sigmas_m[found.agreeing]))
+    sigma_m = max(_sigma_m(found, found.points(used) - used_m, used_m, stated_m), 1e-9)
+    return _off_level(found, _Measured(used, used_m, sigma_m), by_terrain, by_tilts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,18 +20,26 @@ import numpy as np
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.adjusting import (
     MIN_OBSERVATIONS,
-    Attitudes,
+    Given,
+    Outcome,
+    Work,
     adjust_in_place,
     adjusted,
     believed_tilts,
     connected_parts,
     drop_weak_images,
     images_by_camera,
+    intersect,
     keep_images,
+    state_errors,
 )
+from aeromatch_cli.orientation.adjustment_facts import adjustment_facts
+from aeromatch_cli.orientation.bundle.adjust import Options
+from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
+from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
 from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import quiet_pycolmap
-from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, image_numbers, sigmas_of, tracks_of
+from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, tracks_of
 from aeromatch_cli.orientation.spread import take_poses, thinned
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
@@ -48,7 +56,6 @@ _FEW_OBSERVATIONS = 50
 _FEWEST_INLIERS = 8
 # Elements of rotations that were written and read again.
 _SAME = 1e-6
-_NONE = np.zeros(0)
 _NOWHERE = np.full(3, np.nan)
 # Poses that are not exact yet: points of the first round may be so far off, and are filtered as usual from then on.
 _FIRST_ERROR_PX = 12.0
@@ -61,19 +68,22 @@ def refine(folder: Path) -> None:
     """
     pycolmap = quiet_pycolmap()
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
-    priors = {**np.load(folder / "priors.npz"), "level_deg": np.array(np.inf)}
+    given = Given.of_file(np.load(folder / "priors.npz"))
+    work = Work.of_task(pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=True))
+    _hold_all_that_adjusts(work, folder)
     facts: list[dict[str, Any]] = []
     waiting = deque(task["groups"])
     if len(waiting) > 1 and not task["fixed"]:
-        waiting = deque(_joined_groups(pycolmap, folder, task["groups"]))
+        waiting = deque(_joined_groups(work, folder, task["groups"]))
     grouped = {number for group in task["groups"] for number in group["images"]}
-    lenses: dict[int, FloatArray] = {}
+    held: set[int] = set()  # cameras that a larger group has found: each is one and the same for all groups
     while waiting:
         group = waiting.popleft()
         free = not task["fixed"]
-        observed = priors if group["kind"] != "level" else _without_positions(priors)
-        model = _posed(pycolmap, folder, set(group["images"]))
-        _take(model, lenses)
+        observed = given if group["kind"] != "level" else given.without_positions()
+        model = _posed(work, folder, set(group["images"]))
+        for number in held:
+            set_lens(pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
         model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
@@ -81,35 +91,60 @@ def refine(folder: Path) -> None:
                 continue
             keep_images(model, parts[0])
             waiting.extend({**group, "images": part} for part in parts[1:] if len(part) >= _FEWEST_IMAGES)
-        attitudes = _attitudes(model, priors) if group["kind"] == "given" else Attitudes((), np.zeros((0, 3, 3)), _NONE)
+        attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
         registered: list[int] = []
+        outcome: Outcome | None = None
         if free:
             if task["more"]:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
                 grouped |= set(registered)
                 model = _triangulated(pycolmap, model, folder, rough=False) if registered else model
-            work = _Work(pycolmap, folder, task["cameras"], frozenset(lenses))
-            model, observed = _refined(work, model, group["kind"], observed, attitudes)
-        model.update_point_3d_errors()
+            model, outcome = _refined(work, folder, model, group["kind"], observed, attitudes, held)
+        intersect(work, model, observed)
         _once_per_image(model)
         _drop_weak_points(model)
         drop_weak_images(model)
         if not image_numbers(model):
             continue
-        lenses |= {n: np.array(model.cameras[n].params) for n in images_by_camera(model) if n not in lenses}
+        lenses = {n: work.lens(model, n) for n in images_by_camera(model)}
+        held |= lenses.keys()
         name = f"model{len(facts)}.npz"
-        angles_deg = dict(zip(attitudes.images, attitudes.sigmas_deg.tolist(), strict=True))
-        deviations = sigmas_of(model, observed["sigmas_m"], task["cameras"], angles_deg, float(observed["level_deg"]))
-        np.savez(folder / name, **arrays(model), **tracks_of(model), **deviations)
-        facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model)})
+        deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
+        np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
+        known = {} if outcome is None else adjustment_facts(outcome)
+        facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 
 
-def _joined_groups(pycolmap: ModuleType, folder: Path, groups: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _hold_all_that_adjusts(work: Work, folder: Path) -> None:
+    """Give the database's cameras, too, the form that holds all that an adjustment finds."""
+    with work.pycolmap.Database.open(folder / "database.db") as opened:
+        for camera in opened.read_all_cameras():
+            set_lens(work.pycolmap, camera, lens_of(camera), int(camera.camera_id) in work.fisheyes)
+            opened.update_camera(camera)
+
+
+def _deviations(model: Any, given: Given, outcome: Outcome | None) -> dict[str, FloatArray]:
+    """Standard deviations (N, 3) of a model's poses: x, y, z in metres and omega, phi, kappa in degrees. Poses that
+    were not adjusted are as exact as was stated."""
+    ids = image_numbers(model)
+    if outcome is None or outcome.result.found is None:
+        rows = np.array(ids) - 1
+        return {"sigmas_m": given.sigmas_m[rows], "sigmas_deg": np.repeat(given.sigmas_deg[rows][:, None], 3, axis=1)}
+    sigmas_m, sigmas_deg = pose_sigmas(outcome.result.network, outcome.result.state, outcome.result.found)
+    row = {number: k for k, number in enumerate(outcome.images)}
+    unknown = np.full(3, np.nan)
+    return {
+        "sigmas_m": np.array([sigmas_m[row[i]] if i in row else unknown for i in ids]),
+        "sigmas_deg": np.array([sigmas_deg[row[i]] if i in row else unknown for i in ids]),
+    }
+
+
+def _joined_groups(work: Work, folder: Path, groups: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Groups of which those that final matches tie are one; the poses on file are moved with them."""
-    parts = []
+    pycolmap, parts = work.pycolmap, []
     for group in sorted(groups, key=lambda one: (one["kind"] == "level", -len(one["images"]))):
-        model = _triangulated(pycolmap, _posed(pycolmap, folder, set(group["images"])), folder, rough=True)
+        model = _triangulated(pycolmap, _posed(work, folder, set(group["images"])), folder, rough=True)
         parts.append(_part(group["kind"], model))
     with pycolmap.Database.open(folder / "database.db") as opened:
         seen = zip(*opened.read_two_view_geometries(), strict=True)
@@ -141,68 +176,42 @@ def _part(kind: str, model: Any) -> Part:
     )
 
 
-def _without_positions(priors: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Of a group in a frame of its own: given positions are not observations there."""
-    unknown = {name: np.full_like(priors[name], np.nan) for name in ("positions_m", "sigmas_m")}
-    return {**priors, **unknown}
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What the adjustments of a group share. cameras: priors by number. held: those that a larger group has found."""
-
-    pycolmap: ModuleType
-    folder: Path
-    cameras: dict[str, Any]
-    held: frozenset[int]
-
-
-def _take(model: Any, lenses: Mapping[int, FloatArray]) -> None:
-    """Give a model the cameras that a larger group has found: each is one and the same for all groups."""
-    for number, params in lenses.items():
-        if number in model.cameras:
-            model.cameras[number].params = params
-
-
 def _refined(
-    work: _Work, model: Any, kind: str, observed: dict[str, FloatArray], attitudes: Attitudes
-) -> tuple[Any, dict[str, FloatArray]]:
-    """The model adjusted and triangulated in turn, while that makes it better; and the observations that it used."""
-    pycolmap, cameras = work.pycolmap, work.cameras
-    positions_m, sigmas_m = observed["positions_m"], observed["sigmas_m"]
+    work: Work,
+    folder: Path,
+    model: Any,
+    kind: str,
+    given: Given,
+    attitudes: Collection[int],
+    held: Collection[int],
+) -> tuple[Any, Outcome | None]:
+    """The model adjusted and triangulated in turn, while that makes it better; and the last adjustment.
+
+    attitudes: numbers of images whose given attitudes are observations. held: cameras that stay as they are.
+    """
     if kind == "positions":
-        tilts = believed_tilts(pycolmap, model, positions_m, sigmas_m, observed["ups"], observed["rotations"])
-        observed = {**observed, "ups": tilts}
-    used, level_deg, factor = image_numbers(model), np.inf, 1.0
+        given = replace(given, ups=believed_tilts(work.pycolmap, model, given))
+    outcome: Outcome | None = None
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break
         thin = thinned(model)
         moved = model if thin is None else thin
-        moved.update_point_3d_errors()
-        before = moved.compute_mean_reprojection_error()
-        given = positions_m, sigmas_m
-        if kind == "positions":
-            placement = adjusted(pycolmap, moved, cameras, *given, observed["ups"], _COST_TOLERANCE, work.held)
-            level_deg, factor = placement.level_sigma_deg, placement.sigma_factor
-            used = [i for i, agrees in zip(image_numbers(moved), placement.agreeing, strict=True) if agrees]
+        before = state_errors(work, moved, given)
+        if kind == "given":
+            outcome = adjust_in_place(work, moved, given, attitudes, held)
         else:
-            used = adjust_in_place(pycolmap, moved, cameras, *given, attitudes, _COST_TOLERANCE, work.held)
-        moved.update_point_3d_errors()
-        settled = moved.compute_mean_reprojection_error() > (1.0 - _WORTH_AGAIN) * before
+            outcome = adjusted(work, moved, given, held)
+        settled = state_errors(work, moved, given) > (1.0 - _WORTH_AGAIN) * before
         settled = settled and not (number == 0 and _found(kind))
         if settled and thin is None:
             break
         if thin is not None:
             take_poses(model, thin)
-        model = _triangulated(pycolmap, model, work.folder, rough=False)
+        model = _triangulated(work.pycolmap, model, folder, rough=False)
         if settled:
             break
-    unused = np.setdiff1d(np.arange(len(sigmas_m)), np.array(used, dtype=int) - 1)
-    # Precision rests on these. An adjustment bends a weak block to its positions: that they fit shows nothing better.
-    sigmas_m = max(factor, 1.0) * sigmas_m
-    sigmas_m[unused] = np.nan
-    return model, {**observed, "sigmas_m": sigmas_m, "level_deg": np.array(level_deg)}
+    return model, outcome
 
 
 def _found(kind: str) -> bool:
@@ -210,24 +219,24 @@ def _found(kind: str) -> bool:
     return kind != "given"
 
 
-def _posed(pycolmap: ModuleType, folder: Path, numbers: set[int]) -> Any:
+def _posed(work: Work, folder: Path, numbers: set[int]) -> Any:
     """The given poses of some images."""
-    model = pycolmap.Reconstruction(folder / "sparse")
+    model = work.pycolmap.Reconstruction(folder / "sparse")
+    work.start(model)
     for image in list(model.images.values()):
         if image.has_pose and image.image_id not in numbers:
             model.deregister_frame(image.frame_id)
     return model
 
 
-def _attitudes(model: Any, priors: Mapping[str, FloatArray]) -> Attitudes:
-    """Given attitudes of the images that have them still: those that were corrected tell nothing."""
-    rows, now = [], model.images
-    for row, given in enumerate(priors["rotations"]):
-        if row + 1 in now and now[row + 1].has_pose and np.isfinite(given).all():
-            found = now[row + 1].cam_from_world().rotation.matrix()
-            if np.abs(found - given).max() < _SAME:
-                rows.append(row)
-    return Attitudes(tuple(row + 1 for row in rows), priors["rotations"][rows], priors["sigmas_deg"][rows])
+def _attitudes(model: Any, given: Given) -> list[int]:
+    """Numbers of the images that have their given attitudes still: those that were corrected tell nothing."""
+    kept = []
+    for number in image_numbers(model):
+        found, stated = model.images[number].cam_from_world().rotation.matrix(), given.rotations[number - 1]
+        if np.isfinite(stated).all() and np.abs(found - stated).max() < _SAME:
+            kept.append(number)
+    return kept
 
 
 def _triangulated(pycolmap: ModuleType, model: Any, folder: Path, rough: bool) -> Any:

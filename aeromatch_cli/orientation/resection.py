@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, IntArray, Pose
-from aeromatch_cli.geometry.cameras import parameters, undistort
+from aeromatch_cli.geometry.cameras import poselib_camera, undistort, without_skew
 from aeromatch_cli.orientation.judgement import PairPoints, triangulated
 
 _MIN_POINTS = 12
@@ -124,18 +124,12 @@ def _resection(
 ) -> Pose | None:
     import poselib
 
-    p = parameters(camera)
-    pinhole = {
-        "model": "PINHOLE",
-        "width": camera.width_px,
-        "height": camera.height_px,
-        "params": [p["fx"], p["fy"], p["cx"], p["cy"]],
-    }
     middle = np.median(points_m, axis=0)
     options = {"max_reproj_error": threshold_px, "seed": 0}
     found, info = poselib.estimate_absolute_pose(
-        undistort(camera, pixels), points_m - middle, pinhole, options, {"loss_type": "TRUNCATED"}
-    )
+        without_skew(camera, undistort(camera, pixels)), points_m - middle, poselib_camera(camera), options,
+        {"loss_type": "TRUNCATED"},
+    )  # fmt: skip
     inliers = int(np.sum(info["inliers"]))
     if inliers < max(_MIN_POINTS, _MIN_SHARE * len(pixels)):
         return None

@@ -14,7 +14,7 @@ from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.orientation.arrangement import SAME_SHARE, Before, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
-from aeromatch_cli.orientation.dem import Terrain, terrains_of
+from aeromatch_cli.orientation.dem import Terrain, ground_points, terrains_of
 from aeromatch_cli.orientation.judgement import (
     PairPoints,
     attitude_errors_deg,
@@ -347,7 +347,7 @@ def _terrains(
 ) -> tuple[tuple[Terrain, ...], int]:
     """Terrains of groups of posed images, and how many points they come from. cameras: by image_id.
 
-    Pairs whose matches the poses contradict show no ground.
+    Pairs whose matches the poses contradict show no ground, nor do single matches that they contradict.
     """
     limits_px = {i: SLACK * limit for i, limit in evidence.thresholds_px.items()}
     parts = []
@@ -355,7 +355,7 @@ def _terrains(
         inside = [pair for pair in evidence.pairs if {pair.image_id0, pair.image_id1} <= group]
         own = [pair for pair in inside if explained_share(pair, poses, cameras, limits_px) >= _SHOWN]
         centers_m = np.array([poses[i].center_m for i in sorted(group)])
-        parts.append((_finite(triangulated(own, poses, cameras)), centers_m))
+        parts.append((ground_points(own, poses, cameras, limits_px), centers_m))
     return terrains_of(parts), sum(len(points) for points, _ in parts)
 
 

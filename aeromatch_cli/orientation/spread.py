@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.orientation.bundle.of_model import image_numbers
 from aeromatch_cli.orientation.grouping import rows_by_number
-from aeromatch_cli.orientation.results import image_numbers, tracks_of
+from aeromatch_cli.orientation.results import tracks_of
 
 # Cells of an image along its sides, and points in each.
 _COLUMNS, _ROWS, _IN_A_CELL = 10, 8, 5

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
+from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.stages import adjust
@@ -56,6 +57,12 @@ def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | No
     return read_adjusted(path) if adjustment.facts.get("points") and path.is_file() else None
 
 
+def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:
+    """By image_id; none of earlier matches, and of an adjustment by an earlier version."""
+    path = context.workspace.residuals
+    return read_residuals(path, context.block.images) if adjustment.facts.get("points") and path.is_file() else {}
+
+
 def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> list[Notice]:
     """Images that the bundle adjustment does not hold, images whose adjusted poses their matches contradict, and what
     else it found."""
@@ -85,13 +92,12 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
     facts = adjustment.facts
     if not facts.get("points"):
         return []
-    length = "m" if adjustment.in_world else "units of the frame"
     found = [
         ("Oriented images", f"{facts['images']:,}"),
         ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
         ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
     ]
-    units = ("sigma_position_m", length), ("sigma_angle_deg", "degrees")
+    units = ("sigma_position_m", "m"), ("sigma_angle_deg", "degrees")
     sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))

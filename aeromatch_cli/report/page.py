@@ -28,6 +28,7 @@ from aeromatch_cli.report.adjustment import (
     counted,
     final_points,
     read_adjustment,
+    read_position_residuals,
 )
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.gathering import Gathered, gather, settled
@@ -35,6 +36,7 @@ from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
 from aeromatch_cli.report.pair_viewer import pair_data, pair_table
 from aeromatch_cli.report.places import ground_figures, point_figures
 from aeromatch_cli.report.previews import ERROR_LIMITS_PX, previews
+from aeromatch_cli.report.residuals import residual_section
 from aeromatch_cli.report.rows import (
     NOT_JUDGED,
     ImageRow,
@@ -114,6 +116,14 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         failure_count=len(failures),
         summary=input_facts.get("summary", []),
         adjusted=adjustment_rows(adjustment),
+        positions=None
+        if adjusted is None
+        else residual_section(
+            adjusted,
+            read_position_residuals(context, adjustment),
+            {row.image_id: row.name for row in images},
+            context.block.gsd_m,
+        ),
         residuals=(adjustment.facts.get("control") or {}).get("residuals", {}),
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
@@ -242,8 +252,9 @@ def notices(
 def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
     block = context.block
     gsd_m = block.gsd_m if in_world else None
+    frame = f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"
     return [
-        ("World frame", f"{block.crs}, minus the origin {' / '.join(f'{value:,.0f}' for value in block.origin_m)}"),
+        ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
         ("Ground", block.ground_source),
         ("Ground sampling distance", "unknown" if gsd_m is None else f"{gsd_m:.3g} m"),
         ("Cameras", camera_words(block.cameras)),

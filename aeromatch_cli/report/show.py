@@ -152,7 +152,8 @@ def _workspace(work: _Work) -> Shown:
     attitudes = sum(pose.world_rotation is not None for pose in work.poses.values())
     lines.append(f"images      {len(work.images)}, {len(work.poses)} with position, {attitudes} with attitude")
     block = read_json(workspace.block)
-    lines.append(f"world       {block['crs']}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
+    scale = "" if block.get("metric", True) else ", of arbitrary scale"
+    lines.append(f"world       {block['crs']}{scale}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
     lines.append(f"pairs       {len(work.pairs)}")
     stages, seconds = dict[str, Any](), seconds_by_stage(workspace)
     for stage in STAGE_ORDER:
@@ -197,13 +198,15 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
     lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in camera.params)}")
-    origin_m = read_json(workspace.block)["origin_m"]
+    world = read_json(workspace.block)
+    origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
     adjusted = work.adjusted.poses.get(image_id) if work.adjusted is not None else None
-    lines += [f"pose        {words}" for words in _pose_words(pose, origin_m)]
+    lines += [f"pose        {words}" for words in _pose_words(pose, origin_m, metric=metric)]
     if adjusted is not None:
         sigmas = float(np.mean(adjusted.sigmas_m)), float(np.mean(adjusted.sigmas_deg))
         known = Pose(adjusted.center_m, adjusted.rotation, *sigmas)
-        lines += [f"adjusted    {words}" for words in _pose_words(known, origin_m)]
+        placed = image_id not in work.adjusted.frames if work.adjusted is not None else metric
+        lines += [f"adjusted    {words}" for words in _pose_words(known, origin_m, metric=placed)]
     keypoints = work.keypoints_px(image_id)
     rows = []
     matched = np.zeros(len(keypoints), dtype=bool)
@@ -247,12 +250,13 @@ def _own_file(workspace: Workspace, name: str) -> Path:
     return folder / name
 
 
-def _pose_words(pose: Pose | None, origin_m: Sequence[float]) -> Iterator[str]:
+def _pose_words(pose: Pose | None, origin_m: Sequence[float], *, metric: bool) -> Iterator[str]:
     if pose is None:
         yield "unknown"
         return
     x, y, z = np.array(pose.center_m) + np.array(origin_m)
-    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} m, standard deviation {pose.sigma_position_m:.3g} m"
+    unit = "m" if metric else "units of arbitrary length"
+    yield f"x {x:.3f}, y {y:.3f}, z {z:.3f} {unit}, standard deviation {pose.sigma_position_m:.3g} {unit}"
     if pose.world_rotation is not None:
         angles = ", ".join(f"{v:.4f}" for v in to_omega_phi_kappa(pose.world_rotation))
         yield f"omega, phi, kappa {angles} degrees, {tilt_deg(pose.world_rotation):.1f} from straight down"

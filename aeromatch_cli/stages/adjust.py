@@ -13,24 +13,27 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, PoseResidual
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import translated_os_errors, whole_record, write_atomically, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
+from aeromatch_cli.formats.residuals import residuals_text
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
+from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
+from aeromatch_cli.stages.simulate import degenerate_view
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
-VERSION = 19
+VERSION = 20
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -41,7 +44,7 @@ _FEW_KEYPOINTS = 0.1
 
 
 def run(context: Context) -> StageReport:
-    """Write adjusted.npz, adjusted.json and orientation.csv where they are not up to date."""
+    """Write adjusted.npz, adjusted.json, orientation.csv and residuals.csv where they are not up to date."""
     report = StageReport("adjust", items=len(context.block.images))
     recipe, groups = context.settings.orient, _groups(context)
     if not groups:
@@ -63,9 +66,10 @@ def run(context: Context) -> StageReport:
         report.failures.append(("all images", str(error)))
         report.facts = {"images": 0, "remarks": []}  # not those of an earlier adjustment
         return report.write(context.workspace)
-    report.facts = _facts(context, adjusted, figures)
+    residuals = _residuals(context, adjusted)
+    report.facts = _facts(context, adjusted, figures) | {"residuals": _residual_figures(context, residuals)}
     report.done = report.items
-    _write(context, adjusted, report)
+    _write(context, adjusted, residuals, report)
     return report.write(context.workspace)
 
 
@@ -110,7 +114,11 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     versions = VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
     control = [(p.name, p.position_m, p.check, sorted(p.pixels.items())) for p in context.control]
-    known = sorted(context.focal_sigmas.items()), sorted(context.angles.items())
+    known = (
+        sorted(context.focal_sigmas.items()),
+        sorted(context.observed.cameras.items()),
+        sorted(context.angles.items()),
+    )
     measured = refine.made_fingerprint(context)
     return fingerprint(versions, context.settings.orient, held, state, known, pairs, control, measured)
 
@@ -122,29 +130,42 @@ def _on_file(context: Context) -> Mapping[str, Any]:
 
 def _remove(context: Context) -> None:
     folder = context.workspace.orientation
-    for name in ("adjusted.json", "adjusted.npz", "orientation.csv", context.workspace.final.name):
+    for name in ("adjusted.json", "adjusted.npz", "orientation.csv", "residuals.csv", context.workspace.final.name):
         with translated_os_errors(folder / name):
             (folder / name).unlink(missing_ok=True)
 
 
-def _write(context: Context, adjusted: AdjustedBlock, report: StageReport) -> None:
+def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResidual]:
+    keypoints_px = contents_of(context).keypoints_px
+    return residuals_of(adjusted, context.observed.poses, context.block.images, keypoints_px)
+
+
+def _residual_figures(context: Context, residuals: Mapping[str, PoseResidual]) -> dict[str, Any]:
+    return residual_figures(residuals, {image.image_id: image.name for image in context.block.images})
+
+
+def _write(
+    context: Context, adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual], report: StageReport
+) -> None:
     """The record comes last: it vouches for the others."""
     folder = context.workspace.orientation
     write_atomically(context.workspace.adjusted, lambda stream: write_adjusted(stream, adjusted))
     write_text(folder / "orientation.csv", orientation_text(adjusted, context.block))
+    write_text(context.workspace.residuals, residuals_text(residuals, context.block.images))
     head = {"fingerprint": report.fingerprint, "facts": report.facts}
-    write_record(folder / "adjusted.json", head, ("adjusted.npz", "orientation.csv"))
+    write_record(folder / "adjusted.json", head, ("adjusted.npz", "orientation.csv", "residuals.csv"))
 
 
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
     control = _control(context, adjusted)
+    beside = adjusted.frames  # no length there is a metre
     return {
         "images": len(adjusted.poses),
         "points": len(adjusted.points_m),
         "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
         "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
-        "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in adjusted.poses.values()]),
+        "sigma_position_m": _median([float(np.mean(p.sigmas_m)) for i, p in adjusted.poses.items() if i not in beside]),
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
         "groups": [dict(one) for one in figures],
         "cameras": {
@@ -237,7 +258,8 @@ def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
         if image_id in unread:
             reasons[image_id] = f"no features: {unread[image_id]}"
         elif count <= _FEW_KEYPOINTS * usual:
-            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: no texture, or blurred"
+            seen = degenerate_view(context.workspace, context.image_by_id[image_id]) or "no texture, or blurred"
+            reasons[image_id] = f"{count} keypoints, the median is {usual:.0f}: {seen}"
         elif not pairs[image_id]:
             reasons[image_id] = "in no pair: it overlaps no other image"
         elif not verified[image_id]:

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.blocks.control import far_control, read_control
+from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, ControlPoint, Ground, Image
+from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
 from aeromatch_cli.errors import ConfigError, ItemError, WorkspaceError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json
@@ -43,7 +43,8 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised: as in `read.BlockInputs`. gsd_before_m: gsd_m and reduced_gsd_m that the workspace had, or None.
+    recognised, flights, velocities, relative_heights_m: as in `read.BlockInputs`. gsd_before_m: gsd_m and
+    reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
 
@@ -52,6 +53,9 @@ class BlockRead:
     focal_sigmas: Mapping[str, float]
     likely_focals: Mapping[str, float]
     angles: Mapping[str, Angles]
+    flights: Mapping[str, str]
+    velocities: Mapping[str, FloatArray]
+    relative_heights_m: Mapping[str, float]
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
@@ -69,8 +73,15 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
     before = read_json(workspace.block) if workspace.block.is_file() else {}
     inputs, prints, remote = _read_inputs(settings, workspace, executor, before)
     ground, source, remarks = given_ground(settings, inputs)
-    control, absent = read_control(settings.block.gcp, inputs.images, inputs.crs, inputs.origin_m)
-    absent += far_control(control, inputs.poses, settings.block.gcp)
+    control, absent = read_control(
+        settings.block.gcp,
+        inputs.images,
+        inputs.crs,
+        inputs.origin_m,
+        marks=settings.block.gcp_marks,
+        poses=inputs.poses,
+        use=settings.block.gcp_use,
+    )
     block = Block(
         images=inputs.images,
         cameras=inputs.cameras,
@@ -87,6 +98,9 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         focal_sigmas=inputs.focal_sigmas,
         likely_focals=inputs.likely_focals,
         angles=inputs.angles,
+        flights=inputs.flights,
+        velocities=inputs.velocities,
+        relative_heights_m=inputs.relative_heights_m,
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),
@@ -125,6 +139,7 @@ def block_record(block: Block, given: Block, settings: Settings) -> dict[str, An
         "format_version": FORMAT_VERSION,
         "crs": block.crs,
         "origin_m": list(block.origin_m),
+        "metric": block.metric,
         "given_crs": given.crs,
         "given_origin_m": list(given.origin_m),
         "ground_source": block.ground_source,

@@ -16,6 +16,8 @@ _NAMED = 4
 # Section of the settings, or setting -> the first stage that reads it; others, as `run`, change no result.
 _FIRST_STAGE = {
     "block.gcp": "adjust",
+    "block.gcp_marks": "adjust",
+    "block.gcp_use": "adjust",
     "block": "orient",
     "orient": "orient",
     "pairs": "pairs",

@@ -11,6 +11,7 @@ from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
 from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.formats.refined import read_final_keypoints
+from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
@@ -73,7 +74,9 @@ def _contents(
         return np.column_stack([geographic_from_grid(block.crs, places_m[:, :2]), places_m[:, 2]])
 
     known = None if block.crs == LOCAL else geographic
-    return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known)
+    path = context.workspace.residuals
+    residuals = read_residuals(path, block.images) if adjusted is not None and path.is_file() else {}
+    return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals)
 
 
 def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:

@@ -9,14 +9,18 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from aeromatch_cli.config import Settings
-from aeromatch_cli.data import Block, Camera, ControlPoint, Image, Neighbour, Pair, PairGeometry, Pose
+from aeromatch_cli.data import Block, Camera, ControlPoint, FloatArray, Image, Neighbour, Pair, PairGeometry, Pose
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.footprints import block_footprints, degenerate_words
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import scale_within, shrink_camera
+from aeromatch_cli.orientation.focal import with_focal_length
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.strategies import Matcher
@@ -39,8 +43,9 @@ class Context:
     """Everything a stage needs to know. Made once per command by `stages.pairs.prepare`.
 
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
-    share of it. likely_focals: camera_id -> focal length in pixels that EXIF speaks for, where it contradicts the
-    given one. angles: image_id -> attitude as it was given. control: surveyed points.
+    share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal
+    length in pixels that EXIF speaks for, where it contradicts the given one. angles: image_id -> attitude as it was
+    given. flights, velocities, relative_heights_m: as in `orientation.mapping.Observed`. control: surveyed points.
     """
 
     settings: Settings
@@ -51,8 +56,12 @@ class Context:
     image_fingerprints: Mapping[str, str]
     given: Block
     focal_sigmas: Mapping[str, float] = field(default_factory=dict)
+    calibrated: frozenset[str] = frozenset()
     likely_focals: Mapping[str, float] = field(default_factory=dict)
     angles: Mapping[str, Angles] = field(default_factory=dict)
+    flights: Mapping[str, str] = field(default_factory=dict)
+    velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     # By name; none where the images lie in a folder.
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
@@ -75,12 +84,30 @@ class Context:
     @property
     def observed(self) -> Observed:
         """What was given, for mapping and adjustment."""
-        return Observed(self.given.poses, self.focal_sigmas, self.angles)
+        return Observed(
+            poses=self.given.poses,
+            focal_sigmas=self.focal_sigmas,
+            angles=self.angles,
+            cameras={camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras},
+            flights=self.flights,
+            velocities=self.velocities,
+            relative_heights_m=self.relative_heights_m,
+            control=self.control,
+        )
+
+    def _stated_camera(self, camera_id: str) -> Camera:
+        """A camera as given; where EXIF contradicts it, with that focal length which the pictures are nearer to."""
+        stated = self.given.cameras[camera_id]
+        if camera_id not in self.likely_focals or camera_id not in self.block.cameras:
+            return stated
+        found_px = focal_px(self.block.cameras[camera_id])
+        nearest_px = min(focal_px(stated), self.likely_focals[camera_id], key=lambda px: abs(np.log(px / found_px)))
+        return with_focal_length(stated, nearest_px)
 
     @property
     def guessed_cameras(self) -> frozenset[str]:
         """Cameras whose focal length is no more than a guess."""
-        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS)
+        return frozenset(i for i, sigma in self.focal_sigmas.items() if sigma >= _GUESS) - self.calibrated
 
     def owns(self, item_id: str) -> bool:
         return self.shard is None or self.shard.owns(item_id)
@@ -112,6 +139,13 @@ class Context:
     def ground_z_m(self, image_id: str) -> float | None:
         """Ground height where an image looks (below it, without attitude), None without ground or position."""
         return _ground_heights(self.block).get(image_id)
+
+    def ground_remark(self, image_id: str) -> str:
+        """Why the ground of an image is not the terrain below it, else ""."""
+        footprint = block_footprints(self.block).get(image_id)
+        if footprint is None or footprint.degenerate is None:
+            return ""
+        return degenerate_words(footprint.degenerate, self.block)
 
     def working_camera(self, image: Image) -> Camera:
         """The camera of the picture that is worked on (--max-size)."""

@@ -101,5 +101,7 @@ def _complete(workspace: Workspace) -> bool:
 def _run_task(task: ExportTask) -> dict[str, Any]:
     contents = contents_of(task.context, task.adjusted, final_pairs)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
+    for remark in summary.remarks:
+        log.warning("warning: export %s: %s", task.folder.name, remark)
     files = [path.relative_to(task.folder).as_posix() for path in summary.files]
     return {"name": task.folder.name, **asdict(summary), "files": files}

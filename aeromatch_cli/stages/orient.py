@@ -43,11 +43,9 @@ from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 19, 1
+VERSION, _LARGE_BLOCK_VERSION = 20, 1
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
-# Standard deviation of a focal length that the pictures gave, as a share of it.
-_FOUND_FOCAL = 0.01
 
 
 def run(
@@ -92,7 +90,7 @@ def run(
         # Given positions are in another frame, and nothing ties this one to a CRS.
         context = replace(
             context,
-            block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0)),
+            block=replace(context.block, crs="local", origin_m=(0.0, 0.0, 0.0), metric=False),
             given=replace(context.given, poses={}),
         )
     block = replace(
@@ -108,8 +106,7 @@ def run(
     report.failures = _failed_images(context, record["failed"])
     if stopped := record["facts"].get("stopped"):  # records of earlier versions lack it
         report.failures.append((_MAPPING, stopped))
-    found = dict.fromkeys(report.facts.get("calibrated", ()), _FOUND_FOCAL)
-    context = replace(context, block=block, focal_sigmas={**context.focal_sigmas, **found})
+    context = replace(context, block=block, calibrated=frozenset(report.facts.get("calibrated", ())))
     return context, report if dry else report.write(context.workspace)
 
 

@@ -21,14 +21,20 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.strategies import Simulator, ViewPixels
 from aeromatch_cli.strategies.simulators import source_view
+from aeromatch_cli.workspace import Workspace
 
 # Name of the source view that images get besides their simulated ones where other images have no attitude.
 _ADDED = "as-taken"
+# A largest view of fewer pixels than this share of the image's shows next to nothing of it.
+_LEAST_PIXELS = 1.0 / 16.0
 
 
 @dataclass(frozen=True, eq=False)
 class SimulateTask:
-    """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown. as_taken: also as it is."""
+    """One image to look at from elsewhere; ground_z_m and gsd_m are None where unknown. as_taken: also as it is.
+
+    remark: why another ground than that below the image is looked at, else "".
+    """
 
     enhance: enhance.EnhanceTask
     pose: Pose | None
@@ -38,6 +44,7 @@ class SimulateTask:
     as_taken: bool
     simulator: Simulator
     fingerprint: str
+    remark: str = ""
 
 
 def make_task(context: Context, image: Image) -> SimulateTask:
@@ -50,7 +57,8 @@ def make_task(context: Context, image: Image) -> SimulateTask:
     own = fingerprint(enhancing.fingerprint, enhancing.skipped, simulator, geometry, as_taken)
     neighbours = context.neighbours(image.image_id) if "neighbours" in simulator.needs else ()
     pose = context.pose(image.image_id)
-    return SimulateTask(enhancing, pose, ground_z_m, context.block.views_gsd_m, neighbours, as_taken, simulator, own)
+    gsd_m, remark = context.block.views_gsd_m, context.ground_remark(image.image_id)
+    return SimulateTask(enhancing, pose, ground_z_m, gsd_m, neighbours, as_taken, simulator, own, remark)
 
 
 def views_of(task: SimulateTask) -> tuple[View, ...]:
@@ -118,6 +126,7 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
             "fingerprint": task.fingerprint,
             "pictures": stay,
             "scale": task.enhance.source.scale,
+            "remark": task.remark,
             "views": [
                 {
                     "name": view.name,
@@ -133,6 +142,18 @@ def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: b
         },
         [f"{item.view.name}.png" for item in pictures] if stay else (),
     )
+
+
+def degenerate_view(workspace: Workspace, image: Image) -> str:
+    """What views.json says of a ground view that shows nothing, "" where there is none: the reason stated, or views
+    that together have too few pixels."""
+    record = whole_record(workspace.views(image.image_id))
+    if not record or record.get("remark"):
+        return str(record.get("remark", ""))
+    width_px, height_px = max(((v["width_px"], v["height_px"]) for v in record["views"]), key=math.prod, default=(0, 0))
+    if width_px * height_px >= _LEAST_PIXELS * record["scale"] ** 2 * image.width_px * image.height_px:
+        return ""
+    return f"degenerate ground view ({width_px}x{height_px} px of an image of {image.width_px}x{image.height_px} px)"
 
 
 def cost_facts(costs: Sequence[ViewCost], earlier: Mapping[str, Any]) -> dict[str, Any]:

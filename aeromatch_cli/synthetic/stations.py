@@ -8,7 +8,7 @@ import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, Pose
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import MODELS, from_colmap
+from aeromatch_cli.geometry.cameras import FISHEYE, MODELS, from_colmap
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 
@@ -43,15 +43,22 @@ class Station:
     height_m: float
 
 
+# Angle from the axis of a fisheye's corners at most.
+_WIDEST_RAD = 1.3
+
+
 def make_camera(lens: str, width_px: int, height_px: int, focal_share: float) -> Camera:
     """Camera of a lens model whose focal length is focal_share picture widths.
 
     The principal point lies 0.4 % off the middle; 1.5 % of barrel distortion in the corners and a tenth of that
-    decentred, where the model has them; one-to-one over the picture. Raises ConfigError on an unknown lens.
+    decentred, where the model has them; one-to-one over the picture. A fisheye's focal length is longer where corners
+    would be further than 74 degrees from the axis. Raises ConfigError on an unknown lens.
     """
     if lens not in MODELS:
         raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}")
     focal = focal_share * width_px
+    if lens == FISHEYE:  # it projects by angles: those of the corners stay below a right angle
+        focal = max(focal, 0.5 * float(np.hypot(width_px, height_px)) / _WIDEST_RAD)
     r2 = (width_px**2 + height_px**2) / (4.0 * focal**2)
     k2_share = 0.006 if "k2" in MODELS[lens] else 0.0
     values = {
@@ -62,8 +69,12 @@ def make_camera(lens: str, width_px: int, height_px: int, focal_share: float) ->
         "cy": 0.4965 * height_px,
         "k1": -(0.015 + k2_share) / r2,
         "k2": k2_share / r2**2,
+        "k3": 0.0006 / r2**3,
+        "k4": -0.0003 / r2**4,
         "p1": 0.0004 / float(np.sqrt(r2)),
         "p2": -0.0003 / float(np.sqrt(r2)),
+        "b1": -0.0008 * focal,
+        "b2": 0.0005 * focal,
     }
     return from_colmap(lens, width_px, height_px, tuple(values[name] for name in MODELS[lens]))
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
-from aeromatch_cli.geometry.cameras import colmap_params
+from aeromatch_cli.geometry.cameras import corner_params
 from aeromatch_cli.synthetic.flights import Flight
 from aeromatch_cli.synthetic.render import Rendered
 from aeromatch_cli.synthetic.stations import Exterior
@@ -140,7 +140,7 @@ def block_facts(flight: Flight, names: tuple[str, ...], heights_m: NDArray[Any])
 
 
 def _lens(camera: Camera) -> dict[str, Any]:
-    params = list(colmap_params(camera))
+    params = list(corner_params(camera))
     return {"model": camera.model, "width": camera.width_px, "height": camera.height_px, "params": params}
 
 

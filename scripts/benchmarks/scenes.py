@@ -18,7 +18,7 @@ from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import write_json
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
-from aeromatch_cli.geometry.cameras import colmap_params, from_colmap
+from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink, shrink_camera
 from aeromatch_cli.synthetic import render_block
@@ -192,6 +192,6 @@ def _reduce(source: Path, out: Path, max_size_px: int) -> None:
     for lens in facts["cameras"].values():
         camera = from_colmap(lens["model"], lens["width"], lens["height"], tuple(lens["params"]))
         small = shrink_camera(camera, scale)
-        lens.update(width=small.width_px, height=small.height_px, params=list(colmap_params(small)))
+        lens.update(width=small.width_px, height=small.height_px, params=list(corner_params(small)))
     shutil.copy(source / "reference" / "poses.csv", out / "poses.csv")
     write_json(out / "block.json", facts)  # last: it says that the rest is there

@@ -3,7 +3,8 @@
 `Pose/Rotation` is cam_from_world in the camera axes that `CameraOrientation` names (XRightYDown unless it says
 otherwise), as M_00 to M_22 or as Omega, Phi, Kappa with M = (Rx(omega) Ry(phi) Rz(kappa))'; `Center` is in the spatial
 reference system of the block or photo group, x being the easting or longitude. The photo group is the camera:
-`PrincipalPoint` counts from the centre of the first pixel; distortion is Brown's, as in OpenCV.
+`PrincipalPoint` counts from the centre of the first pixel; distortion is Brown's, with P1 and P2 exchanged against
+OpenCV's p1 and p2 (P1 goes with r^2 + 2 u^2); Skew is in pixels.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.lenses import Nearest, brown
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 # Directions in OpenCV's camera axes.
@@ -92,7 +93,7 @@ def _lens(group: Any) -> Nearest | None:
             number_of("PrincipalPoint/y", (size[1] - 1) / 2.0) + 0.5,
         )
         radial = [number_of(f"Distortion/K{k}", 0.0) for k in (1, 2, 3)]
-        tangential = number_of("Distortion/P1", 0.0), number_of("Distortion/P2", 0.0)
+        tangential = number_of("Distortion/P2", 0.0), number_of("Distortion/P1", 0.0)
         ratio, skew = number_of("AspectRatio", 1.0), number_of("Skew", 0.0)
     except (TypeError, ValueError, ZeroDivisionError):
         return None

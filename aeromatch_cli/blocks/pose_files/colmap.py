@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from aeromatch_cli.blocks.camera_files import read_camera_file
-from aeromatch_cli.blocks.lenses import Nearest, of_colmap
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, numbers, rotation_row, world_beside
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.lenses import Nearest, of_colmap
 from aeromatch_cli.geometry.rotations import from_quaternion
 
 _FLOAT = r"[-+0-9.eE]+"

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigma_m
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import Source, image_name
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
@@ -23,7 +25,7 @@ _DEGREES = re.compile(r"(\d+(?:\.\d+)?)\s*deg\s*(\d+(?:\.\d+)?)'\s*(\d+(?:\.\d+)
 _FIRST = "Composite"
 # ExifTool names tags without their namespace: which maker's they are.
 _NAMESPACES = (
-    (re.compile(r"Gimbal(Yaw|Pitch|Roll)Degree|RtkStd(Lon|Lat|Hgt)"), "drone-dji"),
+    (re.compile(r"Gimbal(Yaw|Pitch|Roll)Degree|RtkStd(Lon|Lat|Hgt)|RtkFlag"), "drone-dji"),
     (re.compile(r"Camera(Yaw|Pitch|Roll)Degree"), "drone-parrot"),
     (re.compile(r"Yaw|Pitch|Roll|GPS(XY|Z)Accuracy|IMU(Yaw|Pitch|Roll)Accuracy"), "Camera"),
 )
@@ -39,9 +41,9 @@ def is_exiftool(source: Source) -> bool:
 
 def read_exiftool(source: Source) -> PoseList:
     """Raises ConfigError where no image has a position, naming what was looked for."""
-    rows, unposed = [], 0
+    rows, unposed, said = [], 0, Counter[str]()
     for line, record in _records(source):
-        row = _row(line, record)
+        row = _row(line, record, said)
         unposed += row.position is None
         rows.append(row)
     if unposed == len(rows):
@@ -49,8 +51,9 @@ def read_exiftool(source: Source) -> PoseList:
             f"{source.path}: no image of this ExifTool table has GPSLatitude and GPSLongitude: write it by "
             "`exiftool -csv -n -r IMGS`"
         )
-    remarks = (f"{source.path.name}: {unposed} images have no GPS position there",) if unposed else ()
-    return PoseList(tuple(rows), "geographic", remarks, "ExifTool table")
+    remarks = [f"{source.path.name}: {unposed} images have no GPS position there"] if unposed else []
+    remarks += [f"{source.path.name}: {count} of {len(rows)} images had {what}" for what, count in said.items()]
+    return PoseList(tuple(rows), "geographic", tuple(remarks), "ExifTool table")
 
 
 def _records(source: Source) -> Iterator[tuple[int, Mapping[str, Any]]]:
@@ -66,7 +69,8 @@ def _records(source: Source) -> Iterator[tuple[int, Mapping[str, Any]]]:
             yield reader.line_num, dict(zip(names, cells, strict=False))
 
 
-def _row(line: int, record: Mapping[str, Any]) -> PoseRow:
+def _row(line: int, record: Mapping[str, Any], said: Counter[str]) -> PoseRow:
+    """said: gets what is to be said of an image, counted."""
     tags: dict[str, Any] = {}
     for name in sorted(record, key=lambda key: key.startswith(f"{_FIRST}:")):
         if record[name] not in ("", "-", None):
@@ -76,13 +80,18 @@ def _row(line: int, record: Mapping[str, Any]) -> PoseRow:
     xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
     angles = xmp_angles(xmp)
     known = latitude is not None and longitude is not None
+    sigmas_m, remark = position_sigmas_m(xmp)
+    if sigmas_m is None and not remark:
+        sigmas_m = completed_sigmas_m(across_m=tag_number(str(tags.get("GPSHPositioningError", "")).removesuffix(" m")))
+    if remark:
+        said[remark] += 1
     return PoseRow(
         image=image_name(str(record[_IMAGE])), line=line,
         position=(latitude, longitude, height) if latitude is not None and longitude is not None else None,
         position_kind="geographic",
         attitude=(angles.yaw_deg, angles.pitch_deg, angles.roll_deg) if angles and known else None,
         attitude_kind="yaw_pitch_roll" if angles and known else "none",
-        sigma_position_m=position_sigma_m(xmp), sigma_angle_deg=angle_sigma_deg(xmp),
+        sigmas_m=sigmas_m, sigma_angle_deg=angle_sigma_deg(xmp),
         forward=angles.convention == "gimbal" if angles and known else None, true_north=True,
     )  # fmt: skip
 

@@ -20,17 +20,19 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks import lenses
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.lenses import of_metashape
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
+from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
-_ACCURACIES = ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y", "accuracy_x/y/z", "accuracy")
+_ACCURACIES = ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y", "accuracy_x/y/z")
 # Geocentric coordinates of a place on the ground, and of nothing else.
 _EARTH_M = (6.2e6, 6.6e6)
 
@@ -87,7 +89,7 @@ def _column(cell: str) -> str:
     name = cell.strip().strip('"').lower()
     name = re.sub(r"^([xyz])/[a-z]+", r"\1", name)
     name = re.sub(r"[\s_]*\((m|deg|pix)\)$", "", name)
-    return re.sub(r"\s+", "_", name)
+    return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", re.sub(r"\s+", "_", name))
 
 
 def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
@@ -115,7 +117,9 @@ def _row(
     (x, y, z), from_estimate = triple(("x", "y", "z"))
     attitude, _ = triple(angles)
     whole = all(math.isfinite(v) for v in attitude)
-    sigmas = [v for name in _ACCURACIES if (v := value(name)) > 0.0]
+    x_m, y_m, z_m, across_m, overall_m = (value(name) for name in _ACCURACIES)
+    overall_m = overall_m if overall_m > 0.0 else value("accuracy")
+    sigmas_m = completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m)
     turns = [v for name in (*angles, "/".join(angles)) if (v := value(f"accuracy_{name}")) > 0.0]
     kind: PositionKind = "geographic" if geographic else "grid"
     row = PoseRow(
@@ -123,7 +127,7 @@ def _row(
         position=((y, x, z) if geographic else (x, y, z)) if math.isfinite(x + y) else None, position_kind=kind,
         attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
         forward=False, true_north=angles[0] == "yaw",
-        sigma_position_m=None if from_estimate else max(sigmas, default=None),
+        sigmas_m=None if from_estimate else sigmas_m,
         sigma_angle_deg=max(turns, default=None),
     )  # fmt: skip
     if whole and angles == _ANGLES[1]:
@@ -202,23 +206,15 @@ def _similarity(source: Source, element: Any) -> tuple[FloatArray, FloatArray, f
     return turn, shift, float(scale[0])
 
 
-def _sensor(sensor: Any) -> lenses.Nearest | None:
-    """The adjusted calibration of a frame camera; without camera for other types, None without a calibration."""
+def _sensor(sensor: Any) -> Nearest | None:
+    """The adjusted calibration; without camera for lenses that no model here describes, None without a calibration."""
     found = [c for c in sensor.findall("calibration") if c.get("class") == "adjusted"] or sensor.findall("calibration")
     if not found:
         return None
-    if found[0].get("type", "frame") != "frame":
-        return lenses.Nearest(None)
+    size = found[0].find("resolution")
+    size = sensor.find("resolution") if size is None else size
     try:
-        facts = {child.tag: float(child.text) for child in found[0] if child.tag != "resolution" and child.text}
-        size = found[0].find("resolution")
-        size = sensor.find("resolution") if size is None else size
         width, height = int(size.get("width")), int(size.get("height"))
-        f = facts["f"]
-        middle = width / 2.0 + facts.get("cx", 0.0), height / 2.0 + facts.get("cy", 0.0)
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+    except (AttributeError, TypeError, ValueError):
         return None
-    focal = f + facts.get("b1", 0.0), f
-    radial = [facts.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)]
-    tangential = facts.get("p2", 0.0), facts.get("p1", 0.0)
-    return lenses.brown((width, height), focal, middle, radial, tangential, facts.get("b2", 0.0))
+    return of_metashape(found[0], found[0].get("type", "frame"), width, height)

@@ -5,7 +5,8 @@ are, such as `#F=N X Y Z W P K` (N name, W P K omega, phi, kappa in degrees, S s
 
 Calibration (`FileInterne`, or `Interne` in the file): F, PP and SzIm in pixels, whole numbers being middles of pixels;
 ModRad and ModPhgrStd (Fraser) in powers of pixels from CDist, from the undistorted to the measured place
-(eConvApero_DistM2C; src/photogram/phgr_ebner_brown_dist.cpp).
+(eConvApero_DistM2C; src/photogram/phgr_ebner_brown_dist.cpp). P1 and P2 are exchanged against OpenCV's p1 and p2; b1
+and b2 turn the undistorted place, not the distorted one, so that only the nearest camera of ours has them.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown, nearest
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import brown_camera
+from aeromatch_cli.geometry.lenses import Nearest, brown, nearest
 
 _PREFIX = "Orientation-"
 # Conventions whose matrix takes the camera to the world with OpenCV's axes.
@@ -84,25 +86,27 @@ def _lens(calibration: Any) -> Nearest | None:
     except (TypeError, ValueError, OverflowError):
         return None
     powers = [term * focal ** (2 * k) for k, term in enumerate(radial, 1)]
-    middle = np.array(principal) + 0.5
-    if np.allclose(center, principal) and not b2:
-        return brown(
-            (width, height), (focal * (1.0 + b1), focal), (middle[0], middle[1]), powers, (p2 * focal, p1 * focal)
-        )
+    middle = principal[0] + 0.5, principal[1] + 0.5
+    if np.allclose(center, principal) and not b1 and not b2:
+        return brown((width, height), (focal, focal), middle, powers, (p2 * focal, p1 * focal))
 
     def forward(rays: FloatArray) -> FloatArray:
         x, y = (focal * rays + principal - center).T
         r2 = x * x + y * y
         factor = sum(term * r2**k for k, term in enumerate(radial, 1))
-        return np.column_stack(
-            [
-                x + x * factor + p1 * (2.0 * x * x + r2) + 2.0 * p2 * x * y + b1 * x + b2 * y,
-                y + y * factor + p2 * (2.0 * y * y + r2) + 2.0 * p1 * x * y,
-            ]
-        ) + (center + 0.5)
+        return (
+            np.column_stack(
+                [
+                    x + x * factor + p1 * (2.0 * x * x + r2) + 2.0 * p2 * x * y + b1 * x + b2 * y,
+                    y + y * factor + p2 * (2.0 * y * y + r2) + 2.0 * p1 * x * y,
+                ]
+            )
+            + center
+        )
 
-    first = powers[0] if powers else 0.0
-    return nearest((width, height), (focal, focal, middle[0], middle[1], first, 0.0, 0.0, 0.0), forward)
+    values = {"fx": focal * (1.0 + b1), "fy": focal, "skew": focal * b2, "cx": principal[0], "cy": principal[1]}
+    values |= {"p1": p2 * focal, "p2": p1 * focal} | {f"k{k}": term for k, term in enumerate(powers[:3], 1)}
+    return nearest(brown_camera((width, height), values), forward)
 
 
 def _values(element: Any, place: str, count: int) -> list[float]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
@@ -47,7 +48,7 @@ def read_geo_txt(source: Source) -> PoseList:
         values = [_value(source.at(line, f"{column}"), cell) for column, cell in enumerate(fields[1:9], start=2)]
         x, y, z = [*values, np.nan, np.nan][:3]
         angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
-        sigmas = values[6:8] if len(fields) >= _WITH_ACCURACIES else []
+        across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
         place = (y, x, z) if kind == "geographic" else (x, y, z)
         whole = bool(np.isfinite(angles).all())
         rows.append(
@@ -55,7 +56,7 @@ def read_geo_txt(source: Source) -> PoseList:
                 image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
                 position_kind=kind, attitude=tuple(angles) if whole else None,
                 attitude_kind="yaw_pitch_roll" if whole else "none", forward=False, true_north=True,
-                sigma_position_m=max((s for s in sigmas if s > 0), default=None),
+                sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
             )
         )  # fmt: skip
     given = [row.attitude for row in rows if row.attitude is not None]

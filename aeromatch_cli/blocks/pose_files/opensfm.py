@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown, fisheye
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.lenses import of_opensfm
 from aeromatch_cli.blocks.pose_files.geodesy import from_topocentric
 from aeromatch_cli.blocks.pose_files.odm import rotation_of_vector
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.geometry.cameras import from_colmap
 
 
 def is_reconstruction(source: Source) -> bool:
@@ -48,7 +48,7 @@ def read_reconstruction(source: Source) -> PoseList:
             centers.append(-rotation.T @ translation)
             ids.append(str(shot.get("camera", "")))
         for key, entry in part["cameras"].items():
-            cameras.add(str(key), _camera(entry))
+            cameras.add(str(key), of_opensfm(entry))
         reference = _reference(source, part)
         places: FloatArray = np.array(centers).reshape(-1, 3)
         local: list[FloatArray | None] = [*rotations]
@@ -87,28 +87,6 @@ def _reference(source: Source, part: Any) -> tuple[float, float, float] | None:
     return (values[0], values[1], values[2]) if any(values) else None
 
 
-def _camera(entry: Any) -> Nearest | None:
-    """Without camera for models that are not known here (spherical), None for incomplete ones."""
-    try:
-        width, height = int(entry["width"]), int(entry["height"])
-        longer = max(width, height)
-        model = entry["projection_type"]
-        if model == "perspective":
-            f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
-            return Nearest(from_colmap("RADIAL", width, height, (f, *middle, float(entry["k1"]), float(entry["k2"]))))
-        if model == "brown":
-            fx, fy = (float(entry[key]) * longer for key in ("focal_x", "focal_y"))
-            cx, cy = width / 2.0 + float(entry["c_x"]) * longer, height / 2.0 + float(entry["c_y"]) * longer
-            radial = [float(entry.get(key, 0.0)) for key in ("k1", "k2", "k3")]
-            return brown((width, height), (fx, fy), (cx, cy), radial, (float(entry["p1"]), float(entry["p2"])))
-        if model == "fisheye":
-            f, middle = float(entry["focal"]) * longer, (width / 2.0, height / 2.0)
-            return fisheye((width, height), (f, f), middle, (float(entry["k1"]), float(entry["k2"])))
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
-    return Nearest(None)
-
-
 def is_overrides(source: Source) -> bool:
     tree = source.tree
     if not isinstance(tree, dict) or not tree:
@@ -133,7 +111,7 @@ def read_overrides(source: Source) -> PoseList:
         rows.append(
             PoseRow(
                 image=image_name(name), line=0, position=place, position_kind="geographic", attitude=angles,
-                attitude_kind="omega_phi_kappa" if angles else "none", sigma_position_m=sigma or None,
+                attitude_kind="omega_phi_kappa" if angles else "none", sigmas_m=completed_sigmas_m(overall_m=sigma),
             )
         )  # fmt: skip
     return PoseList(tuple(rows), "geographic", (), "OpenSfM exif_overrides.json")

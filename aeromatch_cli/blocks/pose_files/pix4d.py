@@ -5,7 +5,8 @@ Geolocation: `name,c1,c2,z[,a1,a2,a3][,accuracy_horizontal,accuracy_vertical]`. 
 roll from straight down: nothing in the file tells them, so of flights that look down the column that turns most does.
 
 *_calibrated_camera_parameters.txt: eight lines of header, then for every image its name and size, K, radial and
-tangential distortion, t (the projection centre less the project's offset) and R (cam_from_world in OpenCV's axes). The
+tangential distortion (T1, T2 in OpenCV's order), t (the projection centre less the project's offset) and R
+(cam_from_world in OpenCV's axes). The
 offset lies beside in *_offset.xyz.
 """
 
@@ -16,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import (
     IMAGE,
     CameraShelf,
@@ -30,6 +31,7 @@ from aeromatch_cli.blocks.pose_files.source import (
 )
 from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.lenses import Nearest, brown
 
 _COUNTS = (4, 6, 7, 9)
 _LINES_OF_IMAGE = 10
@@ -90,13 +92,13 @@ def _row(
 ) -> PoseRow:
     first, second, height = values[:3]
     angles = tuple(values[3:6]) if len(values) >= 6 else None
-    sigmas = values[6:8] if len(values) == 8 else values[3:5] if len(values) == 5 else []
+    across_m, up_m = values[-2:] if len(values) in (5, 8) else (None, None)
     return PoseRow(
         image=image_name(name), line=line, position=(second, first, height) if exchanged else (first, second, height),
         position_kind=kind, attitude=angles, attitude_kind=form if angles else "none",
         forward=False if angles and form == "yaw_pitch_roll" else None,
         true_north=bool(angles) and form == "yaw_pitch_roll",
-        sigma_position_m=max((s for s in sigmas if s > 0.0), default=None),
+        sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
     )  # fmt: skip
 
 

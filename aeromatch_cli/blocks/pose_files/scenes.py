@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest, brown, fisheye
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, number, numbers, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
+from aeromatch_cli.geometry.lenses import Nearest, brown, fisheye
 from aeromatch_cli.geometry.rotations import from_quaternion
 
 _NVM = ("f", "qw", "qx", "qy", "qz", "x", "y", "z")

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.lenses import Nearest
+from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
+from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
@@ -134,9 +135,9 @@ class CameraShelf:
             return
         if lens.camera is not None:
             self.found[key] = lens.camera
-        remark = lens.remark(f"{self.file}, camera {key}")
-        if remark and remark not in self.remarks:
-            self.remarks.append(remark)
+        said = remark(lens, f"{self.file}, camera {key}")
+        if said and said not in self.remarks:
+            self.remarks.append(said)
 
     def key(self, wanted: str) -> str:
         """The name for a row, "" where there is no such camera."""
@@ -205,7 +206,6 @@ def rotation_row(
     *,
     true_north: bool = False,
     camera: str = "",
-    sigma_position_m: float | None = None,
 ) -> PoseRow:
     """A row of a projection centre and a matrix cam_from_world (3, 3), relative to the grid or to true north."""
     x, y, z = (float(value) for value in center)
@@ -216,6 +216,5 @@ def rotation_row(
         attitude = to_quaternion(rotation)
     return PoseRow(
         image=image_name(image), line=line, position=(x, y, z), position_kind=kind, attitude=attitude,
-        attitude_kind="none" if attitude is None else "quaternion", camera=camera, sigma_position_m=sigma_position_m,
-        true_north=true_north,
+        attitude_kind="none" if attitude is None else "quaternion", camera=camera, true_north=true_north,
     )  # fmt: skip

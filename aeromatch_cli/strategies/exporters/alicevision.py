@@ -8,16 +8,18 @@ as text, the principal point from the middle of the image (version 1.2.1).
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.geometry.cameras import is_fisheye, parameters
+from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write, write_world
+from aeromatch_cli.strategies.exporters.solution import Solution, held, matched, summary_of, write, write_world
 
 _VERSION = ["1", "2", "1"]
 
@@ -46,11 +48,12 @@ class AliceVision(Strategy):
                 for id0, id1, rows in found.pairs
             )
             write(partial / "matches" / "0.matches.txt", "".join(blocks))
-            write(partial / "cameras.sfm", json.dumps(_sfm(solution, views), indent=1))
-            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+            cameras, remarks = held(solution, "AliceVision", in_colmap)  # it has no b2 either
+            write(partial / "cameras.sfm", json.dumps(_sfm(solution, cameras, views), indent=1))
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts, remarks)
 
 
-def _sfm(solution: Solution, views: dict[str, int]) -> dict[str, Any]:
+def _sfm(solution: Solution, cameras: Mapping[str, Camera], views: dict[str, int]) -> dict[str, Any]:
     numbers = {camera_id: str(number) for number, camera_id in enumerate(sorted(solution.cameras), start=1)}
     poses = []
     for image_id, (rotation, center_m) in solution.poses.items():
@@ -69,24 +72,26 @@ def _sfm(solution: Solution, views: dict[str, int]) -> dict[str, Any]:
             for image in solution.images
         ],
         "intrinsics": [
-            {"intrinsicId": number, **_intrinsic(solution.cameras[camera_id])} for camera_id, number in numbers.items()
+            {"intrinsicId": number, **_intrinsic(cameras[camera_id])} for camera_id, number in numbers.items()
         ],
         "poses": poses,
     }  # fmt: skip
 
 
 def _intrinsic(camera: Camera) -> dict[str, Any]:
-    """Brown's model, with focal lengths in pixels; the sensor counts as 36 mm wide."""
+    """Brown's model, or OpenCV's fisheye, with focal lengths in pixels; the sensor counts as 36 mm wide."""
     values, sensor_mm = parameters(camera), 36.0
     focal_px = _texts([values["fx"], values["fy"]])
     # AliceVision adds half the size to it, in the frame of the features.
     middle = camera.width_px / 2.0, camera.height_px / 2.0
+    kind, names = ("fisheye4", ("k1", "k2", "k3", "k4")) if is_fisheye(camera) else (
+        "brown", ("k1", "k2", "k3", "p1", "p2"))  # fmt: skip
     return {
         "width": str(camera.width_px), "height": str(camera.height_px), "sensorWidth": f"{sensor_mm}",
-        "sensorHeight": f"{sensor_mm * camera.height_px / camera.width_px:.15g}", "type": "brown",
+        "sensorHeight": f"{sensor_mm * camera.height_px / camera.width_px:.15g}", "type": kind,
         "serialNumber": "", "initializationMode": "calibrated", "pxInitialFocalLength": focal_px[0],
         "pxFocalLength": focal_px, "principalPoint": _texts([values["cx"] - middle[0], values["cy"] - middle[1]]),
-        "distortionParams": _texts([values["k1"], values["k2"], 0.0, values["p1"], values["p2"]]), "locked": "0",
+        "distortionParams": _texts([values[name] for name in names]), "locked": "0",
     }  # fmt: skip
 
 

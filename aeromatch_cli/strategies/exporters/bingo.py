@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.geometry.cameras import focal_px, parameters, undistort
+from aeromatch_cli.geometry.cameras import focal_px, normalise, parameters
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
@@ -49,13 +49,14 @@ class Bingo(Strategy):
                 places = np.asarray(contents.keypoints_px(image.image_id), np.float64).reshape(-1, 2)
                 keypoints += len(places)
                 own = rows[number - 1]
-                values = parameters(camera)
-                flat = undistort(camera, places[found.keypoint[own]]) - [values["cx"], values["cy"]]
+                rays = normalise(camera, places[found.keypoint[own]])
                 names.append(f"{number} {image.name}\n")
                 lines.append(f"{number} {focal_px(camera) * mm:.5f}\n")
-                # One focal length: as if pixels were square.
-                square = focal_px(camera) * mm / np.array([values["fx"], -values["fy"]])
-                for track, (x, y) in zip(found.track[own], flat * square, strict=True):
+                # As a camera of one focal length, without distortion and skew, would have them; y upwards.
+                measured = rays * focal_px(camera) * mm * [1.0, -1.0]
+                for track, (x, y) in zip(found.track[own], measured, strict=True):
+                    if not np.isfinite(x + y):  # no ray of the lens has that pixel
+                        continue
                     lines.append(f"{track + 1} {x:.6f} {y:.6f}\n")
                 lines.append(_END)
             write(partial / "image.txt", "".join(lines))

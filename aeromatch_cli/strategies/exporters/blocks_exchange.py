@@ -1,7 +1,8 @@
 """BlocksExchange XML with tie points, for Metashape, ContextCapture and iTwin Capture.
 
 Pixels count from the middle of the first pixel; rotations are cam_from_world with x right and y down; centres are in
-the block's CRS.
+the block's CRS. Distortion is Brown's, with P1 and P2 exchanged against OpenCV's p1 and p2, and Skew is b2 in pixels: a
+fisheye lens is written as the nearest such camera.
 """
 
 from __future__ import annotations
@@ -15,10 +16,19 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, Image
-from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.geometry.cameras import BROWN, MODELS, parameters
+from aeromatch_cli.geometry.lenses import nearest_of
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, keypoints_of, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import (
+    Matched,
+    Solution,
+    held,
+    keypoints_of,
+    matched,
+    summary_of,
+    write,
+)
 
 _LOCAL = "local"
 
@@ -26,7 +36,7 @@ _LOCAL = "local"
 class BlocksExchange(Strategy):
     """Writes blocks.xml: cameras, poses, and the points of the adjusted block with their measurements."""
 
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     name: Literal["blocks-exchange"] = "blocks-exchange"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -39,9 +49,10 @@ class BlocksExchange(Strategy):
             of_camera: dict[str, list[tuple[int, Image]]] = defaultdict(list)
             for place, image in enumerate(solution.images):
                 of_camera[image.camera_id].append((place, image))
+            cameras, remarks = held(solution, "BlocksExchange", lambda camera: nearest_of(camera, MODELS[BROWN]))
             groups = "".join(
                 _group(number, camera, of_camera[camera_id], solution, origin_m)
-                for number, (camera_id, camera) in enumerate(sorted(solution.cameras.items()))
+                for number, (camera_id, camera) in enumerate(cameras.items())
             )
             system = "" if crs == _LOCAL else "<SRSId>0</SRSId>"
             systems = "" if crs == _LOCAL else (
@@ -56,7 +67,7 @@ class BlocksExchange(Strategy):
                 "</TiePoints>\n</Block>\n</BlocksExchange>\n",
             )
             count = sum(map(len, keypoints.values()))
-            return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
+            return summary_of(folder, partial, contents, len(solution.poses), count, found.counts, remarks)
 
 
 def _group(
@@ -65,15 +76,15 @@ def _group(
     """images: of the camera, with their places among all."""
     values = parameters(camera)
     lens = "".join(
-        f"<{tag}>{values.get(key, 0.0):.12g}</{tag}>"
-        for tag, key in (("K1", "k1"), ("K2", "k2"), ("K3", ""), ("P1", "p1"), ("P2", "p2"))
+        f"<{tag}>{values[key]:.12g}</{tag}>"
+        for tag, key in (("K1", "k1"), ("K2", "k2"), ("K3", "k3"), ("P1", "p2"), ("P2", "p1"))
     )
     photos = "".join(_photo(place, image, solution, origin_m) for place, image in images)
     return (
         f"<Photogroup><Name>{number}</Name><ImageDimensions><Width>{camera.width_px}</Width><Height>{camera.height_px}"
         "</Height></ImageDimensions><CameraModelType>Perspective</CameraModelType>"
         f"<FocalLengthPixels>{values['fx']:.9g}</FocalLengthPixels><AspectRatio>{values['fy'] / values['fx']:.12g}"
-        f"</AspectRatio><Skew>0</Skew><PrincipalPoint><x>{values['cx']:.9g}</x><y>{values['cy']:.9g}</y></PrincipalPoint>"
+        f"</AspectRatio><Skew>{values['skew']:.12g}</Skew><PrincipalPoint><x>{values['cx']:.9g}</x><y>{values['cy']:.9g}</y></PrincipalPoint>"
         f"<Distortion>{lens}</Distortion><CameraOrientation>XRightYDown</CameraOrientation>\n{photos}</Photogroup>\n"
     )
 

@@ -9,6 +9,7 @@ world.json.
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from types import ModuleType
@@ -20,13 +21,15 @@ from pydantic import Field
 from aeromatch_cli.data import Camera, Image, IntArray, Pose
 from aeromatch_cli.errors import WorkspaceError
 from aeromatch_cli.formats.adjusted import orientation_text
-from aeromatch_cli.geometry.cameras import colmap_params
+from aeromatch_cli.formats.residuals import residuals_text
+from aeromatch_cli.geometry.cameras import colmap_camera
 from aeromatch_cli.geometry.epipolar import fundamental
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.colmap_model import Numbers, import_pycolmap, write_model
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, PairContents, whole_folder
-from aeromatch_cli.strategies.exporters.solution import write_world
+from aeromatch_cli.strategies.exporters.solution import Solution, held, write_world
 
 # Ours (pixel centre) to COLMAP's pixel frame (corner).
 _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFSET_PX], [0.0, 0.0, 1.0]])
@@ -34,11 +37,11 @@ _COLMAP_FROM_PX = np.array([[1.0, 0.0, COLMAP_OFFSET_PX], [0.0, 1.0, COLMAP_OFFS
 
 class Colmap(Strategy):
     """Writes database.db (cameras, rigs, frames, images, keypoints, matches, two-view geometries, pose priors),
-    sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv. Where an image name
-    contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
+    sparse/{cameras,images,points3D}.txt, world.json and, of an adjusted block, orientation.csv and residuals.csv. Where
+    an image name contains a space, which COLMAP cannot read from text, sparse holds the binary model as well.
     """
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["colmap"] = "colmap"
     raw_matches: bool = Field(
         True, description="Also write the matches before filtering, so that COLMAP can verify them itself."
@@ -51,28 +54,37 @@ class Colmap(Strategy):
         """Replace `folder`. WorkspaceError where it cannot be written, ValueError on a match without keypoint."""
         with whole_folder(folder) as partial:
             ids = Numbers.of(contents.block)
-            counts = self._write_database(contents, ids, partial / "database.db")
-            posed = write_model(contents, ids, partial / "sparse")
+            lenses = {k: in_colmap(camera).camera or camera for k, camera in contents.block.cameras.items()}
+            counts = self._write_database(contents, lenses, ids, partial / "database.db")
+            cameras, remarks = held(Solution.of(contents), "COLMAP", in_colmap)
+            posed = write_model(contents, cameras, ids, partial / "sparse")
             if contents.adjusted is not None:
                 text = orientation_text(contents.adjusted, contents.block)
                 (partial / "orientation.csv").write_text(text, encoding="utf-8")
+            if contents.residuals:
+                text = residuals_text(contents.residuals, contents.block.images)
+                (partial / "residuals.csv").write_text(text, encoding="utf-8")
             write_world(partial, contents.block)
             names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
         return ExportSummary(
             files=tuple(folder / name for name in names),
             images=len(contents.block.images),
             posed_images=posed,
+            remarks=tuple(remarks),
             **counts,
         )
 
-    def _write_database(self, contents: ExportContents, ids: Numbers, path: Path) -> dict[str, int]:
+    def _write_database(
+        self, contents: ExportContents, lenses: Mapping[str, Camera], ids: Numbers, path: Path
+    ) -> dict[str, int]:
+        """lenses: cameras of the block as COLMAP can hold them."""
         pycolmap = import_pycolmap()
         try:
             # No pycolmap.DatabaseTransaction: it aborts the process on a full disk, and is no faster.
             with pycolmap.Database.open(path) as database:
-                _write_cameras(pycolmap, database, contents, ids)
+                _write_cameras(pycolmap, database, contents, lenses, ids)
                 sizes = self._write_images(pycolmap, database, contents, ids)
-                counts = self._write_pairs(pycolmap, database, contents, ids, sizes)
+                counts = self._write_pairs(pycolmap, database, contents, lenses, ids, sizes)
         except RuntimeError as error:
             raise WorkspaceError(f"{path} cannot be written ({error}); check free space, then run again") from error
         if path.with_name(path.name + "-wal").exists():
@@ -97,11 +109,12 @@ class Colmap(Strategy):
         return sizes
 
     def _write_pairs(
-        self, pycolmap: ModuleType, database: Any, contents: ExportContents, ids: Numbers, sizes: dict[str, int]
-    ) -> dict[str, int]:
+        self, pycolmap: ModuleType, database: Any, contents: ExportContents, lenses: Mapping[str, Camera], ids: Numbers,
+        sizes: dict[str, int],
+    ) -> dict[str, int]:  # fmt: skip
         """Matches and two-view geometries; returns the counts of the summary."""
         counts = dict.fromkeys(("matched_pairs", "matches", "verified_pairs", "verified_matches"), 0)
-        cameras = {image.image_id: contents.block.camera(image) for image in contents.block.images}
+        cameras = {image.image_id: lenses[image.camera_id] for image in contents.block.images}
         for item in contents.pairs:
             id0, id1 = item.pair.image_id0, item.pair.image_id1
             _check_indices(item, ids, sizes)
@@ -124,17 +137,20 @@ def _leave_wal_mode(path: Path) -> None:
         connection.execute("PRAGMA journal_mode = DELETE")
 
 
-def _write_cameras(pycolmap: ModuleType, database: Any, contents: ExportContents, ids: Numbers) -> None:
+def _write_cameras(
+    pycolmap: ModuleType, database: Any, contents: ExportContents, lenses: Mapping[str, Camera], ids: Numbers
+) -> None:
     """Cameras, each with the rig of one sensor that COLMAP 4 asks for."""
     for camera_id, number in ids.camera.items():
-        camera = contents.block.cameras[camera_id]
+        camera = lenses[camera_id]
+        model, params = colmap_camera(camera)
         database.write_camera(
             pycolmap.Camera(
                 camera_id=number,
-                model=camera.model,
+                model=model,
                 width=camera.width_px,
                 height=camera.height_px,
-                params=colmap_params(camera),
+                params=params,
                 has_prior_focal_length=camera_id not in contents.guessed_cameras,
             ),
             use_camera_id=True,

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Block, Camera, FloatArray, Image
-from aeromatch_cli.geometry.cameras import colmap_params
+from aeromatch_cli.geometry.cameras import colmap_camera
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies.exporters.contents import ExportContents
@@ -48,11 +48,13 @@ def import_pycolmap() -> ModuleType:
     return pycolmap
 
 
-def write_model(contents: ExportContents, ids: Numbers, sparse: Path) -> int:
-    """cameras.txt, images.txt and points3D.txt in the new folder `sparse`; returns the number of images with a pose."""
+def write_model(contents: ExportContents, cameras: Mapping[str, Camera], ids: Numbers, sparse: Path) -> int:
+    """cameras.txt, images.txt and points3D.txt in the new folder `sparse`; returns the number of images with a pose.
+
+    cameras: by camera_id, those that COLMAP can hold.
+    """
     sparse.mkdir()
     block, adjusted = contents.block, contents.adjusted
-    cameras = block.cameras if adjusted is None else adjusted.cameras
     posed = _posed_images(block) if adjusted is None else _adjusted_images(block, adjusted)
     (sparse / "cameras.txt").write_text(_cameras_text(cameras, ids), encoding="utf-8")
     with (sparse / "images.txt").open("w", encoding="utf-8") as stream:
@@ -97,8 +99,9 @@ def _cameras_text(cameras: Mapping[str, Camera], ids: Numbers) -> str:
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for camera_id, number in ids.camera.items():
         camera = cameras[camera_id]
-        params = " ".join(f"{value:.17g}" for value in colmap_params(camera))
-        lines.append(f"{number} {camera.model} {camera.width_px} {camera.height_px} {params}")
+        model, values = colmap_camera(camera)
+        params = " ".join(f"{value:.17g}" for value in values)
+        lines.append(f"{number} {model} {camera.width_px} {camera.height_px} {params}")
     return "\n".join(lines) + "\n"
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose
+from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose, PoseResidual
 from aeromatch_cli.errors import WorkspaceError
 
 
@@ -36,7 +36,7 @@ class ExportContents:
     guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
     positions: image_id -> position as it was given, with its standard deviation; None: those of the block. adjusted:
     the block after bundle adjustment, or None. geographic: world (N, 3) -> WGS84 latitude, longitude in degrees and
-    height (N, 3); None in a local frame.
+    height (N, 3); None in a local frame. residuals: of the adjusted images, by image_id.
     """
 
     block: Block
@@ -46,11 +46,13 @@ class ExportContents:
     positions: Mapping[str, Pose] | None = None
     adjusted: AdjustedBlock | None = None
     geographic: Callable[[FloatArray], FloatArray] | None = None
+    residuals: Mapping[str, PoseResidual] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """Counts of what was written. files: absolute or relative as the folder was given, sorted."""
+    """Counts of what was written. files: absolute or relative as the folder was given, sorted. remarks: for a person,
+    on what the format does not hold."""
 
     files: tuple[Path, ...]
     images: int
@@ -60,6 +62,7 @@ class ExportSummary:
     matches: int
     verified_pairs: int
     verified_matches: int
+    remarks: tuple[str, ...] = ()
 
 
 @contextmanager

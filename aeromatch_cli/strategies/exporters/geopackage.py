@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.formats.residuals import fields_of
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
@@ -26,10 +27,10 @@ _MADE = "2000-01-01T00:00:00.000Z"
 
 
 class GeoPackage(Strategy):
-    """Writes block.gpkg: camera positions, footprints and pairs with their verified matches, and styles for QGIS; needs
-    pyogrio."""
+    """Writes block.gpkg: camera positions with the residuals of an adjusted block, footprints and pairs with their
+    verified matches, and styles for QGIS; needs pyogrio."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["geopackage"] = "geopackage"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -49,7 +50,7 @@ class GeoPackage(Strategy):
             write_layer(
                 path, "cameras", [Point(links.positions[i] + origin_m) for i in ids], "Point Z", crs,
                 {"image": [names[i] for i in ids], "matches": [links.ties[i] for i in ids],
-                 "weak": [links.ties[i] < WEAK_MATCHES for i in ids]},
+                 "weak": [links.ties[i] < WEAK_MATCHES for i in ids], **_residual_fields(contents, ids)},
             )  # fmt: skip
             areas = sorted(block_footprints(block).items())
             write_layer(
@@ -66,6 +67,14 @@ class GeoPackage(Strategy):
             write_styles(path, ("cameras", *(("footprints",) if areas else ()), *(("pairs",) if links.lines else ())))
             count = sum(len(contents.keypoints_px(image.image_id)) for image in solution.images)
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
+
+
+def _residual_fields(contents: ExportContents, ids: Sequence[str]) -> dict[str, list[Any]]:
+    """Columns of residuals.csv for the layer of cameras, none of a block that is not adjusted."""
+    if not contents.residuals:
+        return {}
+    rows = [fields_of(contents.residuals.get(image_id)) for image_id in ids]
+    return {name: [row[name] for row in rows] for name in fields_of(None)}
 
 
 def write_styles(path: Path, layers: Sequence[str]) -> None:

@@ -1,8 +1,9 @@
 """OpenSfM and ODM: features, matches, tracks and metadata of a project, for create_tracks and reconstruct.
 
-Pixels (opensfm/features.py): u = (x + 0.5 - w / 2) / max(w, h) of x from the centre of the first pixel; the same for
-v. tracks.csv is version 2 (src/map/src/tracks_manager.cc). Matches are pickled under numpy 1's module names, which
-both OpenSfM and ODM's fork load. GPS positions are those that were given.
+Cameras are `brown` or `fisheye_opencv`, which hold all but b2. Pixels (opensfm/features.py): u = (x + 0.5 - w / 2) /
+max(w, h) of x from the centre of the first pixel; the same for v. tracks.csv is version 2
+(src/map/src/tracks_manager.cc). Matches are pickled under numpy 1's module names, which both OpenSfM and ODM's fork
+load. GPS positions are those that were given.
 """
 
 from __future__ import annotations
@@ -10,17 +11,19 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray, Image
-from aeromatch_cli.geometry.cameras import parameters
+from aeromatch_cli.geometry.cameras import is_fisheye, parameters
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, called, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Matched, Solution, called, held, matched, summary_of, write
 
 _TRACKS_HEAD = "OPENSFM_TRACKS_VERSION_v2\n"
 _FEATURES_VERSION = 3
@@ -52,9 +55,9 @@ class OpenSfm(Strategy):
             write(partial / "tracks.csv", _tracks_text(found, solution, places, names))
             write(partial / "image_list.txt", "".join(f"images/{image.name}\n" for image in solution.images))
             write(partial / "config.yaml", _CONFIG)
-            _write_metadata(partial, contents, solution, names)
+            remarks = _write_metadata(partial, contents, solution, names)
             keypoints = sum(map(len, places.values()))
-            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts)
+            return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts, remarks)
 
 
 def _normalised(contents: ExportContents, image: Image) -> FloatArray:
@@ -99,9 +102,16 @@ def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArra
     return "".join(lines)
 
 
-def _write_metadata(partial: Path, contents: ExportContents, solution: Solution, names: dict[str, str]) -> None:
-    models = {camera_id: camera_model(camera) for camera_id, camera in solution.cameras.items()}
-    keys = {camera_id: f"v2 aeromatch {camera_id} {m['width']} {m['height']} brown" for camera_id, m in models.items()}
+def _write_metadata(
+    partial: Path, contents: ExportContents, solution: Solution, names: dict[str, str]
+) -> Sequence[str]:
+    """Returns remarks on cameras that OpenSfM cannot hold."""
+    cameras, remarks = held(solution, "OpenSfM", in_colmap)  # what it holds of lenses is what COLMAP holds
+    models = {camera_id: camera_model(cameras[camera_id]) for camera_id in solution.cameras}
+    keys = {
+        camera_id: f"v2 aeromatch {camera_id} {m['width']} {m['height']} {m['projection_type']}"
+        for camera_id, m in models.items()
+    }
     write(partial / "camera_models.json", _json({keys[camera_id]: model for camera_id, model in models.items()}))
     given = contents.block.poses if contents.positions is None else contents.positions
     gps: dict[str, dict[str, float]] = {}
@@ -116,8 +126,8 @@ def _write_metadata(partial: Path, contents: ExportContents, solution: Solution,
         model = models[image.camera_id]
         exif = {
             "make": "aeromatch", "model": image.camera_id, "width": image.width_px, "height": image.height_px,
-            "projection_type": "brown", "focal_ratio": model["focal_x"], "orientation": 1, "capture_time": 0.0,
-            "camera": keys[image.camera_id], "skey": "", "gps": gps.get(image.image_id, {}),
+            "projection_type": model["projection_type"], "focal_ratio": model["focal_x"], "orientation": 1,
+            "capture_time": 0.0, "camera": keys[image.camera_id], "skey": "", "gps": gps.get(image.image_id, {}),
         }  # fmt: skip
         write(partial / "exif" / f"{names[image.image_id]}.exif", _json(exif))
     means = (
@@ -126,17 +136,20 @@ def _write_metadata(partial: Path, contents: ExportContents, solution: Solution,
         else [0.0] * 2
     )
     write(partial / "reference_lla.json", _json({"latitude": means[0], "longitude": means[1], "altitude": 0.0}))
+    return remarks
 
 
 def camera_model(camera: Camera) -> dict[str, Any]:
-    """OpenSfM's `brown`: lengths as shares of the longer side, the principal point from the middle of the image."""
+    """OpenSfM's `brown` or `fisheye_opencv`: lengths as shares of the longer side, the principal point from the middle
+    of the image."""
     values, longer = parameters(camera), max(camera.width_px, camera.height_px)
     middle = camera.width_px / 2.0 - COLMAP_OFFSET_PX, camera.height_px / 2.0 - COLMAP_OFFSET_PX
+    model, terms = ("fisheye_opencv", ("k1", "k2", "k3", "k4")) if is_fisheye(camera) else (
+        "brown", ("k1", "k2", "k3", "p1", "p2"))  # fmt: skip
     return {
-        "projection_type": "brown", "width": camera.width_px, "height": camera.height_px,
+        "projection_type": model, "width": camera.width_px, "height": camera.height_px,
         "focal_x": values["fx"] / longer, "focal_y": values["fy"] / longer, "c_x": (values["cx"] - middle[0]) / longer,
-        "c_y": (values["cy"] - middle[1]) / longer, "k1": values["k1"], "k2": values["k2"], "k3": 0.0,
-        "p1": values["p1"], "p2": values["p2"],
+        "c_y": (values["cy"] - middle[1]) / longer, **{name: values[name] for name in terms},
     }  # fmt: skip
 
 

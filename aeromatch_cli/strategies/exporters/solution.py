@@ -11,6 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
 from aeromatch_cli.errors import ItemError
+from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary
 
 
@@ -136,19 +137,52 @@ def keypoints_of(contents: ExportContents) -> dict[str, FloatArray]:
 
 
 def summary_of(
-    folder: Path, partial: Path, contents: ExportContents, posed: int, keypoints: int, counts: Mapping[str, int]
+    folder: Path,
+    partial: Path,
+    contents: ExportContents,
+    posed: int,
+    keypoints: int,
+    counts: Mapping[str, int],
+    remarks: Iterable[str] = (),
 ) -> ExportSummary:
     """partial: the scratch folder that holds the files now."""
     names = sorted(path.relative_to(partial) for path in partial.rglob("*") if path.is_file())
     return ExportSummary(
         files=tuple(folder / name for name in names), images=len(contents.block.images), posed_images=posed,
-        keypoints=keypoints, **counts,
+        keypoints=keypoints, remarks=tuple(remarks), **counts,
     )  # fmt: skip
+
+
+def held(
+    solution: Solution, program: str, nearest: Callable[[Camera], Nearest]
+) -> tuple[Mapping[str, Camera], list[str]]:
+    """camera_id -> the camera that a program's format holds, and a remark for each that is another one.
+
+    nearest: the camera of those that the format holds.
+    """
+    cameras, remarks = {}, []
+    for camera_id, camera in sorted(solution.cameras.items()):
+        found = nearest(camera)
+        cameras[camera_id] = found.camera or camera
+        remarks += misfit_remark(camera_id, program, found)
+    return cameras, remarks
+
+
+def misfit_remark(camera_id: str, program: str, found: Nearest) -> list[str]:
+    """One sentence where the camera that was written is another one."""
+    if not found.differs:
+        return []
+    return [f"camera {camera_id}: {program} has no such lens model; the nearest one is written, {found.misfit}"]
 
 
 def write_world(folder: Path, block: Block) -> None:
     """world.json: in which CRS, less which origin, coordinates count that a format has no place for."""
-    world = {"crs": block.crs, "origin_m": list(block.origin_m), "note": "coordinate in crs = coordinate here + origin"}
+    world = {
+        "crs": block.crs,
+        "origin_m": list(block.origin_m),
+        "unit": "m" if block.metric else "arbitrary",
+        "note": "coordinate in crs = coordinate here + origin",
+    }
     write(folder / "world.json", json.dumps(world, indent=2) + "\n")
 
 

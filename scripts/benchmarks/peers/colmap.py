@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.geometry.cameras import colmap_params
+from aeromatch_cli.geometry.cameras import colmap_camera
 from benchmarks.peers.base import MIN_INLIERS, Described, Found, Options, Scene, found, read_gray
 from benchmarks.peers.matching import RATIO
 from benchmarks.peers.opencv import CONTRAST_THRESHOLD
@@ -47,8 +47,8 @@ class Colmap:
         import pycolmap
 
         size = {"width": camera.width_px, "height": camera.height_px}
-        params = list(colmap_params(camera))
-        lens = pycolmap.Camera(model=camera.model, params=params, has_prior_focal_length=True, **size)
+        model, params = colmap_camera(camera)
+        lens = pycolmap.Camera(model=model, params=list(params), has_prior_focal_length=True, **size)
         entry = pycolmap.Image(name=image, camera_id=self.database.write_camera(lens))
         return int(self.database.write_image(entry))
 

@@ -1,0 +1,62 @@
+"""OpenDroneMap's gcp_list.txt: coordinates and image measurements in one file.
+
+First line: the CRS of the coordinates, as a code (EPSG:32633), a PROJ string, or "WGS84 UTM 33N". Then one line for
+every point in every image, separated by blanks or tabs:
+
+  geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z [accuracy_px]]
+
+im_x, im_y: pixels from the upper left corner of the image. A point without a name is known by its coordinates. A point
+with the word "check" (or "checkpoint") behind its name takes no part in the fit. ODM ignores what stands behind the
+name; two or three positive numbers there are standard deviations in metres, and in pixels. Lines that start with # are
+comments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.pose_files.source import Source, is_number, number
+from aeromatch_cli.errors import ConfigError
+
+_COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
+# Coordinates of one point may differ by rounding alone.
+_SAME = 1e-8
+
+
+def read_gcp_list(source: Source) -> Survey:
+    """Raises ConfigError with file and line."""
+    records = list(source.records())
+    if len(records) < 2:
+        raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
+    points: dict[str, SurveyedPoint] = {}
+    marks: list[Mark] = []
+    for line, record in records[1:]:
+        point, one = _row(source, line, record)
+        known = points.setdefault(point.name, point)
+        if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
+            raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
+        points[point.name] = replace(known, check=known.check or point.check, sigmas_m=known.sigmas_m or point.sigmas_m)
+        marks.append(one)
+    return Survey(
+        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]), measured_in=source.path
+    )
+
+
+def _row(source: Source, line: int, record: str) -> tuple[SurveyedPoint, Mark]:
+    cells = [cell.strip() for cell in record.split("\t")] if "\t" in record else record.split()
+    if len(cells) < 6:
+        raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
+    x, y, z = (number(source.at(line, what), cell) for what, cell in zip(("x", "y", "z"), cells[:3], strict=True))
+    named = len(cells) > 6 and not is_check(cells[6])
+    name = cells[6] if named else " ".join(cells[:3])
+    rest = [cell for cell in cells[7 if named else 6 :] if not is_check(cell)]
+    sigmas = [float(cell) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
+    if not all(0.0 < sigma < float("inf") for sigma in sigmas):
+        sigmas = []
+    across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
+    check = any(map(is_check, cells[6:]))
+    sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
+    point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
+    return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px)

@@ -1,0 +1,211 @@
+"""Tables of coordinates, and tables of image measurements.
+
+Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_vertical][,type]`; in degrees the
+latitude stands first; a CRS is not stated, unless a .prj of the same name lies beside. With a header the columns go by
+their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
+`#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
+a check point. `type`: check points are named as such, all else is a control point.
+
+Image measurements, as Pix4D writes its marks: `image,label,x,y[,accuracy in pixels]`; or with a header that names these
+columns, in any order.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+
+from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
+from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, is_number, number
+from aeromatch_cli.errors import ConfigError
+
+_CRS = re.compile(r"#\s*coordinatesystem\s*:\s*(.*)", re.IGNORECASE)
+_LARGEST_LONGITUDE_DEG = 180.0
+# A mark that is less exact than this, in pixels, is none: Pix4D may write the zoom of the picture there.
+_LARGEST_SIGMA_PX = 10.0
+_SIDES = {"x": "x", "y": "y", "z": "z", "xy": "xy", "x/y": "xy", "xyz": "xyz", "x/y/z": "xyz", "horizontal": "xy",
+          "horz": "xy", "vertical": "z", "vert": "z", "": "xyz"}  # fmt: skip
+_POINT_NAMES = ("label", "name", "point", "gcp", "gcp_name", "gcp_label", "point_name", "point_id", "marker", "id")
+_COORDINATES: Mapping[str, str] = {
+    **dict.fromkeys(_POINT_NAMES, "label"),
+    **dict.fromkeys(("x", "easting", "east", "e"), "x"),
+    **dict.fromkeys(("y", "northing", "north", "n"), "y"),
+    **dict.fromkeys(("lon", "longitude", "lng", "long"), "longitude"),
+    **dict.fromkeys(("lat", "latitude"), "latitude"),
+    **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "h", "up", "ellipsoidal_height"), "z"),
+    **dict.fromkeys(("type", "role", "usage", "use"), "type"),
+    **dict.fromkeys(("enable", "enabled"), "enable"),
+    **{f"accuracy_{name}".rstrip("_"): f"sigma_{side}" for name, side in _SIDES.items()},
+    **{f"{name}_accuracy": f"sigma_{side}" for name, side in _SIDES.items() if name},
+    **{f"sigma_{name}": f"sigma_{side}" for name, side in _SIDES.items() if name},
+}
+_MARKS: Mapping[str, str] = {
+    **dict.fromkeys(("image", "image_name", "filename", "file", "photo", "camera", "image_label"), "image"),
+    **dict.fromkeys((*_POINT_NAMES, "tie_point", "tie_point_name"), "label"),
+    **{f"{stem}{axis}": side for stem in ("", "pixel_", "image_", "im_", "px_", "p")
+       for axis, side in (("x", "x"), ("y", "y"), ("u", "x"), ("v", "y"))},
+    **{"x_px": "x", "y_px": "y", "accuracy": "sigma_px", "accuracy_px": "sigma_px", "sigma_px": "sigma_px"},
+}  # fmt: skip
+
+
+def is_coordinates(source: Source) -> bool:
+    """Whether a file is a table of points with three coordinates each."""
+    header, names = _header(source, _COORDINATES)
+    if header:
+        return {"label", "z"} <= set(names) and ({"x", "y"} <= set(names) or {"longitude", "latitude"} <= set(names))
+    cells = _first(source)
+    return len(cells) >= 4 and all(map(is_number, cells[1:4])) and not any(map(IMAGE.fullmatch, cells))
+
+
+def is_marks(source: Source) -> bool:
+    """Whether a file is a table of image measurements."""
+    header, names = _header(source, _MARKS)
+    if header and {"image", "label", "x", "y"} <= set(names):
+        return True
+    cells = _first(source)
+    if len(cells) < 4 or not all(map(is_number, cells[2:4])):
+        return False
+    return bool(IMAGE.fullmatch(cells[0]) or IMAGE.fullmatch(cells[1])) or not is_number(cells[1])
+
+
+def read_coordinates(source: Source) -> Survey:
+    """Raises ConfigError with file and line."""
+    header, names = _header(source, _COORDINATES)
+    crs, crs_where = _stated_crs(source)
+    rows = [(line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells), comma)
+            for line, cells, comma in _rows(source, header)]  # fmt: skip
+    points = [_point(source, line, record, comma) for line, record, comma in rows]
+    if not points:
+        raise ConfigError(f"{source.path}: no control points follow the header")
+    twice = next((point for n, point in enumerate(points) if point.name in {one.name for one in points[:n]}), None)
+    if twice is not None:
+        raise ConfigError(f"{twice.where}: the point {twice.name} stands in the file twice: keep one of the two lines")
+    geographic = "latitude" in names or _in_degrees(points)
+    if not header and crs is None and geographic:  # the latitude stands first
+        points = [_exchanged(point) for point in points]
+    return Survey(tuple(points), (), crs, crs_where, geographic)
+
+
+def read_marks(source: Source) -> Survey:
+    """Raises ConfigError with file and line."""
+    header, names = _header(source, _MARKS)
+    marks: list[Mark] = []
+    for line, cells, comma in _rows(source, header):
+        if header:
+            record = dict(zip(names, cells, strict=False))
+        else:
+            names_first = ("label", "image") if len(cells) > 1 and IMAGE.fullmatch(cells[1]) else ("image", "label")
+            record = dict(zip((*names_first, "x", "y", "sigma_px"), cells, strict=False))
+        if not {"image", "label", "x", "y"} <= record.keys():
+            raise ConfigError(f"{source.at(line)}: {len(cells)} values, image, label, x and y are needed")
+        stated = record.get("sigma_px", "")
+        sigma_px = float(stated.replace(",", ".")) if is_number(stated) else 0.0
+        marks.append(
+            mark(
+                source, line, [record[name] for name in ("label", "image", "x", "y")],
+                sigma_px if 0.0 < sigma_px < _LARGEST_SIGMA_PX else None, comma=comma,
+            )
+        )  # fmt: skip
+    return Survey(marks=tuple(marks), measured_in=source.path)
+
+
+def _first(source: Source) -> list[str]:
+    return next((_cells(record)[0] for _, record in source.records()), [])
+
+
+def _cells(record: str) -> tuple[list[str], bool]:
+    """Values of a line, and whether their numbers may have a decimal comma."""
+    separator = next((one for one in (";", "\t", ",") if one in record), None)
+    if separator is None:
+        return record.split(), True
+    try:
+        cells = next(csv.reader([record], delimiter=separator, skipinitialspace=True))
+    except (csv.Error, StopIteration):
+        cells = record.split(separator)
+    return [cell.strip() for cell in cells], separator != ","
+
+
+def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str]]:
+    """Line of the header, 0 without one, and its columns by their names in `known`."""
+    for line, text in enumerate(source.lines, start=1):
+        stripped = text.strip()
+        if not stripped or _CRS.match(stripped):
+            continue
+        cells, _ = _cells(stripped.lstrip("#").strip())
+        names = [known.get(_column(cell), "") for cell in cells]
+        if len({name for name in names if name}) >= 4 and not any(map(is_number, cells)):
+            return line, names
+        if not stripped.startswith("#"):
+            break
+    return 0, []
+
+
+def _column(cell: str) -> str:
+    """x of `X/Easting`, longitude of `X/Longitude`, accuracy_x/y of `Accuracy_X/Y_(m)`, in lower case without units."""
+    if len(cell) > 100:
+        return ""  # no name
+    name = re.sub(r"[\s_]*[\[(].*?[\])]\s*$", "", cell.strip().lower())
+    name = re.sub(r"^[xyz]/([a-z]+)$", r"\1", re.sub(r"[\s-]+", "_", name))
+    return re.sub(r"_m$", "", name)
+
+
+def _rows(source: Source, header: int) -> list[tuple[int, list[str], bool]]:
+    return [(line, *_cells(record)) for line, record in source.records() if line > header]
+
+
+def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
+    """Columns of a line of Pix4D's file, with a type where words stand behind the coordinates."""
+    if len(cells) < 4:
+        raise ConfigError(f"{source.at(line)}: {len(cells)} values, label and three coordinates are needed")
+    numbers = [cell for cell in cells[4:] if is_number(cell)]
+    words = [cell for cell in cells[4:] if cell and not is_number(cell)]
+    record = dict(zip(("label", "x", "y", "z"), cells, strict=False)) | {"type": words[0] if words else ""}
+    return record | (dict(zip(("sigma_xy", "sigma_z"), numbers, strict=False)) if len(numbers) == 2 else {})
+
+
+def _point(source: Source, line: int, record: Mapping[str, str], comma: bool) -> SurveyedPoint:
+    def value(column: str) -> float:
+        cell = record.get(column, "")
+        if not cell:
+            raise ConfigError(f"{source.at(line, column)}: empty: a control point has three coordinates")
+        return number(source.at(line, column), cell, decimal_comma=comma)
+
+    name = record.get("label", "")
+    if not name:
+        raise ConfigError(f"{source.at(line)}: the name of the point is missing")
+    x, y = ("longitude", "latitude") if "latitude" in record else ("x", "y")
+    disabled = record.get("enable", "1").lower() in ("0", "false", "no")
+    check = disabled or is_check(record.get("type", ""))
+    return SurveyedPoint(name, source.at(line), (value(x), value(y), value("z")), _sigmas_m(record), check)
+
+
+def _sigmas_m(record: Mapping[str, str]) -> Sigmas | None:
+    x, y, z, across, overall = (
+        float(text.replace(",", ".")) if is_number(text := record.get(f"sigma_{side}", "")) else None
+        for side in ("x", "y", "z", "xy", "xyz")
+    )
+    stated = [one if one is not None and one < float("inf") else None for one in (x, y, z, across, overall)]
+    return completed_sigmas_m(*stated[:3], across_m=stated[3], overall_m=stated[4])
+
+
+def _stated_crs(source: Source) -> tuple[str | None, str]:
+    """CRS and its place: in the file, or in a .prj beside it."""
+    for line, text in enumerate(source.lines[:5], start=1):
+        stated = _CRS.match(text.strip())
+        if stated:
+            return stated[1].strip(), source.at(line)
+    beside = source.beside(source.path.with_suffix(".prj").name)
+    if beside is not None and beside.text.strip():
+        return beside.text.strip(), str(beside.path)
+    return None, str(source.path)
+
+
+def _in_degrees(points: list[SurveyedPoint]) -> bool:
+    return all(max(abs(point.position[0]), abs(point.position[1])) <= _LARGEST_LONGITUDE_DEG for point in points)
+
+
+def _exchanged(point: SurveyedPoint) -> SurveyedPoint:
+    first, second, height = point.position
+    return SurveyedPoint(point.name, point.where, (second, first, height), point.sigmas_m, point.check)

@@ -1,0 +1,163 @@
+"""What an adjustment says of itself, ready for JSON: calibration, accuracy of observations, expected deformation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.orientation.adjusting import Outcome
+from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
+from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
+from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
+
+# Correlations that are stated, and how many of them.
+_STRONG, _MOST_LISTED = 0.9, 5
+# Points whose heights stand for those of the whole block: so many, spread over it.
+_HEIGHTS = 150
+# Cells along the longer side of the map of expected errors of height.
+_CELLS = 12
+
+
+def adjustment_facts(outcome: Outcome) -> dict[str, Any]:
+    """Of one group. Keys are described in `formats` (adjusted.json)."""
+    result = outcome.result
+    network, state, found = result.network, result.state, result.found
+    facts: dict[str, Any] = {
+        "sigma_px": result.sigma_px,
+        "positions": _positions(outcome),
+        "flights": _flights(outcome),
+        "mounts": _mounts(outcome),
+        "calibration": {str(n): _calibration(outcome, k) for k, n in enumerate(outcome.cameras)},
+    }
+    if found is not None:
+        facts["heights"] = _heights(network, state, found)
+    return facts
+
+
+def _positions(outcome: Outcome) -> dict[str, Any] | None:
+    """How positions agree with the adjusted block: root mean squares, metres and in stated standard deviations."""
+    result = outcome.result
+    stated = result.stated
+    known = stated.located
+    if not known.any():
+        return None
+    used = result.network.located
+    off_m = position_residuals_m(stated, result.state)
+    sigmas = off_m / stated.position_sigmas_m
+    return {
+        "images": int(known.sum()),
+        "used": int(used.sum()),
+        "wrong": [outcome.images[k] for k in np.flatnonzero(known & ~used)],
+        "rms_m": _rms(off_m[used]),
+        "rms_sigmas": _rms(sigmas[used]),
+        "stated_m": np.median(stated.position_sigmas_m[known], axis=0).tolist(),
+        "factors": result.position_factors.tolist(),
+    }
+
+
+def _rms(values: FloatArray) -> list[float]:
+    return np.sqrt((values**2).mean(axis=0)).tolist() if len(values) else []
+
+
+def _flights(outcome: Outcome) -> list[dict[str, Any]]:
+    """What was found of flights: steps of height taken out before, shifts, delays of positions."""
+    network, state, found = outcome.result.network, outcome.result.state, outcome.result.found
+    listed = []
+    for row, number in enumerate(outcome.flights):
+        images = [i for i, flight in zip(outcome.images, network.flight, strict=True) if flight == row]
+        step_m = 0.0 if outcome.steps_m is None else float(outcome.steps_m[images[0] - 1])
+        free = network.flight_sigmas[row] > 0.0
+        if not free.any() and step_m == 0.0:
+            continue
+        sigmas = np.zeros(6) if found is None else np.sqrt(np.maximum(np.diag(found.flight[row]), 0.0))
+        values = {FLIGHT[k]: [float(state.flight[row, k]), float(sigmas[k])] for k in np.flatnonzero(free)}
+        listed.append({"flight": number, "images": len(images), "step_m": step_m, **values})
+    return listed
+
+
+def _mounts(outcome: Outcome) -> dict[str, Any]:
+    """By camera number, boresight in degrees and lever arm in metres, each with its standard deviation."""
+    network, state, found = outcome.result.network, outcome.result.state, outcome.result.found
+    mounts = {}
+    for row, number in enumerate(outcome.cameras):
+        free = network.mount_sigmas[row] > 0.0
+        if free.any():
+            sigmas = np.zeros(6) if found is None else np.sqrt(np.maximum(np.diag(found.mount[row]), 0.0))
+            scale = np.array([np.rad2deg(1.0)] * 3 + [1.0] * 3)
+            mounts[str(number)] = {
+                MOUNT[k]: [float(state.mount[row, k] * scale[k]), float(sigmas[k] * scale[k])]
+                for k in np.flatnonzero(free)
+            }
+    return mounts
+
+
+def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
+    """By parameter: value, standard deviation (0 where it was held), prior and its standard deviation."""
+    network, state, found, stated = (
+        outcome.result.network, outcome.result.state, outcome.result.found, outcome.result.stated
+    )  # fmt: skip
+    sigmas = np.zeros(len(LENS)) if found is None else found.lens_sigmas[row]
+    free = network.lens_sigmas[row] > 0.0
+    parameters = {
+        name: [
+            float(state.lens[row, k]), float(sigmas[k]) if free[k] else 0.0, float(stated.lens_prior[row, k]),
+            float(stated.lens_sigmas[row, k]),
+        ]
+        for k, name in enumerate(LENS)
+        if name != "unused" and (name != "readout_s" or free[k])
+    }  # fmt: skip
+    strong = [] if found is None else [
+        [first, second, round(value, 3)]
+        for camera, first, second, value in lens_correlations(found)
+        if camera == row and abs(value) > _STRONG
+    ]  # fmt: skip
+    return {
+        "images": int((network.camera == row).sum()),
+        "parameters": parameters,
+        "correlations": strong[:_MOST_LISTED],
+    }
+
+
+def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, Any]:
+    """Expected errors of the heights of points over the block.
+
+    sigma_m: median standard deviation; bowl_m, tilt_m: standard deviation of how much the middle of the block lies
+    above its border, and one side above the other, at the extent of the points. map: cells with their standard
+    deviation. Where place and scale are open (a free network) they are those of the shape.
+    """
+    rows = _spread(network, state)
+    if len(rows) < 6:
+        return {}
+    together = found.of_points(rows)[2::3, 2::3]
+    xy = state.points_m[rows, :2]
+    middle, reach = xy.mean(axis=0), float(np.abs(xy - xy.mean(axis=0)).max()) or 1.0
+    x, y = ((xy - middle) / reach).T
+    shapes = np.column_stack([np.ones_like(x), x, y, x * x + y * y])
+    fit = np.linalg.pinv(shapes)
+    covariance = fit @ together @ fit.T
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    heights_m = np.sqrt(np.maximum(np.diag(together), 0.0))
+    cells = [[float(px), float(py), float(sigma)] for (px, py), sigma in zip(xy, heights_m, strict=True)]
+    return {
+        "sigma_m": float(np.median(heights_m)),
+        "bowl_m": float(sigmas[3]),
+        "tilt_m": float(np.hypot(sigmas[1], sigmas[2])),
+        "points": cells,
+    }
+
+
+def _spread(network: Network, state: Unknowns) -> IntArray:
+    """Rows of points all over the block that at least three images see, where there are any."""
+    seen = np.bincount(network.point, minlength=len(state.points_m))
+    usable = np.flatnonzero(np.isfinite(state.points_m).all(axis=1) & (seen >= min(3, int(seen.max(initial=0)))))
+    if len(usable) <= _HEIGHTS:
+        return usable
+    xy = state.points_m[usable, :2]
+    low, high = np.quantile(xy, [0.01, 0.99], axis=0)
+    cell_m = max(float((high - low).max()), 1e-9) / _CELLS
+    cells = np.clip((xy - low) // cell_m, 0, _CELLS).astype(int)
+    order = np.random.default_rng(0).permutation(len(usable))
+    _, first = np.unique(cells[order] @ [1, _CELLS + 1], return_index=True)
+    return np.asarray(usable[np.sort(order[first])][:_HEIGHTS])

@@ -1,0 +1,1 @@
+"""Bundle adjustment with self-calibration: arrays in, arrays out."""

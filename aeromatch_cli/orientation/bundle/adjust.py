@@ -1,0 +1,250 @@
+"""The adjustment of a network with the weights that its own residuals show, and with what it determines of calibration.
+
+Observations of one kind (image points, positions horizontally and vertically) have standard deviations in the ratio
+that was stated; how large they are together is estimated from their residuals and redundancy (variance components:
+Foerstner 1979; Luhmann et al., Close-Range Photogrammetry, section 2.4). All unknowns of calibration have a prior, so
+that what the block says little of stays near it; what it says nothing significant of is held (`_hold_undetermined`).
+What else may explain residuals (shifts of flights, a delay of positions, a lever arm, the read-out of the shutter) is
+unknown only where the block is much better with it (`_explained`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.orientation.bundle.covariance import Covariance, covariance
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
+from aeromatch_cli.orientation.bundle.normal_equations import residuals_in_sigmas
+from aeromatch_cli.orientation.bundle.projection import project_with_derivatives
+from aeromatch_cli.orientation.bundle.solve import solve
+
+# The standard deviation of image points is estimated again until it changes by less than this share.
+_SETTLED, _MAX_ROUNDS = 0.1, 5
+_ROUGH = 1e-3
+# No coordinate of an image point is measured more exactly, pixels; where poses are rough, none counts as worse.
+_LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.05, 20.0
+# Distances of normally distributed residuals in the plane have this median, in standard deviations of a coordinate.
+_MEDIAN_DISTANCE = 1.1774
+# What was stated of the accuracy of positions counts as much as so many residuals. Positions that are off by more than
+# the larger factor have another reason than their accuracy: they are not given up for it.
+_STATED_RESIDUALS, _MOST_FACTOR, _LEAST_FACTOR = 3.0, 5.0, 0.2
+# A position that is so many standard deviations from its image is not that of the image.
+_WRONG_SIGMAS = 5.0
+# An unknown of calibration is held at its prior where its change is less than so many of its standard deviations and
+# the block has told less than half of what was not known of it; or where it moves no image point by so much of the
+# standard deviation of one.
+_SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS = 3.0, 0.5, 0.5
+# Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
+# their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
+_UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
+# Standard deviations of what may explain residuals, before the block is asked: shifts of a flight's positions, metres;
+# their delay, seconds; the lever arm, metres; the read-out of a shutter, seconds.
+_SHIFT_M, _LAG_S, _LEVER_M, _READOUT_S = 20.0, 1.0, 0.5, 0.03
+
+
+@dataclass(frozen=True)
+class Options:
+    """tolerance: the adjustment ends when a step lowers the cost by a smaller share. final: whether standard deviations
+    are wanted, unknowns that are not determined held, and explanations of residuals tried. readout: whether a rolling
+    shutter is one of these."""
+
+    tolerance: float
+    final: bool
+    readout: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """network: with the weights and positions that were used in the end. sigma_px: of a coordinate of an image point.
+    position_factors: (2,) by which positions are less exact than stated, horizontally and vertically. found: None
+    unless asked for. stated: the network as it was given."""
+
+    network: Network
+    state: Unknowns
+    sigma_px: float
+    position_factors: FloatArray
+    found: Covariance | None
+    stated: Network
+
+
+def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
+    """The block that fits its observations best, from `start`, whose image points may be off by many pixels."""
+    stated = network
+    network, state = _with_image_sigma(network, start, options.tolerance)
+    if options.final:
+        held = _hold_undetermined(network, state, covariance(network, state))
+        if held is not network:
+            state = replace(state, lens=np.where(held.lens_sigmas > 0.0, state.lens, held.lens_prior))
+            network, state = _with_image_sigma(held, state, options.tolerance)
+        explained, state = _explained(network, state, options)
+        if explained is not network:
+            network, state = _with_image_sigma(explained, state, options.tolerance)
+    network, state, factors = _with_position_sigmas(network, state, options)
+    found = covariance(network, state) if options.final else None
+    return Adjusted(network, state, network.tie_sigma_px, factors, found, stated)
+
+
+def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tuple[Network, Unknowns]:
+    """The network solved with the accuracy of tie points that their residuals show."""
+    sigma_px = _sigma_px(network, state, redundant=False)
+    for number in range(_MAX_ROUNDS):
+        network = _of_sigma(network, sigma_px)
+        state = solve(network, state, _ROUGH if number == 0 else tolerance).state
+        before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
+        if number and abs(sigma_px / before - 1.0) < _SETTLED:
+            break
+    return _of_sigma(network, sigma_px), state
+
+
+def _of_sigma(network: Network, sigma_px: float) -> Network:
+    return replace(network, sigma_px=np.where(network.tie_points, sigma_px, network.sigma_px))
+
+
+def _sigma_px(network: Network, state: Unknowns, *, redundant: bool) -> float:
+    """Standard deviation of a coordinate of a tie point, from the median residual and, with redundant, what the
+    unknowns have taken from it."""
+    apart_px = (residuals_in_sigmas(network, state) * network.sigma_px)[network.tie_points]
+    if not len(apart_px):
+        return 1.0
+    coordinates = 2 * len(apart_px)
+    unknowns = 3 * len(state.points_m) + 6 * int((~network.held).sum())
+    taken = np.sqrt(coordinates / max(coordinates - unknowns, 0.1 * coordinates)) if redundant else 1.0
+    return float(np.clip(np.median(apart_px) / _MEDIAN_DISTANCE * taken, _LEAST_SIGMA_PX, _MOST_SIGMA_PX))
+
+
+def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> Network:
+    """The network with unknowns of lenses held that it says nothing significant of; the same where there are none."""
+    sigmas, prior = found.lens_sigmas, network.lens_sigmas
+    change = np.abs(state.lens - network.lens_prior)
+    unclear = change < _SIGNIFICANT_SIGMAS * sigmas
+    untold = sigmas > _DETERMINED * np.where(np.isfinite(prior), prior, np.inf)
+    held = (prior > 0.0) & (
+        (unclear & untold) | (_moved_px(network, state, change) < _SEEN_SIGMAS * network.tie_sigma_px)
+    )
+    held[:, LENS.index("f")] = False  # its prior weighs
+    return replace(network, lens_sigmas=np.where(held, 0.0, prior)) if held.any() else network
+
+
+def _moved_px(network: Network, state: Unknowns, change: FloatArray) -> FloatArray:
+    """(K, 12) by how much a change of the unknowns of lenses (K, 12) moves an image point at most, pixels."""
+    by_lens = np.nan_to_num(np.abs(project_with_derivatives(network, state).by_lens).max(axis=1))
+    most = np.zeros_like(change)
+    np.maximum.at(most, network.camera[network.image], by_lens)
+    return most * change
+
+
+def _explained(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
+    """The network with those further unknowns that its residuals speak for, and its solution."""
+    for tried in _explanations(network, state, options):
+        solved = solve(tried, state, _ROUGH)
+        unknowns = _freed_since(network, tried)
+        gain = 2.0 * (solve(network, state, _ROUGH).cost - solved.cost)
+        if gain < _WORTH_SQUARES * max(1, _count(unknowns)):
+            continue
+        values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(tried, solved.state), unknowns)
+        if (np.abs(values) > _WORTH_SIGMAS * sigmas).any():
+            network, state = tried, solved.state
+    return network, state
+
+
+def _explanations(network: Network, state: Unknowns, options: Options) -> list[Network]:
+    """Networks with one kind of further unknowns each."""
+    tried = []
+    off = position_residuals_m(network, state) / network.position_sigmas_m
+    known = network.located
+    if known.any() and float(np.sqrt(np.nanmean(off[known] ** 2))) > _UNEXPLAINED:
+        several = np.bincount(network.flight[known], minlength=network.flights) > 0
+        shifts = np.zeros_like(network.flight_sigmas)
+        if several.sum() > 1:  # against the flight of most images
+            shifts[np.arange(len(shifts)) != np.bincount(network.flight[known]).argmax(), :3] = _SHIFT_M
+            tried.append(replace(network, flight_sigmas=np.maximum(network.flight_sigmas, shifts)))
+        lags = network.flight_sigmas.copy()
+        lags[:, 3] = _LAG_S * (np.abs(network.velocities_m_s).sum() > 0.0)
+        levers = network.mount_sigmas.copy()
+        levers[:, 3:] = _LEVER_M
+        tried += [replace(network, flight_sigmas=lags), replace(network, mount_sigmas=levers)]
+    if options.readout and np.abs(network.velocities_m_s).sum() > 0.0:
+        readout = network.lens_sigmas.copy()
+        readout[:, READOUT] = _READOUT_S
+        tried.append(replace(network, lens_sigmas=readout))
+    return tried
+
+
+_Freed = tuple[BoolArray, BoolArray, BoolArray]
+
+
+def _freed_since(before: Network, after: Network) -> _Freed:
+    """Which unknowns of lenses, mounts and flights are free in one network and not in the other."""
+    names = ("lens_sigmas", "mount_sigmas", "flight_sigmas")
+    lens, mount, flight = ((getattr(after, name) > 0.0) & (getattr(before, name) == 0.0) for name in names)
+    return lens, mount, flight
+
+
+def _count(freed: _Freed) -> int:
+    return int(sum(part.sum() for part in freed))
+
+
+def _values(state: Unknowns, freed: _Freed) -> FloatArray:
+    return np.concatenate(
+        [part[which] for part, which in zip((state.lens, state.mount, state.flight), freed, strict=True)]
+    )
+
+
+def _sigmas(found: Covariance, freed: _Freed) -> FloatArray:
+    parts = (np.diagonal(part, axis1=1, axis2=2) for part in (found.lens, found.mount, found.flight))
+    return np.sqrt(np.maximum(np.concatenate([p[w] for p, w in zip(parts, freed, strict=True)]), 0.0))
+
+
+def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns, FloatArray]:
+    """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
+    they are less exact than stated, horizontally and vertically."""
+    stated, factors = network, np.asarray([1.0, 1.0])
+    for _ in range(_MAX_ROUNDS):
+        wrong = _wrong_positions(network, state)
+        new = _position_factors(stated, state, covariance(network, state) if options.final else None, wrong)
+        if not wrong.any() and np.abs(new / factors - 1.0).max() < 2.0 * _SETTLED:
+            break
+        factors = new
+        stated = replace(stated, positions_m=np.where(wrong[:, None], np.nan, stated.positions_m))
+        network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
+        state = solve(network, state, options.tolerance).state
+    return network, state, factors
+
+
+def position_residuals_m(network: Network, state: Unknowns) -> FloatArray:
+    """(N, 3) measured minus adjusted positions, of the antenna and with what was found of the flight; NaN where there
+    is none."""
+    lever = np.einsum("nji,nj->ni", state.rotations, state.mount[network.camera, 3:])
+    flight = state.flight[network.flight]
+    expected = state.centers_m + lever + flight[:, :3] + network.velocities_m_s * flight[:, 3:4]
+    return np.where(network.located[:, None], network.positions_m - expected, np.nan)
+
+
+def _wrong_positions(network: Network, state: Unknowns) -> BoolArray:
+    """(N,) images whose positions contradict all others: the worst first, at most a fifth of all at once."""
+    off = np.abs(position_residuals_m(network, state)) / network.position_sigmas_m
+    worst = np.where(np.isfinite(off), off, 0.0).max(axis=1)
+    usual = float(np.quantile(worst[network.located], 0.8)) if network.located.any() else 0.0
+    return np.asarray(worst > max(_WRONG_SIGMAS, usual))
+
+
+def _position_factors(network: Network, state: Unknowns, found: Covariance | None, wrong: BoolArray) -> FloatArray:
+    """(2,) by how much positions are less exact than stated, horizontally and vertically."""
+    used = network.located & ~wrong
+    if not used.any():
+        return np.ones(2)
+    sigmas_m = network.position_sigmas_m[used]
+    off = (position_residuals_m(network, state)[used] / sigmas_m) ** 2
+    # What the unknowns take of the residuals, of each coordinate between all and nothing.
+    taken = np.zeros_like(off)
+    if found is not None:
+        variances = np.diagonal(found.images[:, 3:, 3:], axis1=1, axis2=2)[used]
+        taken = np.clip(variances / sigmas_m**2, 0.0, 0.99)
+    factors = []
+    for axes in ([0, 1], [2]):
+        redundancy = float((1.0 - taken[:, axes]).sum())
+        factors.append(np.sqrt((off[:, axes].sum() + _STATED_RESIDUALS) / (redundancy + _STATED_RESIDUALS)))
+    return np.clip(factors, _LEAST_FACTOR, _MOST_FACTOR)

@@ -1,0 +1,85 @@
+"""The bundle adjustment: least squares of a network by Levenberg and Marquardt's method, and its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.orientation.bundle.network import Network, Unknowns
+from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, cost, equations, reduced
+
+# The damping of the first step, the bounds, and by how much it changes from step to step.
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e6
+_EASED, _RAISED = 0.2, 6.0
+_MAX_STEPS = 60
+# Up to so many unknowns the reduced equations are solved as a full matrix, beyond as a sparse one.
+_FULL_SIZE = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """state: values of the unknowns; cost: half the sum of squares; steps: that were taken."""
+
+    state: Unknowns
+    cost: float
+    steps: int
+
+
+def solve(network: Network, state: Unknowns, tolerance: float) -> Solved:
+    """The unknowns nearest to all observations, from where `state` puts them.
+
+    tolerance: it ends when a step lowers the cost by a smaller share.
+    """
+    best, damping, step = cost(network, state), _DAMPING, 0
+    while step < _MAX_STEPS:
+        made = equations(network, state)
+        while damping <= _MOST_DAMPING:
+            tried = _moved(network, state, reduced(made, damping))
+            if tried is not None and cost(network, tried) < best:
+                break
+            damping *= _RAISED
+        else:
+            break
+        assert tried is not None
+        step, found = step + 1, cost(network, tried)
+        gain, best, state = 1.0 - found / best, found, tried
+        damping = max(_EASED * damping, _LEAST_DAMPING)
+        if gain < tolerance:
+            break
+    return Solved(state, best, step)
+
+
+def _moved(network: Network, state: Unknowns, normals: Reduced) -> Unknowns | None:
+    """The unknowns after one step, None where the equations have no solution."""
+    from scipy.spatial.transform import Rotation
+
+    change = _solution(normals)
+    if not np.isfinite(change).all():
+        return None
+    turned, lens, mount, flight = Layout.of(network).parts(change)
+    by_images = normals.point_right + (normals.coupling.T @ change).reshape(-1, 3)
+    points_m = state.points_m - np.einsum("pij,pj->pi", normals.inverses, by_images)
+    rotations = Rotation.from_rotvec(turned[:, :3]).as_matrix() @ state.rotations
+    parts = state.centers_m + turned[:, 3:], points_m, state.lens + lens, state.mount + mount, state.flight + flight
+    return Unknowns(rotations, *parts)
+
+
+def _solution(normals: Reduced) -> FloatArray:
+    """The change (6 B,) of all unknowns but points."""
+    from scipy import linalg, sparse
+
+    scale = 1.0 / np.sqrt(np.maximum(normals.matrix.diagonal(), 1e-300))
+    right = -normals.right * scale
+    scaled = sparse.diags(scale) @ normals.matrix @ sparse.diags(scale)
+    try:
+        if len(right) <= _FULL_SIZE:
+            factor = linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)
+            return np.asarray(scale * linalg.cho_solve(factor, right, check_finite=False))
+        solver = sparse.linalg.splu(
+            scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        return np.asarray(scale * solver.solve(right))
+    except (linalg.LinAlgError, RuntimeError):  # not positive definite, singular
+        return np.full(len(right), np.nan)
