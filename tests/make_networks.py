@@ -93,9 +93,9 @@ def simulated(
     rng = np.random.default_rng(seed)
     images, low, high = len(plan.centers_m), plan.centers_m.min(axis=0), plan.centers_m.max(axis=0)
     headings = np.deg2rad(plan.headings_deg)
-    tilts_deg = rng.normal(0.0, tilt_deg, (images, 3))
+    angles_deg = rng.normal(0.0, tilt_deg, (images, 3)) + plan.headings_deg[:, None] * [0.0, 0.0, 1.0]
     poses = Unknowns(
-        rotations=np.array([from_omega_phi_kappa(*t) for t in tilts_deg + np.c_[np.zeros((images, 2)), plan.headings_deg]]),
+        rotations=np.array([from_omega_phi_kappa(*one) for one in angles_deg]),
         centers_m=plan.centers_m + rng.normal(0.0, 1.0, (images, 3)),
         points_m=np.column_stack([
             rng.uniform(low[0] - 40, high[0] + 40, points), rng.uniform(low[1] - 35, high[1] + 35, points),
@@ -165,7 +165,8 @@ def with_lens_prior(network: Network, prior: FloatArray, **sigmas: float) -> Net
 
 # What is known of a lens that nobody has calibrated, see `calibration`.
 UNKNOWN_LENS = {
-    "f": 30.0, "cx": 24.0, "cy": 24.0, "k1": 0.09, "k2": 0.16, "k3": 0.28, "p1": 0.001, "p2": 0.001, "b1": 0.2, "b2": 0.2,
+    "f": 30.0, "cx": 24.0, "cy": 24.0, "k1": 0.09, "k2": 0.16, "k3": 0.28, "p1": 0.001, "p2": 0.001,
+    "b1": 0.2, "b2": 0.2,
 }  # fmt: skip
 
 

@@ -111,4 +111,4 @@ def test_on_the_axis_a_fisheye_has_its_derivatives() -> None:
     found = project_with_derivatives(network, state)
     np.testing.assert_allclose(found.xy_px[-1], FISHEYE[1:3], atol=1e-9)
     np.testing.assert_allclose(found.by_turn[-1], [[0.0, 696.0, 0.0], [-700.0, 0.0, 0.0]], atol=1e-4)
-    assert np.abs(found.by_lens[-1, :, 3:]).max() < 1e-4
+    assert np.abs(found.by_lens[-1, :, 3:READOUT]).max() < 1e-4
