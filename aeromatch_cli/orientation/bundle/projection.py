@@ -80,9 +80,9 @@ def project_with_derivatives(network: Network, state: Unknowns) -> Projected:
 
 
 def _normalised(local: FloatArray) -> tuple[FloatArray, FloatArray]:
-    depth = local[:, 2]
-    near = _LEAST_DEPTH * float(np.median(np.abs(depth))) if len(depth) else 0.0
-    depth = np.where(depth > near, depth, np.nan)
+    depth, somewhere = local[:, 2], np.isfinite(local).all(axis=1)
+    near = _LEAST_DEPTH * float(np.median(np.abs(depth[somewhere]))) if somewhere.any() else 0.0
+    depth = np.where(somewhere & (depth > near), depth, np.nan)
     return local[:, 0] / depth, local[:, 1] / depth
 
 
