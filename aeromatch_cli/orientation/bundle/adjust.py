@@ -35,6 +35,10 @@ _STATED_RESIDUALS, _MOST_FACTOR, _LEAST_FACTOR = 3.0, 5.0, 0.2
 # by the share of positions that are right at least: of normally distributed ones so many have their largest coordinate
 # within so many standard deviations.
 _WRONG_SIGMAS, _RIGHT, _RIGHT_SIGMAS = 5.0, 0.8, 1.8
+# Before the block is adjusted, the poses of some are not known much better.
+_FAR_SIGMAS = 15.0
+# Positions that make residuals of image points larger by this factor bend the block.
+_BENT = 1.1
 # An unknown of calibration is held at its prior where its change is less than so many of its standard deviations and
 # the block has told less than half of what was not known of it; or where it moves no image point by so much of the
 # standard deviation of one.
@@ -91,15 +95,26 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
 
 
 def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tuple[Network, Unknowns]:
-    """The network solved with the accuracy of tie points that their residuals show."""
+    """The network with the accuracy of tie points that their residuals show, and its solution.
+
+    Positions weigh no more meanwhile than what they are off by allows: with too much weight they bend the block, and
+    image points would seem inexact.
+    """
     sigma_px = _sigma_px(network, state, redundant=False)
     for number in range(_MAX_ROUNDS):
         network = _of_sigma(network, sigma_px)
-        state = solve(network, state, _ROUGH if number == 0 else tolerance).state
+        state = solve(_loosened(network, state), state, _ROUGH if number == 0 else tolerance).state
         before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
         if number and abs(sigma_px / before - 1.0) < _SETTLED:
             break
     return _of_sigma(network, sigma_px), state
+
+
+def _loosened(network: Network, state: Unknowns) -> Network:
+    """The network with standard deviations of positions that most of their residuals agree with; the same where the
+    stated ones do."""
+    usual = _off_sigmas(network, state)[1]
+    return replace(network, position_sigmas_m=usual * network.position_sigmas_m) if usual > 1.0 else network
 
 
 def _of_sigma(network: Network, sigma_px: float) -> Network:
@@ -140,17 +155,31 @@ def _moved_px(network: Network, state: Unknowns, change: FloatArray) -> FloatArr
 
 
 def _explained(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
-    """The network with those further unknowns that its residuals speak for, and its solution."""
-    for tried in _explanations(network, state, options):
-        solved = solve(tried, state, _ROUGH)
-        unknowns = _freed_since(network, tried)
-        gain = 2.0 * (solve(network, state, _ROUGH).cost - solved.cost)
-        if gain < _WORTH_SQUARES * max(1, _count(unknowns)):
-            continue
-        values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(tried, solved.state), unknowns)
-        if (np.abs(values) > _WORTH_SIGMAS * sigmas).any():
-            network, state = tried, solved.state
-    return network, state
+    """The network with those further unknowns that its residuals speak for, the clearest first, and its solution."""
+    while True:
+        found = [_worth(network, state, tried) for tried in _explanations(network, state, options)]
+        taken = max((one for one in found if one is not None), key=lambda one: one[0], default=None)
+        if taken is None:
+            return network, state
+        network, state = taken[1:]
+
+
+def _worth(network: Network, state: Unknowns, tried: Network) -> tuple[float, Network, Unknowns] | None:
+    """By how much further unknowns lower the sum of squares, their network and its solution; None where that is too
+    little. Positions weigh by what they are off by once it is taken."""
+    unknowns = _freed_since(network, tried)
+    if not _count(unknowns):
+        return None
+    loose_m = _loosened(network, state).position_sigmas_m
+    after = solve(replace(tried, position_sigmas_m=loose_m), state, _ROUGH).state
+    fair = _loosened(tried, after)
+    solved = solve(fair, after, _ROUGH)
+    without = solve(replace(network, position_sigmas_m=fair.position_sigmas_m), state, _ROUGH)
+    gain = 2.0 * (without.cost - solved.cost)
+    if gain < _WORTH_SQUARES * _count(unknowns):
+        return None
+    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state), unknowns)
+    return (gain, tried, solved.state) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
 
 
 def _explanations(network: Network, state: Unknowns, options: Options) -> list[Network]:
@@ -206,15 +235,16 @@ def _without_far_positions(network: Network, state: Unknowns) -> tuple[Network, 
 
     With all its weight a wrong position would bend the block to where it fits, and others would seem wrong.
     """
-    for _ in range(_ROUGH_ROUNDS):
-        worst, usual = _off_sigmas(network, state)
-        if worst.max(initial=0.0) <= _WRONG_SIGMAS:
-            return network, state
+    worst, usual = _off_sigmas(network, state)
+    if worst.max(initial=0.0) <= _WRONG_SIGMAS:
+        return network, state
+    for _ in range(_ROUGH_ROUNDS):  # image points weigh rightly from the second on
         looser = np.maximum(usual, worst / _WRONG_SIGMAS)
         loose = replace(network, position_sigmas_m=network.position_sigmas_m * looser[:, None])
         state = solve(_of_sigma(loose, _sigma_px(network, state, redundant=False)), state, _ROUGH).state
-    wrong = _wrong_positions(network, state)
-    return _without(network, wrong), state
+        worst, _ = _off_sigmas(network, state)
+    worst, usual = _off_sigmas(network, state)
+    return _without(network, worst > _FAR_SIGMAS * usual), state
 
 
 def _without(network: Network, wrong: BoolArray) -> Network:
@@ -225,12 +255,16 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
     """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
     they are less exact than stated, horizontally and vertically."""
     stated, factors = network, np.asarray([1.0, 1.0])
+    tight = solve(stated, state, options.tolerance).state
+    bent = _sigma_px(stated, tight, redundant=True) > _BENT * stated.tie_sigma_px
+    network, state = (_loosened(stated, state), state) if bent else (stated, tight)
+    settled = network is stated
     for _ in range(_MAX_ROUNDS):
         wrong = _wrong_positions(network, state)
         new = _position_factors(stated, network, state, covariance(network, state) if options.final else None, wrong)
-        if not wrong.any() and np.abs(new / factors - 1.0).max() < 2.0 * _SETTLED:
+        if settled and not wrong.any() and np.abs(new / factors - 1.0).max() < 2.0 * _SETTLED:
             break
-        factors, stated = new, _without(stated, wrong)
+        factors, stated, settled = new, _without(stated, wrong), True
         network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
         state = solve(network, state, options.tolerance).state
     return network, state, factors

@@ -166,8 +166,8 @@ def _of_control(network: Network, state: Unknowns, extent_m: float) -> FloatArra
     for axis in range(3):
         moved[:, :, 3 + axis] = np.cross(np.eye(3)[axis], away_m)
     moved[:, :, 6] = away_m
-    moved = (moved / network.control_sigmas_m[:, :, None]).reshape(-1, 7)
-    return np.asarray(moved.T @ moved)
+    rows = (moved / network.control_sigmas_m[:, :, None]).reshape(-1, 7)
+    return np.asarray(rows.T @ rows)
 
 
 def _inverse(normal: FloatArray, free: FloatArray, in_world: bool) -> FloatArray:
