@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.orientation.adjusting import Given
 from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
 from aeromatch_cli.orientation.bundle.projection import project
 
@@ -184,6 +185,22 @@ def disturbed(
         mount=np.zeros_like(truth.mount),
         flight=np.zeros_like(truth.flight),
     )
+
+
+def given_positions(positions_m: FloatArray, sigmas_m: FloatArray, **other: FloatArray) -> Given:
+    """Positions alone, with standard deviations (N,) of each axis, and what else is named."""
+    count = len(positions_m)
+    nowhere = np.full((count, 3), np.nan)
+    known = {
+        "positions_m": positions_m,
+        "sigmas_m": np.repeat(np.asarray(sigmas_m)[:, None], 3, axis=1),
+        "ups": nowhere,
+        "rotations": np.full((count, 3, 3), np.nan),
+        "sigmas_deg": np.full(count, np.nan),
+        "flights": np.zeros(count, dtype=int),
+        "velocities_m_s": np.zeros((count, 3)),
+    }
+    return Given(**{**known, **other})
 
 
 def moved(state: Unknowns, change: FloatArray) -> Unknowns:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from make_networks import given_positions
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.cameras import BROWN, FISHEYE, MODELS, colmap_camera, parameters
@@ -124,11 +125,7 @@ def model() -> Any:
 
 
 def nothing_given(count: int) -> Given:
-    nowhere = np.full((count, 3), np.nan)
-    return Given(
-        nowhere, nowhere, nowhere, np.full((count, 3, 3), np.nan), np.full(count, np.nan), np.zeros(count, dtype=int),
-        np.zeros((count, 3)),
-    )  # fmt: skip
+    return given_positions(np.full((count, 3), np.nan), np.full(count, np.nan))
 
 
 def work_of(model: Any) -> Work:
