@@ -32,7 +32,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
 }
 # Written out: the modules that know them are too heavy for --help. A test compares.
 _SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"
-_FLIGHTS = "nadir, oblique, sweep, orbit, arc, two-flights, mixed"
+_FLIGHTS = "nadir, oblique, sweep, orbit, arc, two-flights, mixed, cross, two-heights, tilted, dense-rig"
 
 
 def evaluate(
@@ -94,7 +94,7 @@ def synth(
     lens: Annotated[
         str,
         typer.Option(
-            "--lens", metavar="MODEL", help="Camera model: PINHOLE, RADIAL, OPENCV, BROWN, OPENCV_FISHEYE ..."
+            "--lens", metavar="MODEL", help="Camera model: PINHOLE, RADIAL, OPENCV, BROWN, ..., or real: a lens of the seed."
         ),
     ] = "SIMPLE_RADIAL",
     sun: Annotated[

@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+from aeromatch_cli.synthetic.lenses import REAL, real_lens
 from aeromatch_cli.synthetic.stations import Exterior, Station, exterior_of, make_camera
 
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.70, 0.60
@@ -62,6 +63,9 @@ class Order:
     rng: np.random.Generator
 
     def camera(self, focal_share: float) -> Camera:
+        """Of that many picture widths; a real lens is another one with each call."""
+        if self.lens == REAL:
+            return real_lens(self.rng, self.width_px, self.height_px, focal_share)
         return make_camera(self.lens, self.width_px, self.height_px, focal_share)
 
     def rig(self) -> dict[str, Camera]:

@@ -55,7 +55,7 @@ def make_camera(lens: str, width_px: int, height_px: int, focal_share: float) ->
     would be further than 74 degrees from the axis. Raises ConfigError on an unknown lens.
     """
     if lens not in MODELS:
-        raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}")
+        raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}, or real")
     focal = focal_share * width_px
     if lens == FISHEYE:  # it projects by angles: those of the corners stay below a right angle
         focal = max(focal, 0.5 * float(np.hypot(width_px, height_px)) / _WIDEST_RAD)
