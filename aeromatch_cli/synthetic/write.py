@@ -1,6 +1,6 @@
 """A rendered block on disk: pictures as a user would have them, and the truth beside them.
 
-OUT/images/city_0001.jpg ...         the pictures
+OUT/images/city_0001.jpg ...         the pictures; of real lenses with a header that states the focal length
 OUT/poses.csv                        exact: image,x,y,z,omega_deg,phi_deg,kappa_deg,camera; metres, degrees
 OUT/poses_noisy.csv                  the same with Gaussian noise, whose sigmas truth.json states
 OUT/poses_rtk.csv                    positions of an RTK receiver with their sigmas: image,x,y,z,sigma_x_m,...,camera
@@ -11,7 +11,9 @@ OUT/truth/city_0001.depth.tif        (H, W) float32, metres along the optical ax
 OUT/truth/city_0001.surface.tif      (H, W) uint32, what is visible: 1 + the index of the triangle, 0 for sky
 OUT/truth/city_0001.sun.png          (H, W) uint8, 255 x the share of the sun's disc in view; 0 also where the surface
                                      faces away from the sun. In shadow: below 128
-OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last
+OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last. Of a
+                                     rolling shutter: seconds from the first row to the last, speed, velocities. Poses
+                                     are then of the middle row; depths count from each row's own projection centre
 OUT/synth.json                       the same, written first: what an interrupted block goes on with
 All rasters are lossless (TIFF: deflate with predictor; PNG).
 """
