@@ -23,7 +23,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import from_colmap
 from aeromatch_cli.orientation.placing import similarity
 from aeromatch_cli.orientation.process import quiet_pycolmap
-from aeromatch_cli.orientation.results import arrays, centers_of, image_numbers
+from aeromatch_cli.orientation.results import centers_of, image_numbers
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.simulate import SimulatedBlock
@@ -84,7 +84,16 @@ def _solve(folder: Path, peer: str) -> None:
         _adjust(pycolmap, model, stated if peer == WITH_POSITIONS else stated[:0])
         _place(pycolmap, model, stated if peer != WITH_POSITIONS else stated[:0])
     lens = next(iter(model.cameras.values())).model.name
-    np.savez(folder / "found.npz", **arrays(model), model=np.array(lens))
+    numbers, cameras = image_numbers(model), sorted(model.cameras)
+    np.savez(
+        folder / "found.npz",
+        images=np.array(numbers),
+        rotations=np.array([model.images[i].cam_from_world().rotation.matrix() for i in numbers]),
+        centers_m=centers_of(model, numbers),
+        cameras=np.array(cameras),
+        model=np.array(lens),
+        **{f"params{i}": np.array(model.cameras[i].params) for i in cameras},
+    )
 
 
 def _place(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:

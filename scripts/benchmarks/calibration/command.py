@@ -15,7 +15,8 @@ Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle
 more as OPENCV with a free principal point; colmap-priors: so with the given positions as observations. Models of all
 are put into the world by the positions.
 
-Start perturbed: exact poses made worse by 0.5 degrees and 1 % of the flying height; mapped: what `map_block` finds.
+Start mapped: what `map_block` finds; perturbed: exact poses made worse by 0.5 degrees and 1 % of the flying height,
+neighbours nearly alike.
 Writes OUT/rows/CASE.json for every case, OUT/results.json and OUT/calibration.md; rows that OUT has are not made again.
 """
 
@@ -156,7 +157,7 @@ def main(arguments: Sequence[str]) -> None:
     add("--positions", type=options.names, default=",".join(POSITIONS))
     add("--seeds", type=options.numbers, default="1-3")
     add("--points", type=options.positive, default=800, help="about so many tie points in an image")
-    add("--start", choices=("perturbed", "mapped"), default="perturbed")
+    add("--start", choices=("mapped", "perturbed"), default="mapped")
     add("--peers", type=options.names, default="", help=f"of {', '.join(PEERS)}")
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)

@@ -26,9 +26,10 @@ from aeromatch_cli.orientation.mapping import Group, Mapper, Observed, map_block
 from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.strategies.exporters.contents import ExportContents, PairContents
 from aeromatch_cli.synthetic.flights import Flight, gsd_m, plan_flight
-from aeromatch_cli.synthetic.lenses import real_lens
+from aeromatch_cli.synthetic.lenses import focal_35mm, real_lens
 from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.receivers import GPS_M, RTK_M, gps_errors_m, rtk_errors_m
 from aeromatch_cli.synthetic.scene import build_scene
 from aeromatch_cli.synthetic.terrain import Area
 from benchmarks.calibration.tracks import Keypoints, Picture, Sight, chosen, look, measured, spread
@@ -40,10 +41,7 @@ FLIGHTS: Mapping[str, str] = MappingProxyType(
     {"nadir": "nadir", "cross": "cross", "mixed": "tilted", "five": "dense-rig", "two-heights": "two-heights"}
 )
 WIDTH_PX, HEIGHT_PX = 4000, 3000
-# Standard deviations as they are stated: of GPS, the common part and the noise of a picture together.
-GPS_COMMON_M, GPS_NOISE_M = 5.0, 1.0
-RTK_M = (0.02, 0.02, 0.03)
-_SIGMAS_M: Mapping[str, float] = {"gps5m": float(np.hypot(GPS_COMMON_M, GPS_NOISE_M)), "rtk2cm": 0.025}
+_SIGMAS_M: Mapping[Positions, tuple[float, float, float]] = MappingProxyType({"gps5m": GPS_M, "rtk2cm": RTK_M})
 # Attitudes of a gimbal: every picture by itself, and the mounting of the camera.
 _GIMBAL_DEG, _MOUNT_DEG = 1.0, 0.5
 # A drone keeps its height better than the flights of rendered blocks do, which would tell focal lengths too much.
@@ -55,8 +53,9 @@ _CHECK_PER_IMAGE, CHECK_POINTS = 40, 60
 _FEWEST_MATCHES, _VERIFIED = 15, 300
 # What pairs are verified with: lenses that are not calibrated yet.
 _SAMPLING = Sampling(threshold_px=8.0, max_iterations=500)
-# Poses that a first pass is off by, degrees and flying heights.
-_START_DEG, _START_SHARE = 0.5, 0.01
+# What poses of a first pass are off by, degrees and flying heights: neighbours, which matches tie, nearly alike; and so
+# much of it by themselves.
+_START_DEG, _START_SHARE, _START_OWN = 0.5, 0.01, 0.1
 _STREAM = 201
 
 
@@ -189,8 +188,7 @@ def _pictures(planned: Flight, lenses: Mapping[str, Camera]) -> list[Picture]:
 def exif_camera(camera: Camera) -> Camera:
     """What EXIF says of a camera: the 35-mm equivalent in whole millimetres, and nothing of its lens."""
     diagonal_px = float(np.hypot(camera.width_px, camera.height_px))
-    focal_mm = round(focal_px(camera) / diagonal_px * FULL_FRAME_DIAGONAL_MM)
-    focal = focal_mm / FULL_FRAME_DIAGONAL_MM * diagonal_px
+    focal = focal_35mm(camera) / FULL_FRAME_DIAGONAL_MM * diagonal_px
     middle = 0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)
     return Camera("SIMPLE_RADIAL", camera.width_px, camera.height_px, (focal, *middle, 0.0))
 
@@ -232,25 +230,18 @@ def _observed(seen: _Seen, positions: Positions, rng: np.random.Generator, attit
     focal = dict.fromkeys(seen.contents.block.cameras, FOCAL_SIGMAS["35-mm equivalent"])
     if positions == "nothing":
         return Observed({}, focal, {})
-    errors_m = position_errors_m(positions, len(pictures), rng)
+    errors_m = (rtk_errors_m if positions == "rtk2cm" else gps_errors_m)(len(pictures), rng)
     turns = _turned(rng, _MOUNT_DEG, 1) * _turned(rng, _GIMBAL_DEG, len(pictures))
     poses, angles = {}, {}
     for picture, error_m, turn in zip(pictures, errors_m, turns, strict=True):
         rotation = turn.as_matrix() @ picture.rotation() if attitudes else None
         sigma_deg = float(np.hypot(_GIMBAL_DEG, _MOUNT_DEG))
-        poses[picture.image_id] = Pose(picture.pose.center_m + error_m, rotation, _SIGMAS_M[positions], sigma_deg)
+        stated_m = float(np.sqrt(np.mean(np.square(_SIGMAS_M[positions]))))
+        center_m = picture.pose.center_m + error_m
+        poses[picture.image_id] = Pose(center_m, rotation, stated_m, sigma_deg, _SIGMAS_M[positions])
         if rotation is not None:
             angles[picture.image_id] = Angles("omega_phi_kappa", to_omega_phi_kappa(rotation))
     return Observed(poses, focal, angles)
-
-
-def position_errors_m(positions: Positions, count: int, rng: np.random.Generator) -> FloatArray:
-    """(N, 3) in the order of taking: RTK's are independent, GPS's drift and scatter."""
-    if positions == "rtk2cm":
-        return np.asarray(rng.standard_normal((count, 3)) * RTK_M)
-    phase = np.linspace(0.0, 1.0, count)[:, None] * rng.uniform(0.5, 1.5, 3) * np.pi
-    common = rng.standard_normal(3) * np.cos(phase) + rng.standard_normal(3) * np.sin(phase)
-    return np.asarray(GPS_COMMON_M * common + GPS_NOISE_M * rng.standard_normal((count, 3)))
 
 
 def _turned(rng: np.random.Generator, sigma_deg: float, count: int) -> Rotation:
@@ -260,16 +251,28 @@ def _turned(rng: np.random.Generator, sigma_deg: float, count: int) -> Rotation:
 def perturbed(block: SimulatedBlock) -> tuple[ExportContents, list[Group]]:
     """A start as a good first pass leaves it: exact poses made worse, in a frame of their own without positions."""
     rng = np.random.default_rng([block.seed, _STREAM, 9])
-    turns = _turned(rng, _START_DEG, len(block.poses))
+    centers_m = np.array([pose.center_m for pose in block.poses.values()])
+    turns = Rotation.from_rotvec(np.deg2rad(_START_DEG) * _wave(centers_m, rng))
+    shifts_m = _START_SHARE * block.flying_m * _wave(centers_m, rng)
     scale = LOCAL_FLYING_HEIGHT / block.flying_m if block.positions == "nothing" else 1.0
     poses = {}
-    for turn, (image_id, pose) in zip(turns, block.poses.items(), strict=True):
+    for turn, shift_m, (image_id, pose) in zip(turns, shifts_m, block.poses.items(), strict=True):
         assert pose.world_rotation is not None
-        center_m = scale * (pose.center_m + _START_SHARE * block.flying_m * rng.standard_normal(3))
+        center_m = scale * (pose.center_m + shift_m)
         sigma_m = scale * _START_SHARE * block.flying_m
         poses[image_id] = Pose(center_m, turn.as_matrix() @ pose.world_rotation, sigma_m, _START_DEG)
     kind = "level" if block.positions == "nothing" else "positions"
     return _started(block, block.contents.block.cameras, poses), [Group(kind, tuple(poses))]
+
+
+def _wave(centers_m: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(N, 3) of standard deviation 1: a wave four times as long as the block, and a little of each by itself."""
+    plan_m = centers_m[:, :2] - centers_m[:, :2].mean(axis=0)
+    direction_rad = rng.uniform(0.0, 2.0 * np.pi)
+    along = plan_m @ [np.cos(direction_rad), np.sin(direction_rad)] / max(np.ptp(plan_m, axis=0).max(), 1.0)
+    phase = 0.5 * np.pi * along[:, None]
+    common = rng.standard_normal(3) * np.cos(phase) + rng.standard_normal(3) * np.sin(phase)
+    return np.asarray(common + _START_OWN * rng.standard_normal(centers_m.shape))
 
 
 def mapped(block: SimulatedBlock, mapper: Mapper = "global") -> tuple[ExportContents, list[Group]]:
