@@ -161,6 +161,6 @@ def test_what_json_gets_is_plain() -> None:
     assert facts["findings"][0] == {
         "what": "bowl", "value": 10.0, "limit": 5.0, "level": "doubtful",
         "sentence": "the middle of the block may lie 10.0 ground pixels (0.3 m) above or below its border: straight "
-        "views from one height do not determine it; two strips across, images from another height, or three control points "
-        "determine it",
+        "views from one height do not determine it; two strips across, images from another height, or three control "
+        "points determine it",
     }  # fmt: skip

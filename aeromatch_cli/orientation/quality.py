@@ -238,8 +238,8 @@ def _positions(evidence: Evidence) -> _Found:
         return
     shares = np.array([one["used"] for one in found]) / sum(one["used"] for one in found)
     remedy = (
-        "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state their "
-        "real accuracy, or correct their cause"
+        "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
+        "their real accuracy, or correct their cause"
     )
     for name, axes in (("horizontally", [0, 1]), ("vertically", [2])):
         sigmas, off_m, stated_m = (
