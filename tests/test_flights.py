@@ -389,7 +389,7 @@ def test_the_corners_have_rays_whatever_the_format(width: int, height: int, shar
 
 
 def test_wrong_orders_are_refused_by_name() -> None:
-    with pytest.raises(ConfigError, match=r"'zigzag'.*nadir, oblique, sweep, orbit, arc, two-flights, mixed"):
+    with pytest.raises(ConfigError, match=r"'zigzag'.*nadir, oblique, sweep, orbit, arc, two-flights, mixed, cross"):
         plan("zigzag", 3)
     with pytest.raises(ConfigError, match=r"'FISHEYE'.*SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV"):
         plan("nadir", 3, lens="FISHEYE")

@@ -40,6 +40,9 @@ _ARC_TILTS_DEG = (64.0, 60.0, 68.0)
 _ARC_STEP_DEG = 8.0
 _SECOND_HEADING_DEG = 75.0
 _MIXED_SWEEP_DEG = 25.0
+# Of a nadir flight with further strips across or tilted pictures: so many of all images are nadir ones along.
+_ALONG_SHARE = 2.0 / 3.0
+_ACROSS_DEG, _TILTED_DEG = 90.0, 30.0
 # Sigmas of the wobble: height and plan position in flying heights, then tilt, heading in degrees. The long focal length
 # of a sweep camera needs a steadier, higher aircraft.
 _HEIGHT_SIGMA, _POSITION_SIGMA, _TILT_SIGMA_DEG, _HEADING_SIGMA_DEG = 0.03, 0.01, 2.0, 2.5
@@ -148,13 +151,52 @@ def _nadir_station(order: Order, spot: _Spot, height_m: float, sortie: int) -> S
     return Station(_shot(spot, height_m, np.eye(3), order.rng.standard_normal(6)), _NADIR_ID, sortie, height_m)
 
 
+def _plan_cross(order: Order) -> _Planned:
+    """Strips along, and fewer across them at the same height."""
+    along = round(_ALONG_SHARE * order.images)
+    spots = [
+        *_nadir_strips(replace(order, images=along), order.height_m),
+        *_nadir_strips(replace(order, images=order.images - along), order.height_m, _ACROSS_DEG),
+    ]
+    return {_NADIR_ID: order.camera(_NADIR_FOCAL)}, [_nadir_station(order, s, order.height_m, 0) for s in spots]
+
+
+def _plan_two_heights(order: Order) -> _Planned:
+    """The same strips twice, half of the pictures from higher up."""
+    low = -(-order.images // 2)
+    stations = []
+    for images, height_m in ((low, order.height_m), (order.images - low, SECOND_HEIGHT_FACTOR * order.height_m)):
+        spots = _nadir_strips(replace(order, images=images), height_m)
+        stations += [_nadir_station(order, spot, height_m, 0) for spot in spots]
+    return {_NADIR_ID: order.camera(_NADIR_FOCAL)}, stations
+
+
+def _plan_tilted(order: Order) -> _Planned:
+    """Nadir strips along, and strips across them whose pictures look ahead."""
+    along = round(_ALONG_SHARE * order.images)
+    nadir = _nadir_strips(replace(order, images=along), order.height_m)
+    stations = [_nadir_station(order, spot, order.height_m, 0) for spot in nadir]
+    for spot in _nadir_strips(replace(order, images=order.images - along), order.height_m, _ACROSS_DEG):
+        exterior = _shot(spot, order.height_m, _look(0.0, _TILTED_DEG), order.rng.standard_normal(6))
+        stations.append(Station(exterior, _NADIR_ID, 0, order.height_m))
+    return {_NADIR_ID: order.camera(_NADIR_FOCAL)}, stations
+
+
 def _plan_oblique(order: Order) -> _Planned:
+    return _plan_rig(order, _RIG_FORWARD_OVERLAP, _RIG_SIDE_OVERLAP)
+
+
+def _plan_dense_rig(order: Order) -> _Planned:
+    return _plan_rig(order, FORWARD_OVERLAP, SIDE_OVERLAP)
+
+
+def _plan_rig(order: Order, forward_overlap: float, side_overlap: float) -> _Planned:
     """Few strips and long ones: forward and back pictures meet two flying heights apart on the same strip."""
     cameras = order.rig()
     count = -(-order.images // len(cameras))
     strips = max(1, round(float(np.sqrt(count / 3.0))))
     stations = []
-    for spot in _strips(count, strips, *order.steps_m(_RIG_FORWARD_OVERLAP, _RIG_SIDE_OVERLAP)):
+    for spot in _strips(count, strips, *order.steps_m(forward_overlap, side_overlap)):
         wobble = order.rng.standard_normal(6)
         stations += [Station(_shot(spot, order.height_m, _mount(c), wobble), c, 0, order.height_m) for c in cameras]
     return cameras, stations[: order.images]
@@ -276,5 +318,9 @@ FLIGHTS: Mapping[str, Callable[[Order], _Planned]] = MappingProxyType(
         "arc": _plan_arc,
         "two-flights": _plan_two_flights,
         "mixed": _plan_mixed,
+        "cross": _plan_cross,
+        "two-heights": _plan_two_heights,
+        "tilted": _plan_tilted,
+        "dense-rig": _plan_dense_rig,
     }
 )

@@ -17,6 +17,10 @@ TABLE: Table = {
         "benchmarks.orient.command",
         "orientation from the pictures where given poses and cameras are wrong",
     ),
+    "calibration": (
+        "benchmarks.calibration.command",
+        "bundle adjustment of simulated tie points with real lenses, beside COLMAP, by exact truth",
+    ),
     "similar": ("benchmarks.similar", "pairs of images without poses by image retrieval, against reference overlaps"),
     "polar": ("benchmarks.polar.command", "registration of texture-poor ground beside SIFT"),
     "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),
