@@ -7,24 +7,40 @@ from typing import Any
 import pytest
 
 from aeromatch_cli.stages.closing import closing_lines
-from aeromatch_cli.stages.stage_report import StageReport
+from aeromatch_cli.stages.quality import quality_of
 
 NAMES = {i: f"{i}.jpg" for i in "abcd"}
+# Of a group whose four positions are met as stated.
+PLACED = {"kind": "positions", "positions": {
+    "images": 4, "used": 4, "wrong": [], "rms_m": [0.02, 0.02, 0.03], "rms_sigmas": [1.0, 1.0, 1.0],
+    "stated_m": [0.02, 0.02, 0.03], "factors": [1.0, 1.0],
+}}  # fmt: skip
+LEVEL = {"kind": "level"}
 
 
-def reports(**changes: Any) -> list[StageReport]:
-    filtered = {"components": [4], "weakly_tied": [], **changes.get("filter", {})}
-    adjusted = {"outside": {}, "groups": [{"kind": "positions"}], "images": 4, **changes.get("adjust", {})}
-    spread = {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})
-    return [
-        StageReport("filter", facts=filtered),
-        StageReport("adjust", facts=adjusted),
-        StageReport("consistency", facts={"spread": spread, **changes.get("consistency", {})}),
+def lines_of(**changes: Any) -> list[str]:
+    adjusted = {
+        "outside": {}, "groups": [PLACED], "images": 4, "positions_given": 4, "track_length": 3.9, "held_by_pairs": 0,
+        "reprojection_error_px": 0.2, "ground_pixel_m": 0.05,
+    }  # fmt: skip
+    facts = {
+        "filter": {"components": [4], "weakly_tied": [], **changes.get("filter", {})},
+        "refine": {"keypoints": 100, "measured": 90},
+        "adjust": adjusted | changes.get("adjust", {}),
+        "consistency": {"spread": {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})}
+        | changes.get("consistency", {}),
+    }
+    quality = quality_of(facts, NAMES)
+    assert quality is not None
+    return closing_lines(quality, facts, NAMES)
+
+
+def test_a_block_against_which_nothing_speaks_is_good() -> None:
+    assert lines_of() == [
+        "result    good: all 4 images are connected and oriented",
+        "          not checked: angles: none are given; control points: none are given; calibration: it was not "
+        "adjusted; expected deformation: the block was not adjusted, or has too few points",
     ]
-
-
-def test_a_sound_block_is_called_so() -> None:
-    assert closing_lines(reports(), NAMES) == ["result    sound: all 4 images are connected and oriented"]
 
 
 @pytest.mark.parametrize(
@@ -32,37 +48,38 @@ def test_a_sound_block_is_called_so() -> None:
     [
         (
             {"filter": {"components": [3, 1]}},
-            ["not sound: 2 groups of images (3, 1) that no verified pair connects", "--set pairs=exhaustive"],
+            ["bad: 2 groups of images (3, 1) that no verified pair connects", "--set pairs=exhaustive"],
         ),
         (
-            {"adjust": {"outside": {"b": "few matches"}}},
-            ["not sound: not oriented: b.jpg", "aeromatch show WORK b.jpg"],
+            {"adjust": {"outside": {"b": "few matches"}, "images": 3}},
+            ["bad: 3 of 4 images are oriented: not oriented: b.jpg", "aeromatch show WORK b.jpg"],
         ),
         (
-            {"adjust": {"groups": [{"kind": "positions"}, {"kind": "positions"}, {"kind": "level"}]}},
-            ["2 parts whose scale and place nothing ties", "--poses"],
+            {"adjust": {"groups": [PLACED, PLACED, LEVEL]}},
+            ["bad: 2 parts whose scale and place nothing ties", "--poses"],
         ),
-        ({"adjust": {"groups": [{"kind": "level"}] * 3}}, ["3 parts whose scale and place nothing ties", "--poses"]),
-        ({"adjust": {"groups": [{"kind": "positions"}] * 2}}, ["sound: all 4 images are connected and oriented"]),
-        ({"adjust": {"images": 0}}, ["sound: all 4 images are connected; not oriented, as orient=none asks"]),
+        ({"adjust": {"groups": [LEVEL] * 3, "positions_given": 0}}, ["bad: 3 parts whose scale", "--poses"]),
+        ({"adjust": {"groups": [LEVEL], "positions_given": 0}}, ["doubtful: shape only: nothing ties the block"]),
+        ({"adjust": {"groups": [PLACED] * 2}}, ["good: all 4 images are connected and oriented"]),
+        ({"adjust": {"images": 0}}, ["good: all 4 images are connected", "not checked: orientation: orient=none"]),
         (
             {"adjust": {"images": 0, "remarks": ["not done: no image is oriented"]}},
-            ["not sound: no image is oriented", "known positions and attitudes (--poses)"],
+            ["bad: no image is oriented", "known positions and attitudes (--poses)"],
         ),
         (
             {"consistency": {"components": [3, 1], "weakly_tied": ["d"]}},  # of the final matches
-            ["not sound: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
+            ["bad: 2 groups of images (3, 1)", "weak: d.jpg, with fewer than 50 verified matches"],
         ),
-        ({"filter": {"weakly_tied": ["c"]}}, ["sound: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
-        ({"spread": {"d": [9, 0, 3]}}, ["sound", "weak: d.jpg, with fewer than 20 points that three images see"]),
-        ({"spread": {"a": [7, 2, 99]}}, ["sound", "parts without a point though other images show them: a.jpg"]),
+        ({"filter": {"weakly_tied": ["c"]}}, ["good: all 4", "weak: c.jpg, with fewer than 50 verified matches"]),
+        ({"spread": {"d": [9, 0, 3]}}, ["good", "weak: d.jpg, with fewer than 20 points that three images see"]),
+        ({"spread": {"a": [7, 2, 99]}}, ["good", "parts without a point though other images show them: a.jpg"]),
     ],
 )
 def test_what_is_wrong_or_weak_is_named_with_what_to_do(changes: dict[str, Any], expected: list[str]) -> None:
-    lines = closing_lines(reports(**changes), NAMES)
-    assert lines[0].startswith("result    ")
+    lines = lines_of(**changes)
+    assert lines[0].startswith(f"result    {expected[0].partition(':')[0]}")
     assert all(any(words in line for line in lines) for words in expected), lines
 
 
-def test_a_part_of_a_run_says_nothing() -> None:
-    assert closing_lines(reports()[:1], NAMES) == []
+def test_a_part_of_a_run_has_no_verdict() -> None:
+    assert quality_of({"filter": {"components": [4], "weakly_tied": []}}, NAMES) is None

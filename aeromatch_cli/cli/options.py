@@ -237,6 +237,14 @@ Overwrite = Annotated[
     bool,
     typer.Option("--overwrite", rich_help_panel=_RESULTS, help="Make every result again, even if it is up to date."),
 ]
+Strict = Annotated[
+    bool,
+    typer.Option(
+        "--strict",
+        rich_help_panel=_RESULTS,
+        help="End with exit code 4 where the result is doubtful (run, adjust); where it is bad the code is 1 anyway.",
+    ),
+]
 KeepImages = Annotated[
     bool,
     typer.Option(

@@ -67,6 +67,9 @@ class AdjustFacts(Facts):
     reprojection_error_px: float | None = Field(None, description="Mean, pixels.")
     sigma_position_m: float | None = Field(None, description="Of the positions, metres, median; null without metres.")
     sigma_angle_deg: float | None = Field(None, description="Of the attitudes, degrees, median.")
+    groups: list[dict[str, Any]] = Field(
+        [], description="Of each group: positions, flights, mounts, calibration, heights, control; see adjusted.json."
+    )
     outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
     residuals: dict[str, Any] = Field(
         {}, description="Adjusted less given positions and attitudes: rms, median, worst image; see residuals.csv."
@@ -158,8 +161,10 @@ class Line(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    exit_code: int = Field(description="0: all is done; 1: some images or pairs failed; 2: settings or arguments; 3: "
-                           "input or workspace; 130: interrupted.")  # fmt: skip
+    exit_code: int = Field(
+        description="0: all is done; 1: some images or pairs failed, or the result is bad; 2: settings or arguments; "
+        "3: input or workspace; 4: the result is doubtful, with --strict; 130: interrupted."
+    )
 
 
 class Error(Line):
@@ -167,6 +172,28 @@ class Error(Line):
 
     command: str | None = Field(None, description="The command; missing where none is recognised.")
     error: str = Field(description="What stopped the command, and what to do.")
+
+
+class Finding(BaseModel):
+    """One criterion of the quality of a block."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    what: str = Field(description="Name of the criterion: `reprojection error`, `bowl` ...")
+    value: float | None = Field(description="Its figure, null where it is no number.")
+    limit: float | None = Field(description="Where doubt begins.")
+    level: Literal["good", "doubtful", "bad"]
+    sentence: str = Field(description="Both in words and, where it is not good, the remedy.")
+
+
+class Quality(BaseModel):
+    """How good the adjusted block is."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    verdict: Literal["good", "doubtful", "bad"] = Field(description="The worst level of all findings.")
+    findings: list[Finding] = Field(description="Of all criteria that could be checked, the worst first.")
+    unchecked: list[str] = Field(description="What could not be checked, in words.")
 
 
 class Outcome(Line):
@@ -177,7 +204,7 @@ class Outcome(Line):
     ]
     workspace: str = Field(description="Folder of the results.")
     failures: int = Field(description="Images and pairs that failed; failures.csv names them.")
-    sound: bool | None = Field(None, description="Of a whole `run`: whether its line `result` says sound.")
+    quality: Quality | None = Field(None, description="After `run` and `adjust`: what their line `result` says.")
     stages: Stages = Field(description="What each stage did.")
 
 
@@ -237,6 +264,7 @@ class Shown(Line):
     state: str | None = Field(None, description="verified, rejected, not verifiable.")
     picture: str | None = Field(None, description="The file that was written.")
     file: str | None = None
+    quality: Quality | None = Field(None, description="Of a workspace.")
 
 
 class Compared(Line):

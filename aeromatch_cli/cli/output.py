@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from aeromatch_cli.stages.run import Result
 
 EXIT_SOME_FAILED = 1
+EXIT_DOUBTFUL = 4
 EXIT_INTERRUPTED = 130
 # Where the application keeps the arguments as they were written, in the object of the root context.
 ARGUMENTS = "aeromatch.arguments"
@@ -41,8 +42,10 @@ def guarded(
     as_json: bool,
     log_file: Path | None,
     context: typer.Context | None = None,
+    strict: bool = False,
 ) -> None:
-    """Run one command; print its result, or its error, and leave with the right exit code."""
+    """Run one command; print its result, or its error, and leave with the right exit code. strict: a doubtful result
+    has one of its own."""
     started = time.monotonic()
     with ExitStack() as stack:
 
@@ -52,7 +55,7 @@ def guarded(
             with _terminated_like_interrupt():
                 return call()
 
-        facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet)
+        facts: dict[str, Any] = {"command": command} | _outcome(logged, quiet=quiet, strict=strict)
         record.info("exit code %d after %.1f s", facts["exit_code"], time.monotonic() - started)
     if as_json:
         printed(json.dumps(_finite(facts), allow_nan=False))
@@ -64,7 +67,7 @@ def _arguments(context: typer.Context | None) -> Sequence[str]:
     return () if context is None else tuple(context.find_root().obj[ARGUMENTS])
 
 
-def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
+def _outcome(call: Callable[[], Result], *, quiet: bool, strict: bool) -> dict[str, Any]:
     """The facts of one call, with its exit code; its lines, or its error, are printed and recorded."""
     try:
         result = call()
@@ -97,7 +100,13 @@ def _outcome(call: Callable[[], Result], *, quiet: bool) -> dict[str, Any]:
             printed(": ".join(failure[1:]), err=True)
         if len(result.failures) > _FAILURES_SHOWN:
             printed(f"and {len(result.failures) - _FAILURES_SHOWN} more", err=True)
-    return result.facts | {"exit_code": EXIT_SOME_FAILED if result.failures else 0}
+    return result.facts | {"exit_code": _exit_code(result, strict=strict)}
+
+
+def _exit_code(result: Result, *, strict: bool) -> int:
+    if result.failures or result.verdict == "bad":
+        return EXIT_SOME_FAILED
+    return EXIT_DOUBTFUL if strict and result.verdict == "doubtful" else 0
 
 
 def _shortened(text: str) -> str:

@@ -33,6 +33,7 @@ from aeromatch_cli.cli.options import (
     Scheduler,
     Set,
     ShardText,
+    Strict,
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 # Commands that start anew where no preset is named.
 _WHOLE = ("run", "check")
+# Commands that end with a verdict on the block.
+_JUDGED = ("run", "adjust")
 # Name: what the command does, and examples.
 STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
     "run": (
@@ -155,6 +158,7 @@ def stage_command(name: str) -> Callable[..., None]:
         scheduler: Scheduler = None,
         shard: ShardText = None,
         overwrite: Overwrite = False,
+        strict: Strict = False,
         keep_images: KeepImages = False,
         log_file: LogFile = None,
         json_: Json = False,
@@ -170,6 +174,8 @@ def stage_command(name: str) -> Callable[..., None]:
             from aeromatch_cli.config import load
             from aeromatch_cli.stages.run import execute
 
+            if strict and name not in _JUDGED:
+                raise ConfigError(f"--strict is for {' and '.join(_JUDGED)}: {name} does not say how good the block is")
             if scheduler and executor not in (None, "dask"):
                 raise ConfigError(f"--scheduler is for --executor dask, not {executor}: leave out one of them")
             recipe, say = _recipe(config, name, workspace), said(quiet)
@@ -186,7 +192,7 @@ def stage_command(name: str) -> Callable[..., None]:
             shown = progress_shown(quiet, course if name == "run" else ())
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
-        guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context)
+        guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 
     return command
 

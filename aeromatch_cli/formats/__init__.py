@@ -115,14 +115,38 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
 ### orientation/adjusted.json
 
 - `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
-- `facts`: `images`, `points`, `track_length` (images per point, mean), `reprojection_error_px` (mean),
+- `facts`: `images`, `points`, `track_length` (images per point, mean), `held_by_pairs` (images with fewer than 20
+  points that three images see), `reprojection_error_px` (mean), `ground_pixel_m` (what a pixel is on the ground,
+  median, in units of the largest group's frame), `reduced` (stored pixels in a pixel of the pictures that keypoints
+  were found in), `positions_given` (images),
   `sigma_position_m` (median over the images whose frame has metres, else null), `sigma_angle_deg` (median), `groups`
-  (the same figures of each), `outside`
+  (see below), `outside`
   (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
   `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
   `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
   (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was
   given; `positions`, `rotations`: how many were compared; `error_px_median`, `error_px_worst`: of the images' means.
+- Each of `groups`: `kind`, `images`, `points`, `track_length`, `reprojection_error_px`, `registered` (image_ids that
+  were tied to it by its points) and, where it was adjusted:
+  - `sigma_px`: standard deviation of a coordinate of an image point, by residuals and redundancy.
+  - `positions`, null without any: `images` that have one, `used`, `wrong` (image_ids of those that are not used),
+    `rms_m` and `rms_sigmas` (root mean squares of measured less adjusted ones along x, y, z, in metres and in stated
+    standard deviations, after what was found of flights and antennas), `stated_m` (median standard deviations),
+    `factors` (by which they are less exact than stated, horizontally and vertically, as the adjustment weighs them).
+  - `flights`: those of which something was found: `flight` (its name), `images`, `step_m` (of its heights above those
+    of the flight of most images, taken out before), and of `shift_x`, `shift_y`, `shift_z` (metres) and `lag_s`
+    (seconds by which positions lag behind exposures) those that were unknowns: value, standard deviation.
+  - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
+    projection centre to the antenna, in the camera's frame): value, standard deviation.
+  - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
+    known before and its standard deviation; `correlations`: up to five pairs above 0.9: two names, correlation.
+  - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
+    middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
+    both are of), `points`: x, y and standard deviation of points over the block. Of a group in a frame of its own in
+    units of it.
+  - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `held_out` (`check points`, or `leave
+    one out`), `held_out_rms_m` and `without_rms_m` (at these, with control and without), `kept` (whether control
+    makes them better).
 
 ### orientation/adjusted.npz
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
-from aeromatch_cli.orientation.adjusting import Outcome
+from aeromatch_cli.orientation.adjusting import Given, Outcome
 from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
 from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
 from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
@@ -20,13 +22,14 @@ _HEIGHTS = 150
 _CELLS = 12
 
 
-def adjustment_facts(outcome: Outcome) -> dict[str, Any]:
-    """Of one group. Keys are described in `formats` (adjusted.json)."""
+def adjustment_facts(outcome: Outcome, given: Given) -> dict[str, Any]:
+    """Of one group. given: what its images had. Keys are described in `formats` (adjusted.json); images, flights and
+    cameras are numbers, see `with_names`."""
     result = outcome.result
     network, state, found = result.network, result.state, result.found
     facts: dict[str, Any] = {
         "sigma_px": result.sigma_px,
-        "positions": _positions(outcome),
+        "positions": _positions(outcome, given),
         "flights": _flights(outcome),
         "mounts": _mounts(outcome),
         "calibration": {str(n): _calibration(outcome, k) for k, n in enumerate(outcome.cameras)},
@@ -36,14 +39,38 @@ def adjustment_facts(outcome: Outcome) -> dict[str, Any]:
     return facts
 
 
-def _positions(outcome: Outcome) -> dict[str, Any] | None:
-    """How positions agree with the adjusted block: root mean squares, metres and in stated standard deviations."""
-    result = outcome.result
-    stated = result.stated
-    known = stated.located
+def with_names(
+    facts: dict[str, Any], images: Sequence[str], cameras: Sequence[str], flights: Sequence[str]
+) -> dict[str, Any]:
+    """The facts of a group with ids and names for numbers: images and cameras from 1, flights from 0, -1 for none."""
+    named = dict(facts)
+    if named.get("positions"):
+        wrong = [images[number - 1] for number in named["positions"]["wrong"]]
+        named["positions"] = {**named["positions"], "wrong": wrong}
+    if "flights" in named:
+        of_none = "images of no flight"
+        named["flights"] = [
+            {**one, "flight": flights[one["flight"]] if one["flight"] >= 0 else of_none} for one in named["flights"]
+        ]
+    for key in ("mounts", "calibration"):
+        if key in named:
+            named[key] = {cameras[int(number) - 1]: one for number, one in named[key].items()}
+    return named
+
+
+def _positions(outcome: Outcome, given: Given) -> dict[str, Any] | None:
+    """How positions agree with the adjusted block: root mean squares, metres and in stated standard deviations.
+
+    Positions that were left out before the adjustment, because they lay too far off, count as wrong ones.
+    """
+    result, rows = outcome.result, np.array(outcome.images, dtype=int) - 1
+    steps_m = 0.0 if outcome.steps_m is None else outcome.steps_m[rows][:, None] * [0.0, 0.0, 1.0]
+    stated = replace(
+        result.network, positions_m=given.positions_m[rows] - steps_m, position_sigmas_m=given.sigmas_m[rows]
+    )
+    known, used = stated.located, result.network.located
     if not known.any():
         return None
-    used = result.network.located
     off_m = position_residuals_m(stated, result.state)
     sigmas = off_m / stated.position_sigmas_m
     return {
@@ -125,7 +152,7 @@ def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, 
 
     sigma_m: median standard deviation; bowl_m, tilt_m: standard deviation of how much the middle of the block lies
     above its border, and one side above the other, at the extent of the points. map: cells with their standard
-    deviation. Where place and scale are open (a free network) they are those of the shape.
+    deviation. reach_m: half that extent. Where place and scale are open (a free network) they are those of the shape.
     """
     rows = _spread(network, state)
     if len(rows) < 6:
@@ -144,6 +171,7 @@ def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, 
         "sigma_m": float(np.median(heights_m)),
         "bowl_m": float(sigmas[3]),
         "tilt_m": float(np.hypot(sigmas[1], sigmas[2])),
+        "reach_m": reach,
         "points": cells,
     }
 

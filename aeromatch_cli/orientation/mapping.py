@@ -21,6 +21,7 @@ from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, Contr
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px
 from aeromatch_cli.geometry.lenses import in_colmap
+from aeromatch_cli.orientation.adjustment_facts import with_names
 from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, lens_prior
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
@@ -124,9 +125,13 @@ def refine_block(
     with _task(contents, observed) as folder:
         facts = _solved(folder, "refiner", task, "pycolmap's bundle adjustment")
         archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
-    for one in facts:
-        one["registered"] = [_image_ids(block)[k - 1] for k in one["registered"]]
-    return _joined(archives, [one["kind"] for one in facts], block), facts
+    image_ids, flights = _image_ids(block), sorted(set(observed.flights.values()))
+    named = [
+        with_names(one, image_ids, sorted(block.cameras), flights)
+        | {"registered": [image_ids[k - 1] for k in one["registered"]]}
+        for one in facts
+    ]
+    return _joined(archives, [one["kind"] for one in facts], block), named
 
 
 def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: Block) -> AdjustedBlock:

@@ -117,7 +117,7 @@ def refine(folder: Path) -> None:
         name = f"model{len(facts)}.npz"
         deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
         np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
-        known = {} if outcome is None else adjustment_facts(outcome) | {"control": control}
+        known = {} if outcome is None else adjustment_facts(outcome, observed) | {"control": control}
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, IntArray, Pose, PoseResidual
 from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.orientation.block_figures import images_per_point
 
 _UNKNOWN = np.full(3, np.nan)
 
@@ -24,9 +25,7 @@ def residuals_of(
     given: image_id -> pose as it was given, in the world of the adjusted block. keypoints_px: image_id -> (K, 2) stored
     pixels that the tracks point into.
     """
-    seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
-    for track in adjusted.tracks.values():
-        seen[np.unique(track[:, 1])] += 1
+    seen = images_per_point(adjusted)
     found = {}
     for image in images:
         if image.image_id in adjusted.poses:

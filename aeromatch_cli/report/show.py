@@ -33,6 +33,7 @@ from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
+from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
@@ -175,10 +176,18 @@ def _workspace(work: _Work) -> Shown:
     ]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
+    facts: dict[str, Any] = {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)}
+    names = {image_id: image.name for image_id, image in work.images.items()}
+    quality = quality_on_file(workspace, names)
+    if quality is not None:
+        first, *others = [one.sentence for one in quality.faults] or ["nothing speaks against it"]
+        lines += [f"result      {quality.verdict}: {first}", *(f"            {words}" for words in others)]
+        lines += [f"            not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
+        facts["quality"] = quality.as_facts()
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")
-    return Shown(lines, {"workspace": str(workspace.root), "images": len(work.images), "pairs": len(work.pairs)})
+    return Shown(lines, facts)
 
 
 def _stale(work: _Work) -> str:

@@ -21,6 +21,8 @@ from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, writ
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.residuals import residuals_text
 from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.images.scaling import scale_within
+from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
@@ -33,7 +35,7 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
-VERSION = 20
+VERSION = 21
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -64,7 +66,7 @@ def run(context: Context) -> StageReport:
             adjusted, figures = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
-        report.facts = {"images": 0, "remarks": []}  # not those of an earlier adjustment
+        report.facts = {"images": 0, "remarks": [f"not done: {error}"]}  # not those of an earlier adjustment
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
     report.facts = _facts(context, adjusted, figures) | {"residuals": _residual_figures(context, residuals)}
@@ -160,29 +162,21 @@ def _write(
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
     control = _control(context, adjusted)
-    beside = adjusted.frames  # no length there is a metre
     return {
-        "images": len(adjusted.poses),
-        "points": len(adjusted.points_m),
-        "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
-        "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
-        "sigma_position_m": _median([float(np.mean(p.sigmas_m)) for i, p in adjusted.poses.items() if i not in beside]),
-        "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
-        "groups": [dict(one) for one in figures],
-        "cameras": {
-            camera_id: [camera.model, camera.width_px, camera.height_px, list(camera.params)]
-            for camera_id, camera in sorted(adjusted.cameras.items())
-        },
+        **block_figures(adjusted, context.block.images, figures),
+        "positions_given": len(context.given.poses),
+        "reduced": _reduced(context),
         "outside": _reasons(context, adjusted),
         "control": control,
         "remarks": _remarks(context, adjusted, control),
     }
 
 
-def _median(values: Sequence[float]) -> float | None:
-    """Of those that are known; None where none is."""
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.median(known)) if known else None
+def _reduced(context: Context) -> float:
+    """Stored pixels in a pixel of the pictures that keypoints are found in (--max-size), median."""
+    limit = context.settings.block.max_size_px
+    scales = [scale_within(limit, image.width_px, image.height_px) for image in context.block.images]
+    return round(1.0 / float(np.median(scales)), 4)
 
 
 def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, Any] | None) -> list[str]:

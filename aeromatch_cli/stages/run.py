@@ -18,6 +18,7 @@ from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
+from aeromatch_cli.orientation.quality import Level, Quality
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -35,9 +36,10 @@ from aeromatch_cli.stages import (
     union,
 )
 from aeromatch_cli.stages.changes import changed_words
-from aeromatch_cli.stages.closing import closing_lines, is_sound
+from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
+from aeromatch_cli.stages.quality import facts_told, quality_of
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -62,11 +64,13 @@ _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "
 
 @dataclass(frozen=True)
 class Result:
-    """What a command says: lines for people, facts for machines, failures for the exit code."""
+    """What a command says: lines for people, facts for machines; failures, and the verdict on the block where there is
+    one, for the exit code."""
 
     lines: tuple[str, ...]
     facts: dict[str, Any] = field(default_factory=dict)
     failures: tuple[tuple[str, str, str], ...] = ()
+    verdict: Level | None = None
 
 
 def execute(
@@ -333,8 +337,9 @@ def _result(
     lines = said.rest(next(report for report in reports if report.stage == "pairs").facts["summary"])
     for stage in reports:
         lines += stage_lines(stage, names, part=part)
-    if command == "run" and not part:
-        lines += closing_lines(reports, names)
+    quality, told = _quality(command, workspace, reports, names, part=part)
+    if quality is not None:
+        lines += closing_lines(quality, told, names)
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {workspace.report}")
@@ -351,9 +356,19 @@ def _result(
         "stages": _stage_facts(reports),
         "failures": len(failures),
     }
-    if command == "run" and not part:
-        facts["sound"] = is_sound(reports, names)
-    return Result(tuple(lines), facts, failures)
+    if quality is not None:
+        facts["quality"] = quality.as_facts()
+    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict)
+
+
+def _quality(
+    command: str, workspace: Workspace, reports: Sequence[StageReport], names: Mapping[str, str], *, part: bool
+) -> tuple[Quality | None, Mapping[str, Any]]:
+    """The verdict on the block after `run` and `adjust`, and the facts by stage that it rests on."""
+    if command not in ("run", "adjust") or part:
+        return None, {}
+    facts = facts_told(workspace, reports)
+    return quality_of(facts, names), facts
 
 
 def _left(workspace: Workspace, settings: Settings) -> list[Path]:

@@ -1,0 +1,67 @@
+"""Figures of an adjusted block as a whole, JSON-ready: sizes, errors, and how many images hold each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
+from aeromatch_cli.geometry.cameras import focal_px
+
+# Images with fewer points of three images and more are held by their neighbours one by one.
+_FEW_POINTS = 20
+
+
+def block_figures(
+    adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Keys as in adjusted.json. groups: facts of each."""
+    placed = [pose for image_id, pose in adjusted.poses.items() if image_id not in adjusted.frames]
+    seen = images_per_point(adjusted)
+    held = [int((seen[track[:, 1]] >= 3).sum()) for track in adjusted.tracks.values()]
+    return {
+        "images": len(adjusted.poses),
+        "points": len(adjusted.points_m),
+        "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
+        "held_by_pairs": sum(count < _FEW_POINTS for count in held),
+        "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
+        "ground_pixel_m": _ground_pixel_m(adjusted, {image.image_id: image.camera_id for image in images}),
+        # No length is a metre in a frame of a group's own.
+        "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in placed]),
+        "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
+        "groups": [dict(one) for one in groups],
+        "cameras": {
+            camera_id: [camera.model, camera.width_px, camera.height_px, list(camera.params)]
+            for camera_id, camera in sorted(adjusted.cameras.items())
+        },
+    }
+
+
+def images_per_point(adjusted: AdjustedBlock) -> IntArray:
+    """(P,)."""
+    seen = np.zeros(len(adjusted.points_m), dtype=np.int64)
+    for track in adjusted.tracks.values():
+        seen[np.unique(track[:, 1])] += 1
+    return seen
+
+
+def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> float | None:
+    """What a pixel is on the ground, in units of the largest frame: median over images of the distance of their points
+    over the focal length."""
+    frames = [adjusted.frames.get(image_id, 0) for image_id in adjusted.poses]
+    largest = max(set(frames), key=frames.count, default=0)
+    sizes = []
+    for image_id, pose in adjusted.poses.items():
+        track = adjusted.tracks.get(image_id)
+        if track is not None and len(track) and adjusted.frames.get(image_id, 0) == largest:
+            depths: FloatArray = (adjusted.points_m[track[:, 1]] - pose.center_m) @ pose.rotation[2]
+            sizes.append(float(np.median(depths)) / focal_px(adjusted.cameras[camera_ids[image_id]]))
+    return _median(sizes)
+
+
+def _median(values: Sequence[float]) -> float | None:
+    """Of those that are known; None where none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else None

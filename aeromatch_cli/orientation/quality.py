@@ -1,0 +1,442 @@
+"""Whether an adjusted block can be trusted: good, doubtful or bad, with the number that says so and the remedy.
+
+Every criterion looks at one figure of the adjustment (keys of adjusted.json) and at what it ought to be. The worst
+finding is the verdict. What nothing was given for cannot be checked; it is named, and counts neither way, but for a
+block that nothing ties to the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Level = Literal["good", "doubtful", "bad"]
+LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
+
+# Each pair: doubtful beyond the first, bad beyond the second; None: never bad by itself.
+Limits = tuple[float, float | None]
+# Root mean square of the differences from given positions, in stated standard deviations: 1 is what was promised. Wide
+# statements (5 m of GPS without a better word) are met easily, and that is good.
+_POSITION_SIGMAS: Limits = (2.0, 5.0)
+# Of the given positions, the share that the pictures contradict: single wrong ones happen.
+_WRONG_POSITIONS: Limits = (0.05, 0.3)
+# What was found of a flight (a step of height, a shift), in stated standard deviations of its positions: it is taken
+# out, but which of the flights is right is not known.
+_FLIGHT_SIGMAS: Limits = (3.0, None)
+# Between exposure and position: less is within what receivers do.
+_LAG_S: Limits = (0.1, None)
+# From the projection centre to the antenna: no drone is larger, so that something else has been found.
+_LEVER_M: Limits = (0.5, None)
+# From the first row of a picture to its last: no shutter needs as long.
+_READOUT_S: Limits = (0.2, None)
+# Medians of the differences from measured tilts, as standard deviations of what was stated.
+_TILT_SIGMAS: Limits = (3.0, 6.0)
+# Root mean square at points that took no part, in their standard deviations and those of their measurement.
+_CONTROL_SIGMAS: Limits = (3.0, 8.0)
+_WRONG_CONTROL: Limits = (0.0, 0.3)
+# Mean distance of an image point from where its point is seen, pixels of the picture that it was found in: tie points
+# measured by least squares, and those of a detector as it has left them. Sound blocks have 0.1 to 0.5 and 0.5 to 0.9.
+_MEASURED_PX: Limits = (0.6, 1.2)
+_DETECTED_PX: Limits = (1.0, 2.0)
+# Images per point: two rays meet nearly always, only a third one checks them.
+_FEWEST_IMAGES_PER_POINT = 2.5
+# Share of the images with hardly a point of three images.
+_HELD_BY_PAIRS: Limits = (0.1, 0.5)
+# A calibration that differs so much from what is known of the camera, in standard deviations of that: a camera file of
+# another camera, pictures of another size, or positions that force it.
+_LENS_SIGMAS: Limits = (3.0, 6.0)
+# Expected deformations: how far the middle of the block may lie above its border, ground pixels; and by which angle it
+# may be tilted, degrees, which is what one strip has about its line.
+_BOWL_PIXELS: Limits = (5.0, None)
+_TILT_DEG: Limits = (1.0, None)
+# Share of the images that are not oriented, or not in the largest part: none is as it should be.
+_LEFT_OUT: Limits = (0.0, 0.2)
+# Share of the images whose matches kept poses (orient=given) do not explain.
+_UNEXPLAINED: Limits = (0.1, 0.5)
+# So many positions, or points, hold a block.
+_HOLDING = 3
+
+_STRIPS = "two strips across, images from another height, or three control points determine it"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """what: name of the criterion; value and limit: its figure, and where doubt begins, None where it is no number;
+    sentence: both in words and, where it is not good, the remedy."""
+
+    what: str
+    value: float | None
+    limit: float | None
+    level: Level
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Quality:
+    """findings: of all that was checked, the worst first. unchecked: what could not be, in words."""
+
+    verdict: Level
+    findings: tuple[Finding, ...]
+    unchecked: tuple[str, ...] = ()
+
+    @property
+    def faults(self) -> tuple[Finding, ...]:
+        return tuple(finding for finding in self.findings if finding.level != "good")
+
+    def as_facts(self) -> dict[str, Any]:
+        """JSON-ready."""
+        findings = [asdict(one) | {"value": _rounded(one.value)} for one in self.findings]
+        return {"verdict": self.verdict, "findings": findings, "unchecked": list(self.unchecked)}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a block is judged by. images: of the block. adjust, orient: facts of these stages. components: sizes of the
+    groups of images that verified pairs connect, the largest first. refined: whether tie points were measured by least
+    squares. reduced: stored pixels in a pixel of the pictures that keypoints were found in. metric: whether lengths of
+    the world frame are metres. names: of the files, by image_id."""
+
+    images: int
+    adjust: Mapping[str, Any]
+    orient: Mapping[str, Any] = field(default_factory=dict)
+    components: Sequence[int] = ()
+    refined: bool = False
+    reduced: float = 1.0
+    metric: bool = True
+    names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def groups(self) -> Sequence[Mapping[str, Any]]:
+        return list(self.adjust.get("groups", ()))
+
+    def named(self, image_ids: Sequence[str], most: int = 5) -> str:
+        shown = ", ".join(self.names.get(i, i) for i in image_ids[:most])
+        return shown + (f" and {len(image_ids) - most} more" if len(image_ids) > most else "")
+
+
+def judged(evidence: Evidence) -> Quality:
+    """The verdict on a block, and what it rests on."""
+    findings, unchecked = [*_connection(evidence)], list[str]()
+    if evidence.adjust.get("images"):
+        for criterion in (
+            _left_out, _frames, _positions, _flights, _mounts, _angles, _control, _errors, _multiplicity,
+            _calibration, _deformation, _kept_poses,
+        ):  # fmt: skip
+            for found in criterion(evidence):
+                if isinstance(found, Finding):
+                    findings.append(found)
+                else:
+                    unchecked.append(found)
+    elif evidence.images > 2:
+        if evidence.adjust.get("remarks"):
+            words = (
+                "no image is oriented: more overlap, or known positions and attitudes (--poses) and cameras "
+                "(--cameras) help; matches are exported all the same"
+            )
+            findings.append(Finding("oriented images", 0.0, None, "bad", words))
+        else:  # nothing is said of an orientation that nobody wanted
+            unchecked.append("orientation: orient=none asks for none")
+    else:
+        unchecked.append("adjustment: two images have none")
+    findings.sort(key=lambda one: -LEVELS.index(one.level))
+    verdict = findings[0].level if findings else "good"
+    return Quality(verdict, tuple(findings), tuple(unchecked))
+
+
+_Found = Iterator[Finding | str]
+
+
+def _level(value: float, limits: Limits) -> Level:
+    doubtful, bad = limits
+    if bad is not None and value > bad:
+        return "bad"
+    return "doubtful" if value > doubtful else "good"
+
+
+def _finding(what: str, value: float, limits: Limits, words: str, remedy: str) -> Finding:
+    level = _level(value, limits)
+    return Finding(what, float(value), limits[0], level, words if level == "good" else f"{words}: {remedy}")
+
+
+def _connection(evidence: Evidence) -> Iterator[Finding]:
+    sizes = list(evidence.components)
+    if not sizes:
+        return
+    beside = 1.0 - max(sizes) / max(evidence.images, 1)
+    if len(sizes) == 1:
+        yield Finding("connection", 0.0, 0.0, "good", "all images are connected")
+        return
+    shown = ", ".join(map(str, sizes[:5])) + (", ..." if len(sizes) > 5 else "")
+    words = f"{len(sizes)} groups of images ({shown}) that no verified pair connects"
+    remedy = "more overlap between them helps; --set pairs=exhaustive finds pairs that positions hide"
+    yield _finding("connection", beside, _LEFT_OUT, words, remedy)
+
+
+def _left_out(evidence: Evidence) -> _Found:
+    outside = list(evidence.adjust.get("outside", ()))
+    missing = max(len(outside), evidence.images - evidence.adjust["images"])
+    words = f"{evidence.images - missing} of {evidence.images} images are oriented"
+    if outside:
+        one = evidence.names.get(outside[0], outside[0])
+        remedy = (
+            f"not oriented: {evidence.named(outside)}; the lines of adjust say why; `aeromatch show WORK {one}` shows "
+            "what it has; images of other places may be left out"
+        )
+    else:
+        remedy = "the others have too few points in common with them; more overlap helps"
+    yield _finding("oriented images", missing / max(evidence.images, 1), _LEFT_OUT, words, remedy)
+
+
+def _frames(evidence: Evidence) -> _Found:
+    """Parts of frames of their own, and whether anything ties the block to the ground."""
+    kinds = [group["kind"] for group in evidence.groups]
+    parts = kinds.count("level") + any(kind != "level" for kind in kinds)  # those that positions place lie in one frame
+    if parts > 1 and len(evidence.components) <= 1:
+        words = (
+            f"{parts} parts whose scale and place nothing ties to each other: positions (--poses) place each of them"
+        )
+        yield Finding("parts", float(parts), 1.0, "bad", words)
+    given = int(evidence.adjust.get("positions_given", 0))
+    used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
+    kept = any(kind == "given" for kind in kinds)
+    surveyed = sum(len((group.get("control") or {}).get("used", ())) for group in evidence.groups)
+    fitted = (evidence.adjust.get("control") or {}).get("control") or 0
+    if used >= _HOLDING or surveyed >= _HOLDING or kept:
+        return
+    if given >= _HOLDING:
+        words = (
+            f"none of the {given} given positions is used, the pictures contradict them: check the coordinate "
+            "system, the order of x and y, and which position belongs to which image"
+        )
+        yield Finding("positions", 1.0, _WRONG_POSITIONS[0], "bad", words)
+    elif fitted >= _HOLDING:
+        yield "positions: none are given; the control points show how the block is to be moved"
+    else:
+        words = (
+            "shape only: nothing ties the block to the ground, place, north and scale are arbitrary: positions "
+            "(--poses) or three control points (--gcp) do"
+        )
+        yield Finding("ground", None, None, "doubtful", words)
+
+
+def _positions(evidence: Evidence) -> _Found:
+    found = [group["positions"] for group in evidence.groups if group.get("positions")]
+    if not found:
+        if not evidence.adjust.get("positions_given"):
+            yield "positions: none are given"
+        return
+    images = sum(one["images"] for one in found)
+    wrong = [i for one in found for i in one["wrong"]]
+    remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
+    words = f"{len(wrong)} of {images} given positions contradict the pictures and are not used"
+    yield _finding("wrong positions", len(wrong) / images, _WRONG_POSITIONS, words, remedy)
+    found = [one for one in found if one["rms_sigmas"]]
+    if not found:
+        return
+    shares = np.array([one["used"] for one in found]) / sum(one["used"] for one in found)
+    remedy = (
+        "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
+        "their real accuracy, or correct their cause"
+    )
+    for name, axes in (("horizontally", [0, 1]), ("vertically", [2])):
+        sigmas, off_m, stated_m = (
+            float(np.sqrt(shares @ [_rms(np.array(one[key])[axes]) ** 2 for one in found]))
+            for key in ("rms_sigmas", "rms_m", "stated_m")
+        )
+        words = f"positions are met {name} to {off_m:.3g} m, {sigmas:.1f} times the {stated_m:.3g} m stated"
+        yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, remedy)
+
+
+def _flights(evidence: Evidence) -> _Found:
+    """Steps, shifts and delays of whole flights, each with its size."""
+    for group in evidence.groups:
+        stated_m = (group.get("positions") or {}).get("stated_m") or [np.inf] * 3
+        for flight in group.get("flights", ()):
+            name, images = flight["flight"], flight["images"]
+            step_m = flight.get("step_m", 0.0)
+            if step_m:
+                words = (
+                    f"heights of flight {name} ({images} images) lie {abs(step_m):.1f} m "
+                    f"{'above' if step_m > 0.0 else 'below'} those of the others, which was taken out"
+                )
+                remedy = "check the zero of its heights; control points tell which flight is right"
+                yield _finding("step of heights", abs(step_m) / stated_m[2], _FLIGHT_SIGMAS, words, remedy)
+            shift_m = np.array([flight.get(f"shift_{axis}", [0.0])[0] for axis in "xyz"])
+            if shift_m.any():
+                shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
+                words = f"positions of flight {name} ({images} images) are off by {shown} m, which was taken out"
+                remedy = "check its base station, geoid and coordinate system; control points tell what is right"
+                sigmas = float(np.abs(shift_m / np.array(stated_m)).max())
+                yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
+            if "lag_s" in flight:
+                lag_s = flight["lag_s"][0]
+                words = f"positions of flight {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
+                remedy = "check the times by which positions were given to images"
+                yield _finding("delay of positions", abs(lag_s), _LAG_S, words, remedy)
+
+
+def _mounts(evidence: Evidence) -> _Found:
+    for group in evidence.groups:
+        for camera_id, mount in (group.get("mounts") or {}).items():
+            lever_m = np.array([mount.get(f"lever_{axis}", [0.0])[0] for axis in "xyz"])
+            if lever_m.any():
+                length_m = float(np.linalg.norm(lever_m))
+                words = f"the antenna lies {length_m:.2f} m from camera {camera_id}, as its positions show"
+                remedy = "no drone is as large: check which point the positions are of, and their heights"
+                yield _finding("antenna", length_m, _LEVER_M, words, remedy)
+
+
+def _angles(evidence: Evidence) -> _Found:
+    residuals = evidence.adjust.get("residuals") or {}
+    medians = residuals.get("rotation_sigmas_median")
+    if not medians:
+        yield "angles: none are given"
+        return
+    sigmas = _rms(np.array(medians[:2])) / 0.6745  # of a normal distribution's absolute values
+    degrees = _rms(np.array(residuals["rotation_deg_median"][:2])) / 0.6745
+    words = f"measured tilts differ by {degrees:.2f} degrees, {sigmas:.1f} times what was stated"
+    remedy = "check the convention of the angles (--set block.angles), and the heights of the positions"
+    yield _finding("angles", sigmas, _TILT_SIGMAS, words, remedy)
+
+
+def _control(evidence: Evidence) -> _Found:
+    """Control points that contradict the others, and errors at points that took no part."""
+    control = evidence.adjust.get("control")
+    if not control or not control.get("points"):
+        yield "control points: none are given"
+        return
+    inside = [group["control"] for group in evidence.groups if group.get("control")]
+    unlike = sorted({*(n for one in inside for n in (*one["wrong"], *one["exchanged"])), *control.get("doubtful", ())})
+    count = max(control["control"] + control["check"], 1)
+    words = f"{len(unlike)} of {count} surveyed points contradict the others"
+    remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
+    yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
+    refused = [one for one in inside if not one.get("kept", True)]
+    if refused:
+        words = (
+            "the control points do not make points better that took no part, and were left out: check their coordinate "
+            "system, their heights and where they were measured"
+        )
+        yield Finding("control points", None, None, "doubtful", words)
+    errors_m = next((one["held_out_rms_m"] for one in inside if one.get("kept") and one.get("held_out_rms_m")), None)
+    errors_m = errors_m or control.get("check_rmse_m")
+    if not errors_m:
+        yield "control points: too few to check the block by them"
+        return
+    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
+    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
+    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    sigmas = float((np.array(errors_m) / stated_m).max())
+    shown = ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
+    words = f"points that took no part are met to {shown} m, {sigmas:.1f} times what can be expected"
+    remedy = "check their coordinates and measurements; more control points at the border of the block help"
+    yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
+
+
+def _errors(evidence: Evidence) -> _Found:
+    error_px = evidence.adjust.get("reprojection_error_px")
+    if error_px is None:
+        return
+    limits = _MEASURED_PX if evidence.refined else _DETECTED_PX
+    found_px = error_px / evidence.reduced
+    words = f"mean reprojection error {error_px:.2f} px, up to {limits[0] * evidence.reduced:.1f} px is usual"
+    remedy = (
+        "poses or cameras do not fit the matches: let the pictures find them (orient=global), and check --cameras and "
+        "--poses"
+    )
+    yield _finding("reprojection error", found_px, limits, words, remedy)
+
+
+def _multiplicity(evidence: Evidence) -> _Found:
+    if evidence.adjust["images"] < 3:
+        return
+    length = float(evidence.adjust.get("track_length") or 0.0)
+    level: Level = "good" if length >= _FEWEST_IMAGES_PER_POINT else "doubtful"
+    words = f"a point is seen by {length:.1f} images"
+    remedy = "" if level == "good" else ": where two see it nothing checks them; more overlap, or more keypoints, helps"
+    yield Finding("images per point", length, _FEWEST_IMAGES_PER_POINT, level, words + remedy)
+    held = evidence.adjust.get("held_by_pairs")
+    if held is not None:
+        share = held / evidence.adjust["images"]
+        words = f"{held} of {evidence.adjust['images']} images have hardly a point that three images see"
+        yield _finding("held by pairs", share, _HELD_BY_PAIRS, words, "more overlap, or more keypoints, helps")
+
+
+def _calibration(evidence: Evidence) -> _Found:
+    """The parameter of every camera that differs most from what is known of it."""
+    told = set[str]()
+    for group in evidence.groups:
+        for camera_id, camera in (group.get("calibration") or {}).items():
+            if camera_id in told:  # a camera is one and the same for all groups
+                continue
+            changes = {
+                name: abs(value - prior) / prior_sigma
+                for name, (value, _, prior, prior_sigma) in camera["parameters"].items()
+                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name != "readout_s"
+            }
+            read_out = camera["parameters"].get("readout_s")
+            if read_out and read_out[1] > 0.0:
+                words = f"camera {camera_id} reads a picture in {read_out[0]:+.3f} s (rolling shutter)"
+                remedy = "no shutter needs as long, or backwards: check the times of the images"
+                readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
+                yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
+            if not changes:
+                continue
+            told.add(camera_id)
+            name = max(changes, key=lambda key: changes[key])
+            value, _, prior, prior_sigma = camera["parameters"][name]
+            words = (
+                f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- "
+                f"{_number(prior_sigma)} is known, {changes[name]:.1f} standard deviations"
+            )
+            remedy = (
+                "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
+                "as well, and heights with it"
+            )
+            yield _finding("calibration", changes[name], _LENS_SIGMAS, words, remedy)
+    if not told:
+        yield "calibration: it was not adjusted"
+
+
+def _deformation(evidence: Evidence) -> _Found:
+    pixel_m = evidence.adjust.get("ground_pixel_m")
+    heights = next((group["heights"] for group in evidence.groups if group.get("heights")), None)
+    if not heights or not pixel_m:
+        yield "expected deformation: the block was not adjusted, or has too few points"
+        return
+    bowl = heights["bowl_m"] / pixel_m
+    metres = f" ({heights['bowl_m']:.2g} m)" if evidence.metric else ""
+    words = f"the middle of the block may lie {bowl:.1f} ground pixels{metres} above or below its border"
+    remedy = f"straight views from one height do not determine it; {_STRIPS}"
+    yield _finding("bowl", bowl, _BOWL_PIXELS, words, remedy)
+    angle = float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"])))
+    if any(group["kind"] != "level" for group in evidence.groups):
+        words = f"the block may be tilted by {angle:.2f} degrees"
+        remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
+        yield _finding("tilt", angle, _TILT_DEG, words, remedy)
+
+
+def _kept_poses(evidence: Evidence) -> _Found:
+    """Of poses that were kept as they were given, whether they explain the matches."""
+    orient = evidence.orient
+    if not orient.get("stays") or not orient.get("images_matched"):
+        return
+    matched, explained = orient["images_matched"], orient["given_poses_explained"]
+    words = f"given poses explain the matches of {explained} of {matched} images"
+    remedy = "they are kept because of orient=given; orient=global finds better ones"
+    yield _finding("kept poses", 1.0 - explained / matched, _UNEXPLAINED, words, remedy)
+
+
+def _rms(values: Any) -> float:
+    return float(np.sqrt((np.asarray(values, np.float64) ** 2).mean()))
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(f"{value:.4g}")

@@ -1,0 +1,166 @@
+"""The verdict on a block: every criterion by its figure."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import pytest
+
+from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged
+
+CALIBRATED = {"images": 12, "correlations": [], "parameters": {
+    "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
+}}  # fmt: skip
+GROUP: dict[str, Any] = {
+    "kind": "positions", "images": 12, "sigma_px": 0.3, "mounts": {}, "flights": [], "control": {},
+    "positions": {
+        "images": 12, "used": 12, "wrong": [], "rms_m": [0.02, 0.02, 0.03], "rms_sigmas": [1.0, 1.0, 1.0],
+        "stated_m": [0.02, 0.02, 0.03], "factors": [1.0, 1.0],
+    },
+    "calibration": {"camera_1": CALIBRATED},
+    "heights": {"sigma_m": 0.05, "bowl_m": 0.06, "tilt_m": 0.03, "reach_m": 100.0, "points": []},
+}  # fmt: skip
+ADJUSTED: dict[str, Any] = {
+    "images": 12, "points": 3000, "track_length": 3.4, "held_by_pairs": 0, "reprojection_error_px": 0.3,
+    "ground_pixel_m": 0.03, "positions_given": 12, "outside": {}, "control": None, "groups": [GROUP],
+    "residuals": {"rotation_sigmas_median": [0.7, 0.7, 0.7], "rotation_deg_median": [0.7, 0.7, 0.7]},
+}  # fmt: skip
+
+
+def judged_with(group: dict[str, Any] | None = None, **evidence: Any) -> Quality:
+    """The sound block with changed facts. group: of its only group, evidence: `adjust` and fields of `Evidence`."""
+    adjusted = deepcopy(ADJUSTED) | evidence.pop("adjust", {})
+    if group is not None:
+        adjusted["groups"] = [deepcopy(GROUP) | group]
+    return judged(Evidence(**{"images": 12, "adjust": adjusted, "components": [12], "refined": True, **evidence}))
+
+
+def found(quality: Quality, what: str) -> Finding:
+    (finding,) = [one for one in quality.findings if one.what == what]
+    return finding
+
+
+def positions(**changes: Any) -> dict[str, Any]:
+    return {"positions": GROUP["positions"] | changes}
+
+
+def flight(**found: Any) -> dict[str, Any]:
+    return {"flights": [{"flight": "B", "images": 6, "step_m": 0.0, **found}]}
+
+
+def lens(**parameters: list[float]) -> dict[str, Any]:
+    return {"calibration": {"camera_1": {**CALIBRATED, "parameters": CALIBRATED["parameters"] | parameters}}}
+
+
+def heights(**changes: float) -> dict[str, Any]:
+    return {"heights": GROUP["heights"] | changes}
+
+
+TURNED = {"rotation_sigmas_median": [5.0, 5.0, 0.1], "rotation_deg_median": [5.0, 5.0, 0.1]}
+CONTROL = {
+    "points": 5, "control": 3, "check": 2, "doubtful": [], "check_rmse_m": [0.02, 0.02, 0.03],
+    "control_rmse_m": [0.01, 0.01, 0.01], "sigmas_m": [0.02, 0.02, 0.03],
+}  # fmt: skip
+
+
+def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
+    quality = judged_with()
+    assert quality.verdict == "good"
+    assert not quality.faults
+    assert quality.unchecked == ("control points: none are given",)
+    values = {one.what: one.value for one in quality.findings}
+    assert values["positions horizontally"] == pytest.approx(1.0)
+    assert values["reprojection error"] == pytest.approx(0.3)
+    assert values["bowl"] == pytest.approx(2.0)  # 0.06 m of 0.03 m
+    assert values["tilt"] == pytest.approx(0.0172, abs=1e-4)  # 0.03 m over 100 m
+    assert values["angles"] == pytest.approx(0.7 / 0.6745)
+    assert values["calibration"] == pytest.approx(1.0 / 3.0)  # 10 px of 30 px: the largest change
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "value", "level"),
+    [
+        # Positions stated as 2 cm and missed by 0.5 m.
+        ({"group": positions(rms_sigmas=[25.0, 25.0, 1.0])}, "positions horizontally", 25.0, "bad"),
+        ({"group": positions(rms_sigmas=[1.0, 1.0, 3.0])}, "positions vertically", 3.0, "doubtful"),
+        ({"group": positions(rms_sigmas=[0.1, 0.1, 0.1])}, "positions vertically", 0.1, "good"),
+        ({"group": positions(used=11, wrong=["a"])}, "wrong positions", 1 / 12, "doubtful"),
+        ({"group": positions(used=7, wrong=list("abcde"))}, "wrong positions", 5 / 12, "bad"),
+        # The factory's focal length is 1964 px to 1 %, the adjusted one 2480 px.
+        ({"group": lens(f=[2480.0, 1.0, 1964.0, 19.64])}, "calibration", 26.27, "bad"),
+        ({"group": lens(k1=[0.2, 0.001, 0.0, 0.05])}, "calibration", 4.0, "doubtful"),
+        ({"group": lens(readout_s=[0.03, 0.001, 0.0, 0.03])}, "rolling shutter", 0.03, "good"),
+        ({"group": lens(readout_s=[0.5, 0.001, 0.0, 0.03])}, "rolling shutter", 0.5, "doubtful"),
+        ({"group": heights(bowl_m=0.3)}, "bowl", 10.0, "doubtful"),
+        ({"group": heights(tilt_m=5.0)}, "tilt", 2.862, "doubtful"),
+        ({"group": flight(step_m=14.9)}, "step of heights", 14.9 / 0.03, "doubtful"),
+        ({"group": flight(shift_x=[1.0, 0.01])}, "shift of a flight", 50.0, "doubtful"),
+        ({"group": flight(lag_s=[0.5, 0.01])}, "delay of positions", 0.5, "doubtful"),
+        ({"group": {"mounts": {"camera_1": {"lever_z": [0.2, 0.01]}}}}, "antenna", 0.2, "good"),
+        ({"adjust": {"reprojection_error_px": 2.32}}, "reprojection error", 2.32, "bad"),
+        ({"adjust": {"reprojection_error_px": 0.8}}, "reprojection error", 0.8, "doubtful"),
+        ({"adjust": {"reprojection_error_px": 0.8}, "refined": False}, "reprojection error", 0.8, "good"),
+        ({"adjust": {"reprojection_error_px": 2.0}, "reduced": 4.0}, "reprojection error", 0.5, "good"),
+        ({"adjust": {"track_length": 2.0}}, "images per point", 2.0, "doubtful"),
+        ({"adjust": {"held_by_pairs": 12}}, "held by pairs", 1.0, "bad"),
+        ({"adjust": {"outside": {"a": ""}, "images": 11}}, "oriented images", 1 / 12, "doubtful"),
+        ({"adjust": {"outside": dict.fromkeys("abcd", ""), "images": 8}}, "oriented images", 1 / 3, "bad"),
+        ({"components": [8, 4]}, "connection", 1 / 3, "bad"),
+        ({"components": [11, 1]}, "connection", 1 / 12, "doubtful"),
+        ({"adjust": {"residuals": TURNED}}, "angles", 5.0 / 0.6745, "bad"),
+        ({"orient": {"stays": True, "images_matched": 12, "given_poses_explained": 3}}, "kept poses", 0.75, "bad"),
+        ({"adjust": {"control": CONTROL}}, "check points", 0.8, "good"),
+        ({"adjust": {"control": CONTROL | {"check_rmse_m": [0.02, 0.02, 0.5]}}}, "check points", 11.785, "bad"),
+        ({"adjust": {"control": CONTROL | {"doubtful": ["P1"]}}}, "wrong control points", 0.2, "doubtful"),
+    ],
+)  # fmt: skip
+def test_one_fault_decides_with_its_number(changes: dict[str, Any], what: str, value: float, level: str) -> None:
+    quality = judged_with(**changes)
+    finding = found(quality, what)
+    assert finding.value == pytest.approx(value, rel=1e-3)
+    assert finding.level == quality.verdict == level
+    if level != "good":
+        assert quality.findings[0].what == what
+        assert ": " in finding.sentence, "the remedy follows"
+
+
+def test_the_step_between_two_flights_is_said_with_its_size() -> None:
+    assert (
+        judged_with(group=flight(step_m=14.93))
+        .faults[0]
+        .sentence.startswith(
+            "heights of flight B (6 images) lie 14.9 m above those of the others, which was taken out: check"
+        )
+    )
+
+
+def test_a_block_that_nothing_ties_to_the_ground_has_a_shape_only() -> None:
+    quality = judged_with(group={"kind": "level", "positions": None}, adjust={"positions_given": 0, "residuals": {}})
+    assert quality.verdict == "doubtful"
+    assert quality.faults[0].sentence.startswith("shape only")
+    assert "angles: none are given" in quality.unchecked
+
+
+def test_positions_of_which_none_is_used_are_bad() -> None:
+    quality = judged_with(group={"kind": "level", "positions": None})
+    assert (quality.verdict, quality.faults[0].what) == ("bad", "positions")
+    assert "none of the 12 given positions" in quality.faults[0].sentence
+
+
+def test_lengths_of_a_frame_without_metres_are_no_metres() -> None:
+    group = {"kind": "level", "positions": None, **heights(bowl_m=0.3)}
+    for metric, metres in ((True, True), (False, False)):
+        bowl = found(judged_with(group=group, metric=metric, adjust={"positions_given": 0}), "bowl")
+        assert ("0.3 m" in bowl.sentence) is metres
+
+
+def test_what_json_gets_is_plain() -> None:
+    facts = judged_with(group=heights(bowl_m=0.3)).as_facts()
+    assert facts["verdict"] == "doubtful"
+    assert facts["findings"][0] == {
+        "what": "bowl", "value": 10.0, "limit": 5.0, "level": "doubtful",
+        "sentence": "the middle of the block may lie 10.0 ground pixels (0.3 m) above or below its border: straight "
+        "views from one height do not determine it; two strips across, images from another height, or three control "
+        "points determine it",
+    }  # fmt: skip
