@@ -168,8 +168,6 @@ def _of_control(network: Network, state: Unknowns, extent_m: float) -> FloatArra
     moved[:, :, 6] = away_m
     observed = (moved / network.control_sigmas_m[:, :, None]).reshape(-1, 7)
     return np.asarray(observed.T @ observed)
-    rows = (moved / network.control_sigmas_m[:, :, None]).reshape(-1, 7)
-    return np.asarray(rows.T @ rows)
 
 
 def _inverse(normal: FloatArray, free: FloatArray, in_world: bool) -> FloatArray:
