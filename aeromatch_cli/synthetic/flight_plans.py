@@ -193,14 +193,15 @@ def _plan_oblique(order: Order) -> _Planned:
 
 
 def _plan_dense_rig(order: Order) -> _Planned:
-    return _plan_rig(order, FORWARD_OVERLAP, SIDE_OVERLAP)
+    """Two strips at least: positions along one line leave the turn about it open."""
+    return _plan_rig(order, FORWARD_OVERLAP, SIDE_OVERLAP, fewest_strips=2)
 
 
-def _plan_rig(order: Order, forward_overlap: float, side_overlap: float) -> _Planned:
+def _plan_rig(order: Order, forward_overlap: float, side_overlap: float, fewest_strips: int = 1) -> _Planned:
     """Few strips and long ones: forward and back pictures meet two flying heights apart on the same strip."""
     cameras = order.rig()
     count = -(-order.images // len(cameras))
-    strips = max(1, round(float(np.sqrt(count / 3.0))))
+    strips = max(fewest_strips, round(float(np.sqrt(count / 3.0))))
     stations = []
     for spot in _strips(count, strips, *order.steps_m(forward_overlap, side_overlap)):
         wobble = order.rng.standard_normal(6)
