@@ -25,7 +25,7 @@ _AFFINITY_MOST = 3e-4
 def real_lens(rng: np.random.Generator, width_px: int, height_px: int, focal_share: float = 0.9) -> Camera:
     """A lens of about focal_share picture widths, drawn at random; one-to-one over the picture and beyond.
 
-    Source of the ranges: self-calibrations of consumer drones, docs/results/calibration.md.
+    The ranges are set by hand to cover lenses of drones; they are no statistics of real ones.
     """
     focal = focal_share * width_px * (1.0 + rng.uniform(-_FOCAL_SPREAD, _FOCAL_SPREAD))
     off_px = width_px * np.clip(_CENTRE_SIGMA * rng.standard_normal(2), -_CENTRE_MOST, _CENTRE_MOST)
