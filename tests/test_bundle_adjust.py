@@ -106,6 +106,7 @@ def test_a_wrong_position_is_left_out_and_named(seed: int, axis: int, sigma_m: f
     assert (found.position_factors < 1.5).all()
 
 
+@pytest.mark.slow
 def test_a_true_lens_is_found_in_a_block_with_cross_strips() -> None:
     """The principal point 40 px off, all terms of distortion: of 8 blocks, errors within 3 standard deviations."""
     true = lens(f=1012.0, cx=639.5, cy=439.5, k1=-0.08, k2=0.06, k3=-0.02, p1=0.0015, p2=-0.001)
@@ -140,6 +141,7 @@ def points_off_m(seed: int, true_lens: FloatArray, **sigmas: float) -> float:
     return float(np.median(np.linalg.norm(found.state.points_m - truth.points_m, axis=1)))
 
 
+@pytest.mark.slow
 def test_a_weak_block_calibrates_no_worse_than_its_prior_and_better_where_that_is_wrong() -> None:
     """Lenses by chance, as far off as nobody knows; and a lens that is exactly as was thought, where all that a block
     tells of it is noise."""
