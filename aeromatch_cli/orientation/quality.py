@@ -51,7 +51,7 @@ _LENS_SIGMAS: Limits = (3.0, 6.0)
 # Expected deformations: how far the middle of the block may lie above its border, ground pixels; and by which angle it
 # may be tilted, degrees, which is what one strip has about its line.
 _BOWL_PIXELS: Limits = (5.0, None)
-_TILT_DEG: Limits = (1.0, None)
+_TILT_DEG: Limits = (2.0, None)
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
 # Share of the images whose matches kept poses (orient=given) do not explain.
