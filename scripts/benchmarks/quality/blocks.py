@@ -48,7 +48,7 @@ class Plan:
 
     scene: str = "hills"
     flight: str = "cross"
-    images: int = 24
+    images: int = 16
     positions: Positions = "rtk2cm"
     seed: int = 1
     attitudes: bool = True

@@ -7,8 +7,8 @@ so that the faults reach the adjustment; what a first pass itself finds wrong is
 
 Verdict: `good`, `doubtful` or `bad`. Findings: the criteria that spoke, the gravest first, with their numbers. Height:
 median absolute error of about 60 check points, in ground pixels; absolute, where positions are RTK, else after the best
-similarity. Writes OUT/rows/NAME.json for every block, OUT/results.json and OUT/quality.md; rows that OUT has are not
-made again.
+similarity. Writes OUT/rows/NAME.json with the facts of every block, OUT/results.json and OUT/quality.md; facts that OUT
+has are not made again, and judged by the criteria as they are now.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.mapping import refine_block
-from aeromatch_cli.orientation.quality import Evidence, Quality, judged
+from aeromatch_cli.orientation.quality import Evidence, judged
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import adjust
 from benchmarks import options
@@ -39,8 +39,8 @@ from benchmarks.tables import Column, Row, number, table, write_rows
 _MOST_FINDINGS = 3
 
 
-def verdict_of(task: Task) -> tuple[Quality, Row]:
-    """The verdict on what the adjustment makes of a task, and errors of that by truth."""
+def evidence_of(task: Task) -> tuple[Evidence, Row]:
+    """What the adjustment makes of a task, and errors of that by truth."""
     images = task.contents.block.images
     tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in task.contents.pairs])
     alone = len(images) - sum(map(len, tied))
@@ -61,25 +61,29 @@ def verdict_of(task: Task) -> tuple[Quality, Row]:
             "residuals": residual_figures(residuals, {}),
             "remarks": [] if adjusted.poses else ["no image could be oriented"],
         }
-        cameras_found = {k: adjusted.cameras[k] for k in adjusted.cameras}
-        whole = {k: cameras_found.get(k, next(iter(cameras_found.values()))) for k in task.block.cameras}
+        one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
+        whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
         errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
     evidence = Evidence(
         images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True,
         metric=task.block.positions != "nothing",
     )  # fmt: skip
-    return judged(evidence), errors
+    return evidence, errors
 
 
 def _run(name: str, expected: str, path: Path, tie_points: int) -> None:
     plan, spoil = (FAULTS if expected == "spoilt" else GOOD)[name]
-    quality, errors = verdict_of(spoil(plan.task(tie_points)))
+    evidence, errors = evidence_of(spoil(plan.task(tie_points)))
     height = errors.get("absolute_height_px", errors.get("height_px"))
-    row: Row = {"block": name, "expected": expected, "verdict": quality.verdict, "height_px": height}
-    row["findings"] = [[one.what, one.value, one.level] for one in quality.faults]
-    row["sentences"] = [one.sentence for one in quality.faults]
-    row["unchecked"] = list(quality.unchecked)
-    write_json(path, row)
+    write_json(path, {"block": name, "expected": expected, "height_px": height, "evidence": asdict(evidence)})
+
+
+def _judged(row: Row) -> Row:
+    """A row of what was found with the present verdict on it."""
+    quality = judged(Evidence(**row["evidence"]))
+    faults = [[one.what, one.value, one.level, one.sentence] for one in quality.faults]
+    shown = {key: row[key] for key in ("block", "expected", "height_px")}
+    return {**shown, "verdict": quality.verdict, "findings": faults, "unchecked": list(quality.unchecked)}
 
 
 def _run_all(cases: Sequence[tuple[str, str, Path]], tie_points: int) -> int:
@@ -104,11 +108,11 @@ def rows_of(out: Path, names: Sequence[tuple[str, str]], tie_points: int, jobs: 
         for _ in pool.map(_run_all, batches.values(), [tie_points] * len(batches)):
             pass
     for path in paths.values():
-        yield {key: value for key, value in read_json(path).items() if key != "sha256"}
+        yield _judged(read_json(path))
 
 
 def _findings(row: Row) -> str:
-    shown = [what if value is None else f"{what} {number(value, 2)}" for what, value, _ in row["findings"]]
+    shown = [what if value is None else f"{what} {number(value, 2)}" for what, value, *_ in row["findings"]]
     return "; ".join(shown[:_MOST_FINDINGS]) + ("; ..." if len(shown) > _MOST_FINDINGS else "")
 
 
@@ -136,7 +140,7 @@ def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("quality", __doc__)
     add = parser.add_argument
     add("--only", default="", metavar="WORDS", help="blocks whose names hold these words")
-    add("--points", type=options.positive, default=800, help="about so many tie points in an image")
+    add("--points", type=options.positive, default=600, help="about so many tie points in an image")
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
     args = options.parse(parser, arguments, {"only": "factory", "points": 500})
