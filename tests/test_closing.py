@@ -11,7 +11,7 @@ from aeromatch_cli.stages.quality import quality_of
 
 NAMES = {i: f"{i}.jpg" for i in "abcd"}
 # Of a group whose four positions are met as stated.
-PLACED = {"kind": "positions", "positions": {
+PLACED = {"kind": "positions", "images": 4, "positions": {
     "images": 4, "used": 4, "wrong": [], "rms_m": [0.02, 0.02, 0.03], "rms_sigmas": [1.0, 1.0, 1.0],
     "stated_m": [0.02, 0.02, 0.03], "factors": [1.0, 1.0],
 }}  # fmt: skip

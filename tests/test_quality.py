@@ -45,6 +45,16 @@ def positions(**changes: Any) -> dict[str, Any]:
     return {"positions": GROUP["positions"] | changes}
 
 
+def apart(height_m: float, scatter_m: float) -> dict[str, Any]:
+    """Two flights with GPS of 5 m, the heights of one above those of the other."""
+    scatter = {"scatter_m": [scatter_m] * 3}
+    flights = [
+        {"flight": "A", "images": 7, "mean_m": [0.0, 0.0, -0.3 * height_m], **scatter},
+        {"flight": "B", "images": 5, "mean_m": [0.0, 0.0, 0.7 * height_m], **scatter},
+    ]
+    return positions(stated_m=[5.0, 5.0, 5.0], flights=flights)
+
+
 def flight(**found: Any) -> dict[str, Any]:
     return {"flights": [{"flight": "B", "images": 6, "step_m": 0.0, **found}]}
 
@@ -96,6 +106,8 @@ def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
         ({"group": heights(tilt_m=5.0)}, "tilt", 2.862, "doubtful"),
         ({"group": flight(step_m=14.9)}, "step of heights", 14.9 / 0.03, "doubtful"),
         ({"group": flight(shift_x=[1.0, 0.01])}, "shift of a flight", 50.0, "doubtful"),
+        ({"group": apart(14.9, 0.5)}, "flights apart", 2.98, "doubtful"),
+        ({"group": apart(4.9, 0.5)}, "flights apart", 0.98, "good"),
         ({"group": flight(lag_s=[0.5, 0.01])}, "delay of positions", 0.5, "doubtful"),
         ({"group": {"mounts": {"camera_1": {"lever_z": [0.2, 0.01]}}}}, "antenna", 0.2, "good"),
         ({"adjust": {"reprojection_error_px": 2.32}}, "reprojection error", 2.32, "bad"),
@@ -133,6 +145,18 @@ def test_the_step_between_two_flights_is_said_with_its_size() -> None:
             "heights of flight B (6 images) lie 14.9 m above those of the others, which was taken out: check"
         )
     )
+
+
+def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
+    for stated_m, level in ((0.02, "good"), (5.0, "doubtful")):
+        parts = [deepcopy(GROUP) | positions(stated_m=[stated_m] * 3, used=n, images=n) | {"images": n} for n in (8, 4)]
+        quality = judged_with(adjust={"groups": parts})
+        assert found(quality, "parts").value == pytest.approx(stated_m / 2.0 / 0.03)  # the smaller one has four images
+        assert quality.verdict == level
+
+
+def test_flights_that_scatter_as_much_as_they_lie_apart_are_not_apart() -> None:
+    assert not [one for one in judged_with(group=apart(14.9, 8.0)).findings if one.what == "flights apart"]
 
 
 def test_a_block_that_nothing_ties_to_the_ground_has_a_shape_only() -> None:

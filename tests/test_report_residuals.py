@@ -14,7 +14,8 @@ from test_export_colmap import Truth
 from test_exporters import contents, truth  # noqa: F401 - fixtures
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray, PoseResidual
-from aeromatch_cli.report.residuals import _round_length, residual_section
+from aeromatch_cli.report.figures import round_length
+from aeromatch_cli.report.residuals import residual_section
 from aeromatch_cli.strategies.exporters import EXPORTERS
 
 STRAIGHT_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -79,7 +80,7 @@ def test_without_given_positions_there_is_nothing_to_show() -> None:
 
 
 def test_lengths_of_the_key_are_round() -> None:
-    assert [_round_length(length) for length in (0.034, 1.0, 7.3, 260.0)] == pytest.approx([0.02, 1.0, 5.0, 200.0])
+    assert [round_length(length) for length in (0.034, 1.0, 7.3, 260.0)] == pytest.approx([0.02, 1.0, 5.0, 200.0])
 
 
 def test_cameras_of_a_geopackage_have_their_residuals(contents, truth: Truth, tmp_path: Path) -> None:  # noqa: F811

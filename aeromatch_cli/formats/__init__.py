@@ -132,10 +132,12 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
   - `positions`, null without any: `images` that have one, `used`, `wrong` (image_ids of those that are not used),
     `rms_m` and `rms_sigmas` (root mean squares of measured less adjusted ones along x, y, z, in metres and in stated
     standard deviations, after what was found of flights and antennas), `stated_m` (median standard deviations),
-    `factors` (by which they are less exact than stated, horizontally and vertically, as the adjustment weighs them).
-  - `flights`: those of which something was found: `flight` (its name), `images`, `step_m` (of its heights above those
-    of the flight of most images, taken out before), and of `shift_x`, `shift_y`, `shift_z` (metres) and `lag_s`
-    (seconds by which positions lag behind exposures) those that were unknowns: value, standard deviation.
+    `factors` (by which they are less exact than stated, horizontally and vertically, as the adjustment weighs them),
+    `flights` (`flight`, `images`, `mean_m` and `scatter_m`: mean and standard deviation of the differences of each).
+  - `flights`: those of which something was found: `flight` (its name, empty of images of none), `images`, `step_m` (of
+    its heights above those of the flight of most images, taken out before), and of `shift_x`, `shift_y`, `shift_z`
+    (metres) and `lag_s` (seconds by which positions lag behind exposures) those that were unknowns: value, standard
+    deviation.
   - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
     projection centre to the antenna, in the camera's frame): value, standard deviation.
   - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.orientation.adjusting import Given, Outcome
 from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
 from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
@@ -44,14 +44,16 @@ def with_names(
 ) -> dict[str, Any]:
     """The facts of a group with ids and names for numbers: images and cameras from 1, flights from 0, -1 for none."""
     named = dict(facts)
+
+    def of_flights(listed: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{**one, "flight": flights[one["flight"]] if one["flight"] >= 0 else ""} for one in listed]
+
     if named.get("positions"):
         wrong = [images[number - 1] for number in named["positions"]["wrong"]]
-        named["positions"] = {**named["positions"], "wrong": wrong}
+        means = of_flights(named["positions"]["flights"])
+        named["positions"] = {**named["positions"], "wrong": wrong, "flights": means}
     if "flights" in named:
-        of_none = "images of no flight"
-        named["flights"] = [
-            {**one, "flight": flights[one["flight"]] if one["flight"] >= 0 else of_none} for one in named["flights"]
-        ]
+        named["flights"] = of_flights(named["flights"])
     for key in ("mounts", "calibration"):
         if key in named:
             named[key] = {cameras[int(number) - 1]: one for number, one in named[key].items()}
@@ -81,7 +83,20 @@ def _positions(outcome: Outcome, given: Given) -> dict[str, Any] | None:
         "rms_sigmas": _rms(sigmas[used]),
         "stated_m": np.median(stated.position_sigmas_m[known], axis=0).tolist(),
         "factors": result.position_factors.tolist(),
+        "flights": _means(outcome, off_m, used),
     }
+
+
+def _means(outcome: Outcome, off_m: FloatArray, used: BoolArray) -> list[dict[str, Any]]:
+    """Of every flight with used positions, by how much these lie off on average, and how they scatter."""
+    flight = outcome.result.network.flight
+    listed = []
+    for row, number in enumerate(outcome.flights):
+        own_m = off_m[used & (flight == row)]
+        if len(own_m):
+            means = {"mean_m": own_m.mean(axis=0).tolist(), "scatter_m": own_m.std(axis=0).tolist()}
+            listed.append({"flight": number, "images": len(own_m), **means})
+    return listed
 
 
 def _rms(values: FloatArray) -> list[float]:

@@ -25,8 +25,9 @@ def control_figures(
     cameras: image_id -> adjusted camera. `check_rmse_m` (x, y, z) is of the check points; without any, of every control
     point under the transformation of the others (leave-one-out). `offset_m`: from the block as it is to the surveyed
     positions, median over the control points. `doubtful`: control points that the others contradict.
-    `rays_do_not_meet`: points whose rays are parallel or meet behind a camera, which are left out. None where too few
-    are left.
+    `residuals`: name -> x, y, z after the transformation; `checks`: names; `point_sigmas_m`, `sigmas_m`: standard
+    deviations stated of each, and the median of those at which errors count. `rays_do_not_meet`: points whose rays are
+    parallel or meet behind a camera, which are left out. None where too few are left.
     """
     rays = {point.name: _rays(adjusted, cameras, point) for point in points}
     found = {point.name: _intersected(*rays[point.name]) for point in points}
@@ -70,6 +71,9 @@ def control_figures(
             point.name: [round(float(v), 4) for v in error]
             for point, error in zip([*control, *checks], _errors(fit, [*control, *checks], in_block), strict=True)
         },
+        "checks": [point.name for point in checks],
+        "point_sigmas_m": {point.name: list(point.sigmas_m) for point in [*control, *checks]},
+        "sigmas_m": np.median([point.sigmas_m for point in checks or control], axis=0).tolist(),
         "reprojection_error_px": _pixel_error(adjusted, cameras, seen, in_block),
     }
 

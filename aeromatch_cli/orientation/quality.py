@@ -13,6 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from aeromatch_cli.data import FloatArray
+
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
 
@@ -23,9 +25,11 @@ Limits = tuple[float, float | None]
 _POSITION_SIGMAS: Limits = (2.0, 5.0)
 # Of the given positions, the share that the pictures contradict: single wrong ones happen.
 _WRONG_POSITIONS: Limits = (0.05, 0.3)
-# What was found of a flight (a step of height, a shift), in stated standard deviations of its positions: it is taken
-# out, but which of the flights is right is not known.
-_FLIGHT_SIGMAS: Limits = (3.0, None)
+# What the positions of a flight are off by together (a step of height, a shift), in stated standard deviations: also
+# where it was taken out, which of the flights is right is not known. It is no step where positions of one flight
+# scatter by more than this share of it.
+_FLIGHT_SIGMAS: Limits = (2.0, None)
+_FLIGHT_SCATTER, _FLIGHT_IMAGES = 0.33, 2
 # Between exposure and position: less is within what receivers do.
 _LAG_S: Limits = (0.1, None)
 # From the projection centre to the antenna: no drone is larger, so that something else has been found.
@@ -51,9 +55,11 @@ _LENS_SIGMAS: Limits = (3.0, 6.0)
 # Expected deformations: how far the middle of the block may lie above its border, ground pixels; and by which angle it
 # may be tilted, degrees, which is what one strip has about its line.
 _BOWL_PIXELS: Limits = (5.0, None)
-_TILT_DEG: Limits = (1.0, None)
+_TILT_DEG: Limits = (2.0, None)
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
+# Parts that share too few points lie to each other as exactly as positions put each of them, ground pixels.
+_PARTS_PIXELS: Limits = (5.0, None)
 # Share of the images whose matches kept poses (orient=given) do not explain.
 _UNEXPLAINED: Limits = (0.1, 0.5)
 # So many positions, or points, hold a block.
@@ -199,6 +205,7 @@ def _frames(evidence: Evidence) -> _Found:
             f"{parts} parts whose scale and place nothing ties to each other: positions (--poses) place each of them"
         )
         yield Finding("parts", float(parts), 1.0, "bad", words)
+    yield from _placed_parts(evidence)
     given = int(evidence.adjust.get("positions_given", 0))
     used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
     kept = any(kind == "given" for kind in kinds)
@@ -220,6 +227,22 @@ def _frames(evidence: Evidence) -> _Found:
             "(--poses) or three control points (--gcp) do"
         )
         yield Finding("ground", None, None, "doubtful", words)
+
+
+def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
+    placed = [group for group in evidence.groups if group["kind"] == "positions" and group.get("positions")]
+    pixel_m = evidence.adjust.get("ground_pixel_m")
+    if len(placed) < 2 or not pixel_m:
+        return
+    # Of a part of N images by the square root of N better; that of the smallest counts.
+    exact_m = max(_rms(one["positions"]["stated_m"]) / np.sqrt(max(one["positions"]["used"], 1)) for one in placed)
+    sizes = ", ".join(str(group["images"]) for group in placed[:5]) + (", ..." if len(placed) > 5 else "")
+    words = (
+        f"{len(placed)} parts ({sizes} images) share too few points and lie to each other as their positions put them, "
+        f"to {exact_m:.2g} m ({exact_m / pixel_m:.1f} ground pixels)"
+    )
+    remedy = "more overlap between them, better positions, or control points in each tie them"
+    yield _finding("parts", exact_m / pixel_m, _PARTS_PIXELS, words, remedy)
 
 
 def _positions(evidence: Evidence) -> _Found:
@@ -253,9 +276,10 @@ def _positions(evidence: Evidence) -> _Found:
 def _flights(evidence: Evidence) -> _Found:
     """Steps, shifts and delays of whole flights, each with its size."""
     for group in evidence.groups:
-        stated_m = (group.get("positions") or {}).get("stated_m") or [np.inf] * 3
+        positions, found = group.get("positions") or {}, set[str]()
+        stated_m = positions.get("stated_m") or [np.inf] * 3
         for flight in group.get("flights", ()):
-            name, images = flight["flight"], flight["images"]
+            name, images = flight["flight"] or "without times", flight["images"]
             step_m = flight.get("step_m", 0.0)
             if step_m:
                 words = (
@@ -271,11 +295,35 @@ def _flights(evidence: Evidence) -> _Found:
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
                 sigmas = float(np.abs(shift_m / np.array(stated_m)).max())
                 yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
+            found.add(name)
             if "lag_s" in flight:
                 lag_s = flight["lag_s"][0]
                 words = f"positions of flight {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
                 remedy = "check the times by which positions were given to images"
                 yield _finding("delay of positions", abs(lag_s), _LAG_S, words, remedy)
+
+        left = [one for one in positions.get("flights", ()) if one["flight"] not in found]
+        yield from _apart(left, np.array(stated_m))
+
+
+def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterator[Finding]:
+    """Flights whose positions lie off together, against that of most images, and nothing was taken out."""
+    flights = [flight for flight in flights if flight["images"] >= _FLIGHT_IMAGES]
+    most = max(flights, key=lambda one: one["images"], default=None)
+    for flight in flights:
+        if most is None or flight is most:
+            continue
+        off_m = np.array(flight["mean_m"]) - np.array(most["mean_m"])
+        axis = int(np.argmax(np.abs(off_m) / stated_m))
+        if max(flight["scatter_m"][axis], most["scatter_m"][axis]) > _FLIGHT_SCATTER * abs(off_m[axis]):
+            continue
+        what = ("x", "y", "heights")[axis]
+        words = (
+            f"{what} of flight {flight['flight'] or 'without times'} ({flight['images']} images) lie "
+            f"{off_m[axis]:+.3g} m from those of the largest flight, which is in the result"
+        )
+        remedy = "check their datum and base stations, or state the accuracy of both as they are"
+        yield _finding("flights apart", float(abs(off_m[axis]) / stated_m[axis]), _FLIGHT_SIGMAS, words, remedy)
 
 
 def _mounts(evidence: Evidence) -> _Found:

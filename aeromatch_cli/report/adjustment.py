@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -114,6 +115,21 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
         if control["doubtful"]:
             found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
     return found
+
+
+def surveyed_rows(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels and standard deviations)."""
+    control = facts.get("control") or {}
+    stated, pixel_m, rows = control.get("point_sigmas_m", {}), facts.get("ground_pixel_m"), []
+    for name, error_m in control.get("residuals", {}).items():
+        metres = [f"{value:+.3f}" for value in error_m]
+        pixels = "" if not pixel_m else f"{math.hypot(*error_m) / pixel_m:.1f}"
+        sigmas = ""
+        if name in stated:
+            sigmas = f"{max(abs(e) / s for e, s in zip(error_m, stated[name], strict=True)):.1f}"
+        part = "check" if name in control.get("checks", ()) else "control"
+        rows.append((name, part, *metres, pixels, sigmas))
+    return rows
 
 
 def _metres(errors_m: Sequence[float]) -> str:

@@ -158,6 +158,12 @@ def histogram(values: Sequence[int], label: str, unit: str) -> str:
     return svg(axes.figure, label, "histogram", {"bar": titles})
 
 
+def round_length(length: float) -> float:
+    """1, 2 or 5 times a power of ten, not more than it: of the arrow that explains others."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(factor for factor in (1.0, 2.0, 5.0) if factor * power <= length * (1.0 + 1e-9)) * power)
+
+
 @lru_cache(maxsize=1 << 12)
 def evenly_chosen(count: int, limit: int) -> IntArray:
     """At most `limit` of the indices 0 .. count-1, evenly spaced, ends included."""

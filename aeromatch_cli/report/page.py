@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from aeromatch_cli import __version__
 from aeromatch_cli.config import dump
-from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.data import AdjustedBlock, FloatArray
 from aeromatch_cli.files import write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
+from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
+from aeromatch_cli.orientation.quality import Quality
 from aeromatch_cli.report.adjustment import (
     Adjustment,
     Notice,
@@ -29,7 +31,9 @@ from aeromatch_cli.report.adjustment import (
     final_points,
     read_adjustment,
     read_position_residuals,
+    surveyed_rows,
 )
+from aeromatch_cli.report.calibration import CameraSection, camera_sections, heights_section
 from aeromatch_cli.report.figures import COLOURS, histogram
 from aeromatch_cli.report.gathering import Gathered, gather, settled
 from aeromatch_cli.report.map import Link, MapFigure, Station, block_map
@@ -50,6 +54,7 @@ from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
 from aeromatch_cli.stages.lines import settled_words
+from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import StageReport, facts_on_file
 from aeromatch_cli.workspace import Workspace
 
@@ -100,6 +105,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     stages = stage_rows(context.workspace)
     # Without a verified pair what is on file is of other keypoints.
     adjusted = final_points(context, adjustment) if any(row.state == "verified" for row in pairs) else None
+    quality = _quality(context, adjustment)
     shown = _worst_pairs(pairs)
     pictures = thumbnails(context)
     drawn, keys = pair_data(context, pairs, pictures, found.drawn)
@@ -109,7 +115,8 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         colours=COLOURS,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
-        headline=_headline(images, pairs, facts, failures),
+        quality=quality,
+        headline=[*_verdict(quality), *_headline(images, pairs, facts, failures)],
         notices=_all_notices(context, images, pairs, facts, adjustment, input_facts.get("warnings", [])),
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
@@ -124,7 +131,9 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
             {row.image_id: row.name for row in images},
             context.block.gsd_m,
         ),
-        residuals=(adjustment.facts.get("control") or {}).get("residuals", {}),
+        cameras=_cameras(context, adjustment, adjusted),
+        heights=heights_section(adjustment.facts, in_world=adjustment.in_world),
+        residuals=surveyed_rows(adjustment.facts),
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
@@ -158,6 +167,35 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     )
 
 
+def _quality(context: Context, adjustment: Adjustment) -> Quality | None:
+    """None where the adjustment on file is of earlier matches."""
+    if adjustment.outdated:
+        return None
+    return quality_on_file(context.workspace, {image.image_id: image.name for image in context.block.images})
+
+
+def _verdict(quality: Quality | None) -> list[tuple[str, str, str]]:
+    """The first tile: the verdict and the gravest finding, with its number."""
+    if quality is None:
+        return []
+    level = {"good": "", "doubtful": "warn", "bad": "bad"}[quality.verdict]
+    if not quality.faults:
+        return [(quality.verdict, "result: nothing speaks against the block", level)]
+    first = quality.faults[0]
+    figure = "" if first.value is None else f" {first.value:.2g} (limit {first.limit:.2g})"
+    return [(quality.verdict, f"result: {first.what}{figure}", level)]
+
+
+def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock | None) -> list[CameraSection]:
+    if adjusted is None:
+        return []
+
+    def keypoints_px(image_id: str) -> FloatArray:
+        return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
+
+    return camera_sections(adjustment.facts, adjusted, context.block.images, keypoints_px)
+
+
 def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:
     """Thousands separated by commas; an empty cell where unknown."""
     return "" if value is None or math.isnan(value) else f"{value * factor:,.{digits}f}"
@@ -166,7 +204,7 @@ def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:
 def _headline(
     images: Sequence[ImageRow], pairs: Sequence[PairRow], facts: Mapping[str, Any], failures: Sequence[Any]
 ) -> list[tuple[str, str, str]]:
-    """(number, words, level) of each tile; level "" or "bad"."""
+    """(number, words, level) of each tile; level "", "warn" or "bad"."""
     posed = sum(row.pose != "none" for row in images)
     full = sum(row.pose == "full" for row in images)
     verified = sum(row.state == "verified" for row in pairs)

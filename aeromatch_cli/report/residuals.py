@@ -9,9 +9,9 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, PoseResidual
 from aeromatch_cli.geometry.frames import length_words
-from aeromatch_cli.report.figures import COLOURS, label_width, name_ground_axes, new_axes, svg
+from aeromatch_cli.report.figures import COLOURS, label_width, name_ground_axes, new_axes, round_length, svg
 
-_WIDTH_IN, _HEIGHTS_IN, _BAR_IN, _EDGES_IN = 9.0, (3.4, 6.0), 1.1, (0.6, 0.35)
+_WIDTH_IN, _HEIGHTS_IN, _BAR_IN, _EDGES_IN = 9.0, (3.4, 6.0), 1.5, (0.6, 0.35)
 # The arrow of this quantile is as long as this share of the usual distance between neighbouring cameras.
 _USUAL, _SHARE = 0.9, 0.6
 # Steps of the colours.
@@ -106,18 +106,12 @@ def _plan(centers_m: FloatArray, offsets_m: FloatArray, titles: list[str]) -> st
         *given.T, *(enlarged * offsets_m[:, :2]).T, angles="xy", scale_units="xy", scale=1.0, width=0.0028,
         color=COLOURS["ink"], zorder=3, gid="residual",
     )  # fmt: skip
-    length_m = _round_length(usual_m)
+    length_m = round_length(usual_m)
     axes.quiverkey(arrows, 0.88, 1.02, enlarged * length_m, f"{length_m:g} m", labelpos="E", color=COLOURS["ink"])
     place = axes.get_position()
     beside = axes.figure.add_axes((place.x1 + 0.02, place.y0, 0.022, place.height))
-    bar = axes.figure.colorbar(ScalarMappable(norm, scale), cax=beside, format="{x:.3g}")
+    bar = axes.figure.colorbar(ScalarMappable(norm, scale), cax=beside, format="{x:.2g}")
     bar.set_label("z, adjusted less given, metres")
     axes.set_title(f"positions, adjusted less given; arrows enlarged {enlarged:.3g} times", fontsize=10, loc="left")
     axes.ticklabel_format(useOffset=False, style="plain")
     return svg(axes.figure, "Residuals of the camera positions", "residuals", shown)
-
-
-def _round_length(length: float) -> float:
-    """1, 2 or 5 times a power of ten, not more than it."""
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(max(factor for factor in (1.0, 2.0, 5.0) if factor * power <= length * (1.0 + 1e-9)) * power)

@@ -21,6 +21,10 @@ TABLE: Table = {
         "benchmarks.calibration.command",
         "bundle adjustment of simulated tie points with real lenses, beside COLMAP, by exact truth",
     ),
+    "quality": (
+        "benchmarks.quality.command",
+        "whether a verdict can be believed: blocks spoilt in known ways, and good ones, by exact truth",
+    ),
     "similar": ("benchmarks.similar", "pairs of images without poses by image retrieval, against reference overlaps"),
     "polar": ("benchmarks.polar.command", "registration of texture-poor ground beside SIFT"),
     "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),

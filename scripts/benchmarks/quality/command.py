@@ -1,0 +1,161 @@
+"""Whether the verdict on a block can be believed: blocks spoilt in known ways, of which none may be called good, and
+good blocks, of which none may be called bad.
+
+Tie points are simulated as in `scripts/bench calibration`; what is spoilt is what the adjustment is given (positions,
+cameras, angles, control points, matches) and nothing tells it. Starts are near the truth, as a first pass leaves them,
+so that the faults reach the adjustment; what a first pass itself finds wrong is not tested here.
+
+Verdict: `good`, `doubtful` or `bad`. Findings: the criteria that spoke, the gravest first, with their numbers. Height:
+median absolute error of about 60 check points, in ground pixels; absolute, where positions are RTK, else after the best
+similarity. Writes OUT/rows/NAME.json with the facts of every block, OUT/results.json and OUT/quality.md; facts that OUT
+has are not made again, and judged by the criteria as they are now.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from aeromatch_cli.errors import AeromatchError
+from aeromatch_cli.files import read_json, write_json
+from aeromatch_cli.orientation.block_figures import block_figures
+from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.orientation.judgement import connected_groups
+from aeromatch_cli.orientation.mapping import refine_block
+from aeromatch_cli.orientation.quality import Evidence, judged
+from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.stages import adjust
+from benchmarks import options
+from benchmarks.calibration.accuracy import Found
+from benchmarks.calibration.accuracy import judged as by_truth
+from benchmarks.processes import fresh_process, limit_threads
+from benchmarks.quality.blocks import FAULTS, GOOD, Task
+from benchmarks.tables import Column, Row, number, table, write_rows
+
+_MOST_FINDINGS = 3
+
+
+def evidence_of(task: Task) -> tuple[Evidence, Row]:
+    """What the adjustment makes of a task, and errors of that by truth."""
+    images = task.contents.block.images
+    tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in task.contents.pairs])
+    alone = len(images) - sum(map(len, tied))
+    try:
+        adjusted, groups = refine_block(task.contents, task.observed, task.groups, fixed=task.fixed)
+    except AeromatchError as error:
+        facts: dict[str, Any] = {"images": 0, "remarks": [str(error)]}
+        errors: Row = {}
+    else:
+        residuals = residuals_of(adjusted, task.observed.poses, images, task.contents.keypoints_px)
+        cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in images}
+        control = control_figures(adjusted, cameras, task.observed.control) if task.observed.control else None
+        facts = {
+            **block_figures(adjusted, images, groups),
+            "positions_given": len(task.observed.poses),
+            "outside": {i.image_id: "" for i in images if i.image_id not in adjusted.poses},
+            "control": control,
+            "residuals": residual_figures(residuals, {}),
+            "remarks": [] if adjusted.poses else ["no image could be oriented"],
+        }
+        one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
+        whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
+        errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
+    evidence = Evidence(
+        images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True,
+        metric=task.block.positions != "nothing",
+    )  # fmt: skip
+    return evidence, errors
+
+
+def _run(name: str, expected: str, path: Path, tie_points: int) -> None:
+    plan, spoil = (FAULTS if expected == "spoilt" else GOOD)[name]
+    evidence, errors = evidence_of(spoil(plan.task(tie_points)))
+    height = errors.get("absolute_height_px", errors.get("height_px"))
+    write_json(path, {"block": name, "expected": expected, "height_px": height, "evidence": asdict(evidence)})
+
+
+def _judged(row: Row) -> Row:
+    """A row of what was found with the present verdict on it."""
+    quality = judged(Evidence(**row["evidence"]))
+    faults = [[one.what, one.value, one.level, one.sentence] for one in quality.faults]
+    shown = {key: row[key] for key in ("block", "expected", "height_px")}
+    return {**shown, "verdict": quality.verdict, "findings": faults, "unchecked": list(quality.unchecked)}
+
+
+def _run_all(cases: Sequence[tuple[str, str, Path]], tie_points: int) -> int:
+    for name, expected, path in cases:
+        _run(name, expected, path, tie_points)
+        print(f"{expected}: {name}", file=sys.stderr, flush=True)
+    return len(cases)
+
+
+def rows_of(out: Path, names: Sequence[tuple[str, str]], tie_points: int, jobs: int) -> Iterator[Row]:
+    """All rows, the missing ones made first: blocks of one scene and flight by one process, which simulates it once."""
+    paths = {
+        (name, kind): out / "rows" / f"{kind}-{re.sub('[^a-z0-9]+', '-', name.lower())}.json" for name, kind in names
+    }
+    batches: dict[Any, list[tuple[str, str, Path]]] = {}
+    for (name, kind), path in paths.items():
+        if not path.is_file():
+            plan, _ = (FAULTS if kind == "spoilt" else GOOD)[name]
+            key = plan.scene, plan.seed
+            batches.setdefault(key, []).append((name, kind, path))
+    with fresh_process(jobs, limit_threads, 1) as pool:
+        for _ in pool.map(_run_all, batches.values(), [tie_points] * len(batches)):
+            pass
+    for path in paths.values():
+        yield _judged(read_json(path))
+
+
+def _findings(row: Row) -> str:
+    shown = [what if value is None else f"{what} {number(value, 2)}" for what, value, *_ in row["findings"]]
+    return "; ".join(shown[:_MOST_FINDINGS]) + ("; ..." if len(shown) > _MOST_FINDINGS else "")
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    columns: list[Column[Row]] = [
+        ("verdict", lambda row: str(row["verdict"])),
+        ("findings", _findings),
+        ("height, px", lambda row: "-" if row["height_px"] is None else number(row["height_px"], 1)),
+    ]
+    return table(("", "block"), (([row["expected"], row["block"]], row) for row in rows), columns)
+
+
+def summary_of(rows: Sequence[Row]) -> str:
+    """How many blocks of each kind got which verdict."""
+    words = []
+    for kind in ("spoilt", "good"):
+        own = [row["verdict"] for row in rows if row["expected"] == kind]
+        if own:
+            counts = ", ".join(f"{own.count(level)} {level}" for level in ("good", "doubtful", "bad"))
+            words.append(f"{len(own)} {kind} blocks: {counts}")
+    return "; ".join(words) + "."
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = options.make_parser("quality", __doc__)
+    add = parser.add_argument
+    add("--only", default="", metavar="WORDS", help="blocks whose names hold these words")
+    add("--points", type=options.positive, default=600, help="about so many tie points in an image")
+    add("--jobs", type=options.positive, default=2)
+    options.add_output(parser)
+    args = options.parse(parser, arguments, {"only": "factory", "points": 500})
+    names = [(name, kind) for kind, some in (("spoilt", FAULTS), ("good", GOOD)) for name in some if args.only in name]
+    if not names:
+        parser.error(f"no block has {args.only!r} in its name")
+    limit_threads(1)
+    (args.out / "rows").mkdir(parents=True, exist_ok=True)
+    rows = list(rows_of(args.out, names, args.points, args.jobs))
+    write_rows(args.out / "results.json", rows)
+    options.publish(
+        args, f"{summary_of(rows)}\n\n{table_of(rows)}\n", args.out / "quality.md", table="bench_quality",
+        command=options.command_line(parser, args), versions={"stage.adjust": adjust.VERSION},
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,81 @@
+"""Calibration, residuals over the picture and expected heights on the page."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Image
+from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.report.adjustment import surveyed_rows
+from aeromatch_cli.report.calibration import camera_sections, heights_section
+
+CAMERA = Camera("PINHOLE", 800, 600, (700.0, 700.0, 399.5, 299.5))
+IMAGES = [Image(i, f"{i}.jpg", 800, 600, "1") for i in "ab"]
+KNOWN = {"f": 690.0, "cx": 399.5, "cy": 299.5}
+FACTS: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
+    "calibration": {"1": {"images": 2, "correlations": [["f", "k1", -0.95]], "parameters": {
+        "f": [700.0, 0.5, 690.0, 20.0], "cx": [399.5, 0.0, 399.5, 16.0], "cy": [299.5, 0.0, 299.5, 16.0],
+        "k1": [0.0, 0.001, 0.0, 0.05],
+    }}},
+    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0,
+                "points": [[0.0, 0.0, 0.1], [50.0, 10.0, 0.15], [20.0, 60.0, 0.2]]},
+}]}  # fmt: skip
+
+
+def block(off_px: FloatArray) -> tuple[AdjustedBlock, dict[str, FloatArray]]:
+    """Two images that look straight down on 2,000 points, which they have measured `off_px` beside their places."""
+    rng = np.random.default_rng(1)
+    points_m = np.column_stack([rng.uniform(-50.0, 50.0, 2000), rng.uniform(-38.0, 38.0, 2000), np.zeros(2000)])
+    down = np.diag([1.0, -1.0, -1.0])
+    poses = {
+        i: AdjustedPose(np.array([x, 0.0, 100.0]), down, np.zeros(3), np.zeros(3)) for i, x in (("a", 0.0), ("b", 5.0))
+    }
+    keypoints = {i: project(CAMERA, pose.rotation, pose.center_m, points_m) + off_px for i, pose in poses.items()}
+    rows = np.arange(2000, dtype=np.int32)
+    tracks = {i: np.column_stack([rows, rows]) for i in poses}
+    return AdjustedBlock({"1": CAMERA}, poses, points_m, np.zeros(2000), tracks), keypoints
+
+
+def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
+    adjusted, keypoints = block(np.zeros(2))
+    (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
+    assert section.words == "2 images, PINHOLE, 800 x 600 px"
+    assert section.rows[0] == ("f, focal length", "px", "700.00", "0.50", "690.00", "20.00", "+0.5", "k1 -0.95")
+    assert section.rows[1] == ("cx, principal point", "px", "399.50", "held", "399.50", "16.00", "", "")
+
+
+def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
+    adjusted, keypoints = block(np.array([0.3, -0.4]))
+    (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
+    (moved, moved_words), (remaining, remaining_words) = section.fields
+    # 10 px more in a focal length of 700 px move the middle of the outermost cell, 465.0 px away, by 10 / 700 of that.
+    assert float(re.findall(r"up to ([\d.]+) px", moved_words)[0]) == pytest.approx(465.0 * 10 / 700, abs=0.06)
+    assert float(re.findall(r"up to ([\d.]+) px", remaining_words)[0]) == pytest.approx(0.5, abs=0.005)
+    assert all(drawn.startswith("<svg") for drawn in (moved, remaining))
+
+
+def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:
+    world, own = (heights_section(FACTS, in_world=in_world) for in_world in (True, False))
+    assert world is not None
+    assert own is not None
+    assert "median 0.150 m (1.5 ground pixels)" in world.words
+    assert "may lie 0.400 m (4.0 ground pixels) above or below its border" in world.words
+    assert "median 1.5 ground pixels" in own.words
+    assert "metres" in world.plan
+    assert "metres" not in own.plan
+    assert heights_section({"groups": []}, in_world=True) is None
+
+
+def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:
+    control = {
+        "residuals": {"P1": [0.02, -0.01, 0.06], "P2": [0.0, 0.0, 0.3]}, "checks": ["P2"],
+        "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]},
+    }  # fmt: skip
+    assert surveyed_rows({"control": control, "ground_pixel_m": 0.1}) == [
+        ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0"),
+        ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0"),
+    ]
