@@ -180,7 +180,7 @@ class _Block:
     def without(self, points: Sequence[Surveyed]) -> _Block:
         """The block with these control points alone, weights and calibration's unknowns as they are."""
         network, state = self.with_points(points)
-        return replace(self, network=network, state=solve(network, state, _TOLERANCE).state)
+        return replace(self, network=network, state=solve(network, state, _TOLERANCE, near=True).state)
 
 
 def _worst(block: _Block, rests: Sequence[_Block], count: int) -> int | None:

@@ -11,7 +11,7 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -80,6 +80,8 @@ def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> t
     Raises InputError where the mapper stops; no model is no error.
     """
     block = contents.block
+    # Few matches of reduced pictures do not tell an affinity from a rolling shutter.
+    observed = replace(observed, switches={**dict.fromkeys(("b1", "b2"), False), **observed.switches})
     with _task(contents, observed) as folder:
         facts = _solved(folder, "mapper", {"mapper": mapper}, f"pycolmap's {mapper} mapping")
         return tuple(_read(folder, one, block) for one in facts)

@@ -104,7 +104,7 @@ def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tu
     sigma_px = _sigma_px(network, state, redundant=False)
     for number in range(_MAX_ROUNDS):
         network = _of_sigma(network, sigma_px)
-        state = solve(_loosened(network, state), state, _ROUGH if number == 0 else tolerance).state
+        state = solve(_loosened(network, state), state, _ROUGH if number == 0 else tolerance, near=number > 0).state
         before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
         if number and abs(sigma_px / before - 1.0) < _SETTLED:
             break
@@ -158,24 +158,26 @@ def _moved_px(network: Network, state: Unknowns, change: FloatArray) -> FloatArr
 def _explained(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
     """The network with those further unknowns that its residuals speak for, the clearest first, and its solution."""
     while True:
-        found = [_worth(network, state, tried) for tried in _explanations(network, state, options)]
+        found = [_worth(network, state, tried, options.tolerance) for tried in _explanations(network, state, options)]
         taken = max((one for one in found if one is not None), key=lambda one: one[0], default=None)
         if taken is None:
             return network, state
         network, state = taken[1:]
 
 
-def _worth(network: Network, state: Unknowns, tried: Network) -> tuple[float, Network, Unknowns] | None:
+def _worth(
+    network: Network, state: Unknowns, tried: Network, tolerance: float
+) -> tuple[float, Network, Unknowns] | None:
     """By how much further unknowns lower the sum of squares, their network and its solution; None where that is too
     little. Positions weigh by what they are off by once it is taken."""
     unknowns = _freed_since(network, tried)
     if not _count(unknowns):
         return None
     loose_m = _loosened(network, state).position_sigmas_m
-    after = solve(replace(tried, position_sigmas_m=loose_m), state, _ROUGH).state
+    after = solve(replace(tried, position_sigmas_m=loose_m), state, tolerance, near=True).state
     fair = _loosened(tried, after)
-    solved = solve(fair, after, _ROUGH)
-    without = solve(replace(network, position_sigmas_m=fair.position_sigmas_m), state, _ROUGH)
+    solved = solve(fair, after, tolerance, near=True)
+    without = solve(replace(network, position_sigmas_m=fair.position_sigmas_m), state, tolerance, near=True)
     gain = 2.0 * (without.cost - solved.cost)
     if gain < _WORTH_SQUARES * _count(unknowns):
         return None
@@ -256,7 +258,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
     """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
     they are less exact than stated, horizontally and vertically."""
     stated, factors = network, np.asarray([1.0, 1.0])
-    tight = solve(stated, state, options.tolerance).state
+    tight = solve(stated, state, options.tolerance, near=True).state
     bent = _sigma_px(stated, tight, redundant=True) > _BENT * stated.tie_sigma_px
     network, state = (_loosened(stated, state), state) if bent else (stated, tight)
     settled = network is stated
@@ -267,7 +269,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
             break
         factors, stated, settled = new, _without(stated, wrong), True
         network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
-        state = solve(network, state, options.tolerance).state
+        state = solve(network, state, options.tolerance, near=True).state
     return network, state, factors
 
 

@@ -13,6 +13,9 @@ from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, c
 # The damping of the first step, the bounds, and by how much it changes from step to step.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e6
 _EASED, _RAISED = 0.2, 6.0
+# Near the solution steps begin with less; only with less than this does a small step mean that it is reached: damping
+# holds back what the observations hardly tell apart, such as affinity and rolling shutter, or focal length and height.
+_NEAR_DAMPING, _FREE_DAMPING = 1e-7, 1e-6
 _MAX_STEPS = 60
 # Up to so many unknowns the reduced equations are solved as a full matrix, beyond as a sparse one.
 _FULL_SIZE = 4000
@@ -27,12 +30,13 @@ class Solved:
     steps: int
 
 
-def solve(network: Network, state: Unknowns, tolerance: float) -> Solved:
+def solve(network: Network, state: Unknowns, tolerance: float, *, near: bool = False) -> Solved:
     """The unknowns nearest to all observations, from where `state` puts them.
 
-    tolerance: it ends when a step lowers the cost by a smaller share.
+    tolerance: it ends when a step lowers the cost by a smaller share. near: whether `state` is a solution but for some
+    unknowns or weights.
     """
-    best, damping, step = cost(network, state), _DAMPING, 0
+    best, damping, step = cost(network, state), _NEAR_DAMPING if near else _DAMPING, 0
     while step < _MAX_STEPS:
         made = equations(network, state)
         while damping <= _MOST_DAMPING:
@@ -45,9 +49,10 @@ def solve(network: Network, state: Unknowns, tolerance: float) -> Solved:
         assert tried is not None
         step, found = step + 1, cost(network, tried)
         gain, best, state = 1.0 - found / best, found, tried
-        damping = max(_EASED * damping, _LEAST_DAMPING)
-        if gain < tolerance:
+        settled = gain < tolerance
+        if settled and damping <= _FREE_DAMPING:
             break
+        damping = max((_EASED**2 if settled else _EASED) * damping, _LEAST_DAMPING)
     return Solved(state, best, step)
 
 

@@ -229,7 +229,7 @@ def _observed(seen: _Seen, positions: Positions, rng: np.random.Generator, attit
     pictures = seen.pictures
     focal = dict.fromkeys(seen.contents.block.cameras, FOCAL_SIGMAS["35-mm equivalent"])
     if positions == "nothing":
-        return Observed({}, focal, {})
+        return Observed({}, focal, {}, seen.contents.block.cameras)
     errors_m = (rtk_errors_m if positions == "rtk2cm" else gps_errors_m)(len(pictures), rng)
     turns = _turned(rng, _MOUNT_DEG, 1) * _turned(rng, _GIMBAL_DEG, len(pictures))
     poses, angles = {}, {}
@@ -241,7 +241,7 @@ def _observed(seen: _Seen, positions: Positions, rng: np.random.Generator, attit
         poses[picture.image_id] = Pose(center_m, rotation, stated_m, sigma_deg, _SIGMAS_M[positions])
         if rotation is not None:
             angles[picture.image_id] = Angles("omega_phi_kappa", to_omega_phi_kappa(rotation))
-    return Observed(poses, focal, angles)
+    return Observed(poses, focal, angles, seen.contents.block.cameras)
 
 
 def _turned(rng: np.random.Generator, sigma_deg: float, count: int) -> Rotation:
