@@ -103,6 +103,8 @@ def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
         ({"group": lens(readout_s=[0.03, 0.001, 0.0, 0.03])}, "rolling shutter", 0.03, "good"),
         ({"group": lens(readout_s=[0.5, 0.001, 0.0, 0.03])}, "rolling shutter", 0.5, "doubtful"),
         ({"group": heights(bowl_m=0.3)}, "bowl", 10.0, "doubtful"),
+        ({"group": heights(sigma_m=0.3)}, "heights", 10.0, "doubtful"),
+        ({"group": heights(sigma_m=9.0) | positions(stated_m=[5.0] * 3)}, "heights", 300.0, "good"),
         ({"group": heights(tilt_m=5.0)}, "tilt", 2.862, "doubtful"),
         ({"group": flight(step_m=14.9)}, "step of heights", 14.9 / 0.03, "doubtful"),
         ({"group": flight(shift_x=[1.0, 0.01])}, "shift of a flight", 50.0, "doubtful"),

@@ -56,6 +56,8 @@ _LENS_SIGMAS: Limits = (3.0, 6.0)
 # may be tilted, degrees, which is what one strip has about its line.
 _BOWL_PIXELS: Limits = (5.0, None)
 _TILT_DEG: Limits = (2.0, None)
+# Expected errors of heights as a whole: ground pixels, or so many standard deviations of the heights of positions.
+_HEIGHT_PIXELS, _HEIGHT_SIGMAS = 5.0, 3.0
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
 # Parts that share too few points lie to each other as exactly as positions put each of them, ground pixels.
@@ -450,21 +452,42 @@ def _calibration(evidence: Evidence) -> _Found:
 
 
 def _deformation(evidence: Evidence) -> _Found:
+    """Of the group that is worst in each respect."""
     pixel_m = evidence.adjust.get("ground_pixel_m")
-    heights = next((group["heights"] for group in evidence.groups if group.get("heights")), None)
-    if not heights or not pixel_m:
+    known = [group for group in evidence.groups if group.get("heights")]
+    if not known or not pixel_m:
         yield "expected deformation: the block was not adjusted, or has too few points"
         return
-    bowl = heights["bowl_m"] / pixel_m
-    metres = f" ({heights['bowl_m']:.2g} m)" if evidence.metric else ""
-    words = f"the middle of the block may lie {bowl:.1f} ground pixels{metres} above or below its border"
+
+    def length(value_m: float) -> str:
+        metres = f" ({value_m:.2g} m)" if evidence.metric else ""
+        return f"{value_m / pixel_m:.1f} ground pixels{metres}"
+
+    def part(group: Mapping[str, Any]) -> str:
+        return "the block" if len(evidence.groups) == 1 else f"the part of {group['images']} images"
+
+    worst = max(known, key=lambda group: group["heights"]["bowl_m"])
+    bowl_m = worst["heights"]["bowl_m"]
+    words = f"the middle of {part(worst)} may lie {length(bowl_m)} above or below its border"
     remedy = f"straight views from one height do not determine it; {_STRIPS}"
-    yield _finding("bowl", bowl, _BOWL_PIXELS, words, remedy)
-    angle = float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"])))
-    if any(group["kind"] != "level" for group in evidence.groups):
-        words = f"the block may be tilted by {angle:.2f} degrees"
-        remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
-        yield _finding("tilt", angle, _TILT_DEG, words, remedy)
+    yield _finding("bowl", bowl_m / pixel_m, _BOWL_PIXELS, words, remedy)
+    placed = [group for group in known if group["kind"] != "level"]
+    if not placed:
+        return
+    angles = [float(np.rad2deg(np.arctan2(g["heights"]["tilt_m"], g["heights"]["reach_m"]))) for g in placed]
+    angle, worst = max(zip(angles, placed, strict=True), key=lambda one: one[0])
+    words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
+    remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
+    yield _finding("tilt", angle, _TILT_DEG, words, remedy)
+    placed = [group for group in placed if group.get("positions")]
+    if placed:
+        worst = max(placed, key=lambda group: group["heights"]["sigma_m"])
+        sigma_m, stated_m = worst["heights"]["sigma_m"], worst["positions"]["stated_m"][2]
+        # As exact as positions are is as exact as can be asked for.
+        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / pixel_m)
+        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {stated_m:.2g} m"
+        remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
+        yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
 
 
 def _kept_poses(evidence: Evidence) -> _Found:
