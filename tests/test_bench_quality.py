@@ -51,6 +51,7 @@ def test_cameras_and_matches_are_spoilt_as_the_names_say(task: Task) -> None:
     assert len(used) == len(set(used))
 
 
+@pytest.mark.slow
 def test_a_good_block_is_not_bad_and_a_spoilt_one_is_not_good(task: Task) -> None:
     evidence, errors = evidence_of(task)
     assert judged(evidence).verdict != "bad"
