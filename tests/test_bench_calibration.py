@@ -14,13 +14,13 @@ from benchmarks.calibration.simulate import (
     SimulatedBlock,
     exif_camera,
     perturbed,
-    position_errors_m,
     simulate,
 )
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.geometry.cameras import distort, focal_px, parameters, project, undistort
 from aeromatch_cli.synthetic.lenses import real_lens
+from aeromatch_cli.synthetic.receivers import gps_errors_m
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_the_same_seed_gives_the_same_block_whatever_is_known(block: SimulatedBl
 def test_observed_positions_and_angles_have_their_errors(block: SimulatedBlock) -> None:
     off_m = np.array([block.observed.poses[i].center_m - pose.center_m for i, pose in block.poses.items()])
     assert np.abs(off_m).max() < 0.15
-    drift_m = np.array([position_errors_m("gps5m", 40, np.random.default_rng(k)) for k in range(200)])
+    drift_m = np.array([gps_errors_m(40, np.random.default_rng(k)) for k in range(200)])
     assert drift_m.std() == pytest.approx(5.1, rel=0.1)
     assert np.diff(drift_m, axis=1).std() == pytest.approx(1.41, rel=0.15)
     _, groups = perturbed(block)

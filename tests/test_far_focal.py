@@ -1,17 +1,21 @@
-"""A flat block from straight above, where any focal length goes with some height of the ground: the prior one is taken,
-and the ground stays in front of the images."""
+"""A flat block from straight above, where any focal length goes with some height of the ground: it stays at its prior,
+and the ground in front of the images."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import numpy as np
 import pycolmap
+import pytest
+from make_networks import given_positions
 
-from aeromatch_cli.data import FloatArray
-from aeromatch_cli.orientation.adjusting import _adjuster, _prefer_prior_focal_lengths
-from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, image_numbers, points_of
+from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.orientation.adjusting import Work, adjusted, state_errors
+from aeromatch_cli.orientation.bundle.adjust import Options
+from aeromatch_cli.orientation.bundle.of_model import image_numbers
+from aeromatch_cli.orientation.calibration import freed, lens_prior
+from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of
 
 FOCAL_PX, HEIGHT_M, COLUMNS, ROWS = 200.0, 100.0, 6, 5
 CENTERS_M = np.array([[24.0 * column, -24.0 * row, HEIGHT_M] for row in range(ROWS) for column in range(COLUMNS)])
@@ -57,22 +61,49 @@ def heights_m(model: pycolmap.Reconstruction) -> FloatArray:
     return np.asarray(points_of(model)[:, 2])
 
 
-def test_a_far_prior_is_taken_with_the_ground_in_front_of_the_images() -> None:
-    start = flat_block(noise_px=0.05)
-    found = with_focal_length(start, 1300.0)
+def work(sigma: float, *, final: bool = False) -> Work:
+    """sigma: standard deviation of the focal length, as a share; the rest of the lens is as `calibration` frees it."""
+    prior = lens_prior(Camera("SIMPLE_PINHOLE", 160, 120, (FOCAL_PX, 79.5, 59.5)), sigma)
+    sigmas = freed(prior, "auto", {}, len(CENTERS_M)) if final else np.where(np.arange(12) == 0, prior.sigmas, 0.0)
+    return Work(pycolmap, {1: prior.lens}, {1: sigmas}, frozenset(), Options(1e-6, final=final))
+
+
+GIVEN = given_positions(CENTERS_M, np.full(len(CENTERS_M), 5.0))
+
+
+def test_a_far_focal_length_goes_back_to_its_prior_with_the_ground_in_front_of_the_images() -> None:
+    found = with_focal_length(flat_block(noise_px=0.05), 1300.0)
     assert np.median(heights_m(found)) < -500.0
-    priors = {"1": {"params": np.array([FOCAL_PX, FOCAL_PX, 80.0, 60.0]), "focal_px": FOCAL_PX, "sigma": 0.03}}
-    used, sigmas_m = image_numbers(start), np.full(len(CENTERS_M), 5.0)
-
-    def adjuster(which: Any, fixed_cameras: bool) -> Any:
-        fixed = {1} if fixed_cameras else set()
-        return _adjuster(pycolmap, which, used, CENTERS_M, sigmas_m, fixed, False, 1e-6)
-
-    drifted = copy.deepcopy(found)  # by a name: an adjuster does not keep its model
-    cost = adjuster(drifted, True).solve().ceres_summary.final_cost
-    _prefer_prior_focal_lengths(found, start, priors, cost, adjuster)
-    found.update_point_3d_errors()
-    assert found.cameras[1].params[0] == FOCAL_PX
+    own = work(0.03)
+    own.start(found)
+    adjusted(own, found, GIVEN)
+    state_errors(own, found, GIVEN)
+    assert found.cameras[1].params[0] == pytest.approx(FOCAL_PX, rel=0.01)
     assert max(point.error for point in found.points3D.values()) < 1.0 < BEHIND_PX
     assert np.abs(heights_m(found)).max() < 5.0
-    assert np.abs(centers_of(found, used) - CENTERS_M).max() < 5.0
+    assert np.abs(centers_of(found, image_numbers(found)) - CENTERS_M).max() < 5.0
+
+
+@pytest.mark.parametrize("start_px", [FOCAL_PX, 230.0])
+def test_what_a_block_says_nothing_of_stays_near_its_prior(start_px: float) -> None:
+    """All of the lens is free; a tenth of the prior's standard deviation is as far as noise may move the focal length,
+    and its stated one is that of the prior."""
+    found = with_focal_length(flat_block(noise_px=0.05), start_px)
+    own = work(0.03, final=True)
+    own.start(found)
+    outcome = adjusted(own, found, GIVEN)
+    assert outcome.result.found is not None
+    assert found.cameras[1].params[0] == pytest.approx(FOCAL_PX, abs=0.1 * 0.03 * FOCAL_PX)
+    assert outcome.result.found.lens_sigmas[0, 0] == pytest.approx(0.03 * FOCAL_PX, rel=0.1)
+    assert np.abs(heights_m(found)).max() < 5.0
+
+
+def test_what_nobody_knows_of_a_focal_length_is_said() -> None:
+    """With a prior ten times as wide, heights are as uncertain as it: 30 % of the flying height."""
+    found = flat_block(noise_px=0.05)
+    own = work(0.3, final=True)
+    own.start(found)
+    outcome = adjusted(own, found, GIVEN)
+    assert outcome.result.found is not None
+    sigmas_m = np.sqrt(np.diag(outcome.result.found.of_points(np.arange(10))))[2::3]
+    assert (sigmas_m > 0.2 * HEIGHT_M).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import combinations
 
 import numpy as np
@@ -406,3 +407,25 @@ def test_wrong_orders_are_refused_by_name() -> None:
                 lens="OPENCV",
                 rng=np.random.default_rng(0),
             )
+
+
+def test_flights_of_calibrations_have_strips_across_second_heights_and_tilts() -> None:
+    cross = in_still_air("cross", 24).stations
+    assert Counter(round(s.heading_deg) % 180 for s in cross) == {0: 16, 90: 8}
+    assert {s.exterior.z_m for s in cross} == {HEIGHT_M}
+    heights = Counter(round(s.exterior.z_m / HEIGHT_M, 6) for s in in_still_air("two-heights", 24).stations)
+    assert heights == {1.0: 12, 1.35: 12}
+    tilted = in_still_air("tilted", 24).stations
+    assert Counter(round(tilt(s)) for s in tilted) == {0: 16, 30: 8}
+    for station in tilted[16:]:  # they look where they fly
+        assert turn(azimuth(axis(station)), station.heading_deg) < 1e-3
+    rig = in_still_air("dense-rig", 20)
+    assert len(rig.cameras) == 5
+    assert overlap(*footprints(rig)[0:6:5]) == pytest.approx(0.70, abs=1e-6)
+
+
+def test_real_lenses_differ_by_camera_and_seed() -> None:
+    cameras = plan("dense-rig", 5, lens="REAL").cameras
+    assert len(set(cameras.values())) == 5
+    assert {camera.model for camera in cameras.values()} == {"BROWN"}
+    assert plan("dense-rig", 5, lens="REAL").cameras == cameras

@@ -8,11 +8,14 @@ from functools import partial
 import numpy as np
 import pycolmap
 import pytest
+from make_networks import given_positions, values_of
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.orientation.adjusting import adjusted
+from aeromatch_cli.orientation.adjusting import Work, adjusted
+from aeromatch_cli.orientation.bundle.adjust import Options
+from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.flips import Upright, _Other, other_pose, turned_back
 from aeromatch_cli.orientation.placing import Placement
 
@@ -60,12 +63,14 @@ def centers_of(model: pycolmap.Reconstruction) -> FloatArray:
 
 
 def adjust_with(positions_m: FloatArray, sigmas_m: FloatArray, model: pycolmap.Reconstruction) -> Placement:
-    cameras = {
-        str(number): {"params": [focal_px, 400.0, 300.0], "focal_px": focal_px, "sigma": 0.01}
-        for number, focal_px in enumerate(FOCAL_PX, 1)
-    }
-    nothing = np.full((len(positions_m), 3), np.nan)
-    return adjusted(pycolmap, model, cameras, positions_m, sigmas_m, nothing, 1e-6)
+    """With focal lengths known to a hundredth, all else of the lenses held."""
+    lenses = {number: values_of(LENS, f=focal_px, cx=399.5, cy=299.5) for number, focal_px in enumerate(FOCAL_PX, 1)}
+    sigmas = {number: values_of(LENS, f=0.01 * focal_px) for number, focal_px in enumerate(FOCAL_PX, 1)}
+    work = Work(pycolmap, lenses, sigmas, frozenset(), Options(1e-6, final=False))
+    work.start(model)
+    placement = adjusted(work, model, given_positions(positions_m, sigmas_m)).placement
+    assert placement is not None
+    return placement
 
 
 def turned(exact: pycolmap.Reconstruction, over: tuple[int, ...], positions_m: FloatArray) -> Upright:

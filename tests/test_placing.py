@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
+from make_networks import given_positions
 from scipy.spatial.transform import Rotation
 from test_flips import built, centers_of
 
@@ -182,7 +183,7 @@ def test_headings_are_wrong_as_far_as_positions_tell_north(turned_deg: float, si
     true = np.array([model.images[number].cam_from_world().rotation.matrix() for number in sorted(model.images)])
     given = true @ rotation_z(turned_deg)
     ups = given[:, :, 2]
-    sigmas_m = np.full(len(positions_m), sigma_m)
-    found = believed_tilts(pycolmap, model, positions_m, sigmas_m, ups, given)
+    known = given_positions(positions_m, np.full(len(positions_m), sigma_m), ups=ups, rotations=given)
+    found = believed_tilts(pycolmap, model, known)
     assert np.isfinite(found).all() == believed
     assert not believed or np.array_equal(found, ups)

@@ -7,9 +7,12 @@ import copy
 import numpy as np
 import pycolmap
 import pytest
+from make_networks import given_positions, values_of
 
-from aeromatch_cli.orientation.adjusting import Attitudes, adjust_in_place
-from aeromatch_cli.orientation.results import image_numbers
+from aeromatch_cli.orientation.adjusting import Work, adjust_in_place
+from aeromatch_cli.orientation.bundle.adjust import Options
+from aeromatch_cli.orientation.bundle.network import LENS
+from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of
 from aeromatch_cli.orientation.spread import chosen_points, take_poses, thinned
 
 POINTS, IMAGES = 6000, 6
@@ -53,17 +56,18 @@ def test_poses_of_the_part_are_as_exact_as_those_of_all(model: pycolmap.Reconstr
     truth = {i: model.images[i].projection_center() for i in image_numbers(model)}
     count = len(truth)
     given = np.array([truth[i] for i in sorted(truth)]) + np.random.default_rng(1).normal(0, 0.02, (count, 3))
-    cameras = {
-        str(n): {"params": np.array(c.params), "focal_px": c.mean_focal_length(), "sigma": 0.01}
-        for n, c in model.cameras.items()
-    }
-    nothing = Attitudes((), np.zeros((0, 3, 3)), np.zeros(0))
+    lenses = {int(n): lens_of(c) for n, c in model.cameras.items()}
+    sigmas = {n: values_of(LENS, f=0.01 * values[0], k1=0.1) for n, values in lenses.items()}
+    known = given_positions(given, np.full(count, 0.02))
     off = {}
     for name in ("all", "part"):
         own = copy.deepcopy(model)
         used = own if name == "all" else thinned(own)
         assert used is not None
-        adjust_in_place(pycolmap, used, cameras, given, np.full(count, 0.02), nothing, 1e-6)
+        work = Work(pycolmap, lenses, sigmas, frozenset(), Options(1e-6, final=True))
+        work.start(own)
+        work.start(used)
+        adjust_in_place(work, used, known, ())
         if name == "part":
             assert used.num_points3D() < 0.5 * own.num_points3D()
             take_poses(own, used)

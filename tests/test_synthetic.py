@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from make_scenes import NOON_WEST, make_scene, make_truth, make_view, one_box
 
+from aeromatch_cli.blocks.exif import read_exif
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError
-from aeromatch_cli.geometry.cameras import MODELS, corner_params
+from aeromatch_cli.geometry.cameras import MODELS, corner_params, project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.synthetic import Truth, load_truth, render_block, transfer
+from aeromatch_cli.synthetic.receivers import gps_errors_m, rtk_errors_m
 from aeromatch_cli.synthetic.render import render_image
 from aeromatch_cli.synthetic.sensor import Development
 from aeromatch_cli.synthetic.shade import Stage
@@ -299,7 +301,7 @@ def test_equal_seeds_give_equal_bytes_and_other_seeds_other_scenes(
     scenes_built_once()  # or this process would not build the scene a second time
     render_block(tmp_path / "again", "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=3, jobs=2)
     written = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
-    assert len(written) == 3 + 3 * 3 + 6
+    assert len(written) == 3 + 3 * 3 + 8
     for path in written:
         assert (folder / path).read_bytes() == (tmp_path / "again" / path).read_bytes(), path
     render_block(tmp_path / "other", "suburb", seed=4, width_px=WIDTH, height_px=HEIGHT, images=1)
@@ -366,3 +368,76 @@ def test_truth_that_cannot_be_trusted_is_refused(folder: Path, truth: Truth, tmp
         load_truth(tmp_path)
     with pytest.raises(ConfigError, match=r"'x\.jpg' is no image"):
         truth.transfer("x.jpg", np.zeros((1, 2)), "suburb_0001.jpg")
+
+
+@pytest.fixture(scope="module")
+def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real lens and a rolling shutter: 40 ms at 25 m/s are 1 m, 2 px of 0.5 m, on strips along y."""
+    out = tmp_path_factory.mktemp("rolling") / "block"
+    render_block(
+        out, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=2, lens="REAL", readout_ms=40.0, speed_m_s=25.0
+    )
+    return out
+
+
+def test_every_row_shows_what_its_own_projection_centre_sees(rolling: Path) -> None:
+    truth = load_truth(rolling)
+    shutter = json.loads((rolling / "truth.json").read_text())["rolling_shutter"]
+    assert (shutter["readout_s"], shutter["speed_m_s"]) == (0.04, 25.0)
+    camera, pixels = next(iter(truth.cameras.values())), pixel_grid(3)
+    for name, pose in truth.poses.items():
+        velocity = np.array(shutter["velocities_m_s"][name])
+        np.testing.assert_allclose(velocity, [0.0, 25.0, 0.0], atol=1e-9)  # the first strip flies north
+        assert pose.world_rotation is not None
+        surface = truth.surface_points(name, pixels)
+        seconds = (pixels[:, 1] / (HEIGHT - 1) - 0.5) * 0.04
+        still = surface - seconds[:, None] * velocity  # as a camera at rest would see it
+        np.testing.assert_allclose(project(camera, pose.world_rotation, pose.center_m, still), pixels, atol=1e-6)
+        np.testing.assert_allclose(truth.project(name, surface), pixels, atol=1e-6)
+        # What was rendered lies there too: depths along the axis from each row's own centre.
+        stored = truth.depth_m(name)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        depth = ((still - pose.center_m) @ pose.world_rotation.T)[:, 2]
+        np.testing.assert_allclose(stored, depth, rtol=1e-6)
+        # Without the shutter's motion places are off by up to half of what it moved.
+        off = project(camera, pose.world_rotation, pose.center_m, surface) - pixels
+        assert np.abs(off).max() == pytest.approx(0.5 * 1.0 / (110.0 / (0.9 * WIDTH)), rel=0.3)
+
+
+def test_a_rolling_shutter_transfers_to_where_the_other_image_shows_the_point(rolling: Path) -> None:
+    truth = load_truth(rolling)
+    name0, name1 = truth.poses
+    pixels = pixel_grid(4)
+    places, hidden = truth.transfer(name0, pixels, name1)
+    assert 0.5 < (~hidden).mean() < 0.9
+    back = truth.surface_points(name1, places[~hidden])
+    apart_m = np.linalg.norm(back - truth.surface_points(name0, pixels)[~hidden], axis=1)
+    assert np.quantile(apart_m, 0.98) < 1e-5
+
+
+def test_real_lenses_are_exact_in_block_json_and_exif_knows_their_focal_length_alone(rolling: Path) -> None:
+    lens = json.loads((rolling / "block.json").read_text())["cameras"]["1"]
+    assert lens["model"] == "BROWN"
+    f, cx, cy, *distortion = lens["params"]
+    assert abs(cx - 0.5 * WIDTH) <= 0.02 * WIDTH
+    assert abs(cy - 0.5 * HEIGHT) <= 0.02 * WIDTH
+    assert all(value != 0.0 for value in distortion)
+    for picture in sorted((rolling / "images").iterdir()):
+        header = read_exif(picture)
+        assert (header.make, header.model) == ("aeromatch", "rendered 1")
+        assert header.focal_35mm_mm == pytest.approx(f / np.hypot(WIDTH, HEIGHT) * 43.267, abs=0.51)
+    assert cv2.imread(str(picture)).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_receivers_positions_have_the_sigmas_that_they_state(rolling: Path) -> None:
+    exact = np.array([[float(row[k]) for k in "xyz"] for row in rows(rolling / "poses.csv")])
+    for kind, sigma_xy_m, sigma_z_m in (("rtk", 0.02, 0.03), ("gps", 5.099, 5.099)):
+        table = rows(rolling / f"poses_{kind}.csv")
+        assert list(table[0]) == ["image", "x", "y", "z", "sigma_x_m", "sigma_y_m", "sigma_z_m", "camera"]
+        assert [float(table[0][f"sigma_{k}_m"]) for k in "xyz"] == [sigma_xy_m, sigma_xy_m, sigma_z_m]
+        off_m = np.array([[float(row[k]) for k in "xyz"] for row in table]) - exact
+        assert 0.0 < np.abs(off_m).max() < 4.0 * sigma_z_m
+    many = np.random.default_rng(0)
+    np.testing.assert_allclose(rtk_errors_m(4000, many).std(axis=0), [0.02, 0.02, 0.03], rtol=0.05)
+    drift_m = np.array([gps_errors_m(20, many) for _ in range(400)])
+    np.testing.assert_allclose(drift_m.std(axis=(0, 1)), 5.1, rtol=0.1)
+    np.testing.assert_allclose(np.diff(drift_m, n=2, axis=1).std(axis=(0, 1)), np.sqrt(6.0), rtol=0.1)  # 1 m each

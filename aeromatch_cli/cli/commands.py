@@ -32,7 +32,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
 }
 # Written out: the modules that know them are too heavy for --help. A test compares.
 _SCENES = "city, suburb, farmland, grass, desert, hills, water-edge"
-_FLIGHTS = "nadir, oblique, sweep, orbit, arc, two-flights, mixed"
+_FLIGHTS = "nadir, oblique, sweep, orbit, arc, two-flights, mixed, cross, two-heights, tilted, dense-rig"
 
 
 def evaluate(
@@ -93,9 +93,7 @@ def synth(
     ] = None,
     lens: Annotated[
         str,
-        typer.Option(
-            "--lens", metavar="MODEL", help="Camera model: PINHOLE, RADIAL, OPENCV, BROWN, OPENCV_FISHEYE ..."
-        ),
+        typer.Option("--lens", metavar="MODEL", help="Camera model: PINHOLE, RADIAL, OPENCV, BROWN, ..., or real."),
     ] = "SIMPLE_RADIAL",
     sun: Annotated[
         str | None, typer.Option("--sun", metavar="AZIMUTH,ELEVATION", help="Sun of the first flight, degrees.")
@@ -104,6 +102,12 @@ def synth(
         Path | None,
         typer.Option("--texture", metavar="DIR", help="Folder of pictures that become the ground's texture."),
     ] = None,
+    readout_ms: Annotated[
+        float, typer.Option("--readout-ms", min=0.0, help="Rolling shutter: from the first row to the last, ms.")
+    ] = 0.0,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="M_PER_S", min=0.0, help="Of the aircraft while the rows are read.")
+    ] = 0.0,
     jobs: Jobs = None,
     log_file: LogFile = None,
     json_: Json = False,
@@ -118,8 +122,8 @@ def synth(
         width_px, height_px = _parse_size(size)
         summary = render_block(
             out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images, flight=flight,
-            lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture, jobs=jobs or 0,
-            progress=progress_shown(quiet),
+            lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture,
+            readout_ms=readout_ms, speed_m_s=speed, jobs=jobs or 0, progress=progress_shown(quiet),
         )  # fmt: skip
         return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), as_texts(asdict(summary)))
 

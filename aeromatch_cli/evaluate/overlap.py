@@ -11,7 +11,6 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
 from aeromatch_cli.evaluate.texture import Texture, read_texture
-from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.footprints import view_angles_deg
 from aeromatch_cli.recent import recent
 
@@ -34,6 +33,10 @@ class Sight(Protocol):
 
     def surface_points(self, image: str, points_px: FloatArray) -> FloatArray:
         """World points (N, 3) shown at stored pixels (N, 2), NaN for none."""
+        ...
+
+    def project(self, image: str, points_m: FloatArray) -> FloatArray:
+        """Stored pixels (N, 2) of world points (N, 3), NaN where an image has none for them."""
         ...
 
     def unblocked(self, image: str, points_m: FloatArray) -> BoolArray:
@@ -65,9 +68,7 @@ class _Seen:
 
 def place_on(sight: Sight, image: str, points_m: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Stored pixels (N, 2) of world points (N, 3), and whether (N,) they lie on the image; NaN points do not."""
-    camera, pose = sight.cameras[image], sight.poses[image]
-    assert pose.world_rotation is not None
-    places = project(camera, pose.world_rotation, pose.center_m, points_m)
+    camera, places = sight.cameras[image], sight.project(image, points_m)
     last = np.array([camera.width_px, camera.height_px]) - 0.5
     with np.errstate(invalid="ignore"):
         return places, np.asarray(((places >= -0.5) & (places <= last)).all(axis=1))

@@ -21,7 +21,7 @@ from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.evaluate.metrics import coverage, pose_error_deg, thin
 from aeromatch_cli.evaluate.overlap import OverlapFinder
 from aeromatch_cli.evaluate.scores import CORRECT_PX, WITHIN_PX, Conditions, PairScore
-from aeromatch_cli.geometry.cameras import undistort, world_rays
+from aeromatch_cli.geometry.cameras import project, undistort, world_rays
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, symmetric_distance_px
 from aeromatch_cli.geometry.footprints import MAX_DISTANCE_FACTOR
 
@@ -46,6 +46,11 @@ class PlaneSight:
         points_m = pose.center_m + np.where(far | (distance < 0), np.nan, distance)[:, None] * rays
         points_m[:, 2] = np.where(np.isnan(points_m[:, 0]), np.nan, self.ground_z_m)
         return points_m
+
+    def project(self, image: str, points_m: FloatArray) -> FloatArray:
+        pose = self.poses[image]
+        assert pose.world_rotation is not None
+        return project(self.cameras[image], pose.world_rotation, pose.center_m, points_m)
 
     def unblocked(self, image: str, points_m: FloatArray) -> BoolArray:
         """Nothing stands on a plane."""

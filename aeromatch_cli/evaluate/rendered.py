@@ -44,6 +44,9 @@ class _RenderedSight:
     def surface_points(self, image: str, points_px: FloatArray) -> FloatArray:
         return self.truth.surface_points(image, points_px)
 
+    def project(self, image: str, points_m: FloatArray) -> FloatArray:
+        return self.truth.project(image, points_m)
+
     def unblocked(self, image: str, points_m: FloatArray) -> BoolArray:
         return self.truth.in_open_view(image, points_m)
 

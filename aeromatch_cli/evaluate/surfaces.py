@@ -26,19 +26,19 @@ _FOOTPRINTS = 3.0
 
 
 def view(truth: Truth, image: str, points_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions (N, 3) in the world with depth 1, NaN where the lens has no ray, and the projection centre (3,)."""
+    """Directions (N, 3) in the world with depth 1, NaN where the lens has no ray, and projection centres (N, 3)."""
     pose = truth.poses[image]
     assert pose.world_rotation is not None
     uv = normalise(truth.cameras[image], points_px)
-    return np.column_stack([uv, np.ones(len(uv))]) @ pose.world_rotation, pose.center_m
+    return np.column_stack([uv, np.ones(len(uv))]) @ pose.world_rotation, truth.centers_m(image, points_px)
 
 
-def first_hits(truth: Truth, center_m: FloatArray, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+def first_hits(truth: Truth, centers_m: FloatArray, directions: FloatArray) -> tuple[IntArray, FloatArray]:
     """Triangle index (N,), -1 for none, and distance (N,) in units of the direction, infinite for none."""
     triangle_idx, distances = np.full(len(directions), -1), np.full(len(directions), np.inf)
     usable = np.flatnonzero(np.isfinite(directions).all(axis=1))
     if len(usable):
-        hits = truth.caster.first_hits(center_m, directions[usable])
+        hits = truth.caster.first_hits(centers_m[usable], directions[usable])
         triangle_idx[usable], distances[usable] = hits.triangle_idx, hits.distances
     return triangle_idx, distances
 
@@ -64,8 +64,9 @@ def surfaces(truth: Truth, image: str, points_px: FloatArray) -> Surfaces:
     """
     count, rays = len(points_px), len(_RING_PX)
     around = (np.asarray(points_px, dtype=np.float64)[:, None] + _RING_PX).reshape(-1, 2)
-    directions, center_m = view(truth, image, around)
-    hits = first_hits(truth, center_m, directions)
+    directions, centers_m = view(truth, image, around)
+    hits = first_hits(truth, centers_m, directions)
+    centers_m = centers_m.reshape(count, rays, 3)
     triangle_idx, depth_m = hits[0].reshape(count, rays), hits[1].reshape(count, rays)
     exact = directions.reshape(count, rays, 3)[:, 0]
     has_ray = np.asarray(np.isfinite(exact).all(axis=1))
@@ -76,11 +77,11 @@ def surfaces(truth: Truth, image: str, points_px: FloatArray) -> Surfaces:
     met_m, met_idx = depth_m[k, ring], triangle_idx[k, ring]
     normals, corners_m = truth.scene.normals[met_idx], truth.scene.triangles_m[met_idx, 0]
     along = (normals * exact[k]).sum(axis=1)
-    height = (normals * (corners_m - center_m)).sum(axis=1)
+    height = (normals * (corners_m - centers_m[k, 0])).sum(axis=1)
     extended_m = np.divide(height, along, out=np.full(len(k), np.inf), where=np.abs(along) > 1e-9)
     footprint_m = met_m / focal_px(truth.cameras[image])
     reached_m = np.where(np.abs(extended_m - met_m) <= _FOOTPRINTS * footprint_m, extended_m, met_m)
     meant_m, seen_m = np.full((2, count, rays, 3), np.nan)
-    meant_m[k, ring] = center_m + reached_m[:, None] * exact[k]
-    seen_m[k, ring] = center_m + met_m[:, None] * directions.reshape(count, rays, 3)[k, ring]
+    meant_m[k, ring] = centers_m[k, 0] + reached_m[:, None] * exact[k]
+    seen_m[k, ring] = centers_m[k, ring] + met_m[:, None] * directions.reshape(count, rays, 3)[k, ring]
     return Surfaces(meant_m, seen_m)

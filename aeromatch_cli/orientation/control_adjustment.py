@@ -17,13 +17,14 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.adjusting import Outcome, Work, take_outcome
 from aeromatch_cli.orientation.bundle.adjust import adjust
 from aeromatch_cli.orientation.bundle.network import Network, Unknowns
+from aeromatch_cli.orientation.bundle.normal_equations import cost
 from aeromatch_cli.orientation.bundle.solve import solve
 
 # Standard deviation of what the positions of a flight have in common, metres: from one geoid or datum to another.
 _DATUM_M = 100.0
-# A control point is wrong where the others, without it, put it farther away than so many times what they put each
-# other, and than so many of its standard deviations.
-_WRONG_RATIO, _WRONG_SIGMAS = 5.0, 5.0
+# Control points contradict each other where they raise the sum of squares by more than so many times what chance does;
+# one of them is wrong where that falls by this factor without it, and does not without any other one.
+_CONTRADICTING, _TOLD = 4.0, 3.0
 # So many points tell a wrong one.
 _TELLING = 4
 # An adjustment that starts from the solution of nearly the same network ends when a step lowers the cost by less.
@@ -76,16 +77,14 @@ def with_control(
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
-    solved = base.adjusted(work, used)
-    errors_m = _left_out(solved, used)
-    while len(used) >= _TELLING:
-        worst = _worst(used, errors_m)
+    while True:
+        solved = base.adjusted(work, used)
+        rests = [solved.without([other for other in used if other is not point]) for point in used]
+        worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
         if worst is None:
             break
-        wrong.append(used[worst].name)
-        used = [point for k, point in enumerate(used) if k != worst]
-        solved = base.adjusted(work, used)
-        errors_m = _left_out(solved, used)
+        wrong.append(used.pop(worst).name)
+    errors_m = np.array([rest.error_m(point) for rest, point in zip(rests, used, strict=True)]).reshape(-1, 3)
     held_out = checks or (used if len(used) > 1 else [])
     held_out_m = np.array([solved.error_m(point) for point in checks]) if checks else errors_m
     before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
@@ -113,6 +112,10 @@ class _Block:
     network: Network
     state: Unknowns
     outcome: Outcome
+
+    @property
+    def solution(self) -> tuple[Network, Unknowns]:
+        return self.network, self.state
 
     def with_points(self, points: Sequence[Surveyed]) -> tuple[Network, Unknowns]:
         """The network of tie points with these control points instead of what it has."""
@@ -180,21 +183,16 @@ class _Block:
         return replace(self, network=network, state=solve(network, state, _TOLERANCE).state)
 
 
-def _left_out(block: _Block, used: Sequence[Surveyed]) -> FloatArray:
-    """(Q, 3) errors of each control point in the block that was adjusted to the others."""
-    rests = ([other for other in used if other is not point] for point in used)
-    return np.array([block.without(rest).error_m(point) for rest, point in zip(rests, used, strict=True)]).reshape(
-        -1, 3
-    )
-
-
-def _worst(used: Sequence[Surveyed], errors_m: FloatArray) -> int | None:
-    """The control point that the others contradict, None where there is none."""
-    off = np.linalg.norm(errors_m, axis=1)
-    sigmas = off / np.array([np.linalg.norm(point.sigmas_m) for point in used])
-    worst = int(np.argmax(off))
-    usual = float(np.median(np.delete(off, worst)))
-    return worst if off[worst] > _WRONG_RATIO * usual and sigmas[worst] > _WRONG_SIGMAS else None
+def _worst(block: _Block, rests: Sequence[_Block], count: int) -> int | None:
+    """The control point that the others contradict, None where there is none. rests: the block without each of them."""
+    free = cost(*block.without([]).solution)
+    squares = [2.0 * (cost(*one.solution) - free) for one in (block, *rests)]
+    # Of three coordinates each, less the seven of a similarity that images and positions may leave open.
+    expected = max(3.0 * count - 7.0, 1.0), max(3.0 * (count - 1) - 7.0, 1.0)
+    best, second = np.argsort(squares[1:])[:2] + 1
+    contradicting = squares[0] > _CONTRADICTING * expected[0]
+    limit = _TOLD * max(squares[best], expected[1])
+    return int(best) - 1 if contradicting and squares[0] > limit and squares[second] > limit else None
 
 
 def _exchanged(base: _Block, control: Sequence[Surveyed]) -> list[str]:

@@ -88,7 +88,7 @@ def refine(folder: Path) -> None:
         model = _posed(work, folder, set(group["images"]))
         for number in held:
             set_lens(pycolmap, model.cameras[number], work.lenses[number], number in work.fisheyes)
-        model = _triangulated(pycolmap, model, folder, rough=_found(group["kind"]) and free)
+        model = _triangulated(pycolmap, model, folder, rough=free)
         if free and group["kind"] != "given":
             parts = connected_parts(model)
             if not parts:
@@ -212,7 +212,8 @@ def _refined(
         else:
             outcome = adjusted(work, moved, given, held)
         settled = state_errors(work, moved, given) > (1.0 - _WORTH_AGAIN) * before
-        settled = (settled and not (number == 0 and _found(kind))) or number == _MAX_ROUNDS - 1
+        # The first points may be far off; after the last round nothing follows.
+        settled = (settled and number > 0) or number == _MAX_ROUNDS - 1
         if settled and surveyed:
             outcome, control = with_control(work, moved, outcome, surveyed)
         if settled and thin is None:
@@ -223,11 +224,6 @@ def _refined(
         if settled:
             break
     return model, outcome, control
-
-
-def _found(kind: str) -> bool:
-    """Whether the poses of a group come from the first pass, and are less exact than matches of the final one."""
-    return kind != "given"
 
 
 def _posed(work: Work, folder: Path, numbers: set[int]) -> Any:

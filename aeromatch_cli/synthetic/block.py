@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,10 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import AeromatchError, ConfigError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
 from aeromatch_cli.geometry.cameras import resized
-from aeromatch_cli.synthetic import flights, presets, write
+from aeromatch_cli.synthetic import flights, presets, receivers, write
 from aeromatch_cli.synthetic.flights import Flight
 from aeromatch_cli.synthetic.imagery import GroundImagery, load_imagery
+from aeromatch_cli.synthetic.lenses import REAL
 from aeromatch_cli.synthetic.light import Light
 from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.synthetic.raycast import RayCaster
@@ -38,7 +39,7 @@ _LARGEST_AREA_KM2 = 3.0
 _LARGEST_SEED = 2**31 - 1
 _TEXTURE_GSD_M = 0.08
 _METER_PX, _METERED = 64, 3
-_FLIGHT_STREAM, _POSE_NOISE_STREAM = 103, 104
+_FLIGHT_STREAM, _POSE_NOISE_STREAM, _RECEIVER_STREAM = 103, 104, 105
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,20 @@ class _SceneKey:
     texture: str
 
 
+@dataclass(frozen=True)
+class _Taking:
+    """What all pictures of a block have in common. header: whether their files state the focal length."""
+
+    header: bool
+    readout_s: float
+    speed_m_s: float
+
+    def sweep_m(self, station: Station) -> FloatArray | None:
+        """As `View` has it."""
+        moved: FloatArray = self.readout_s * station.velocity_m_s(self.speed_m_s)
+        return moved if moved.any() else None
+
+
 @dataclass(frozen=True, eq=False)
 class _Shot:
     """One picture to take. moment: its number in the block."""
@@ -79,6 +94,7 @@ class _Shot:
     station: Station
     moment: int
     settings: Development
+    taking: _Taking
 
 
 def render_block(
@@ -94,18 +110,26 @@ def render_block(
     height_m: float | None = None,
     sun_deg: tuple[float, float] | None = None,
     texture: Path | None = None,
+    readout_ms: float = 0.0,
+    speed_m_s: float = 0.0,
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> SynthSummary:
     """Render a block into the folder `out`; equal arguments give equal files, byte for byte, whatever the jobs.
 
-    flight: one of flight_plans.FLIGHTS. lens: one of geometry.cameras.MODELS. height_m: flying height above the datum
-    instead of the preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture:
-    folder of pictures to lay over the ground. An interrupted call goes on where it was. Raises ConfigError on an
-    unknown name, an impossible size or number, or a folder that holds another block; WorkspaceError where `out` cannot
-    be written.
+    flight: one of flight_plans.FLIGHTS. lens: one of geometry.cameras.MODELS, or lenses.REAL for one of the seed's for
+    each camera, whose pictures state its focal length in EXIF. height_m: flying height above the datum instead of the
+    preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture: folder of
+    pictures to lay over the ground. readout_ms, speed_m_s: of a rolling shutter, from the first row to the last, while
+    the aircraft flies along; poses are those of the middle of a picture. An interrupted call goes on where it was.
+    Raises ConfigError on an unknown name, an impossible size or number, or a folder that holds another block;
+    WorkspaceError where `out` cannot be written.
     """
     started = time.monotonic()
+    if not (0.0 <= readout_ms <= 1000.0 and 0.0 <= speed_m_s <= 100.0):
+        raise ConfigError(
+            f"a rolling shutter reads for 0 to 1000 ms at 0 to 100 m/s, got {readout_ms:g} ms at {speed_m_s:g} m/s"
+        )
     chosen = _checked(preset, seed, width_px, height_px, height_m, sun_deg)
     planned = flights.plan_flight(
         flight, images=images, width_px=width_px, height_px=height_px, height_m=height_m or chosen.height_m, lens=lens,
@@ -116,9 +140,18 @@ def render_block(
     if sun_deg is not None:
         lights = (Light(*sun_deg, lights[0].haze_per_km, lights[0].sky, lights[0].season), lights[1])
     key = _SceneKey(chosen.scene, seed, _area(planned, lights), str(texture or ""))
-    shots = _shots(out, names, key, lights, planned)
+    shots = _shots(out, names, key, lights, planned, _Taking(lens == REAL, 1e-3 * readout_ms, speed_m_s))
     scene = _scene(key).scene
     facts = _truth_facts(preset, scene, planned, lights, names, shots)
+    if readout_ms > 0.0:
+        facts["rolling_shutter"] = {
+            "readout_s": 1e-3 * readout_ms,
+            "speed_m_s": speed_m_s,
+            "velocities_m_s": {
+                name: station.velocity_m_s(speed_m_s).tolist()
+                for name, station in zip(names, planned.stations, strict=True)
+            },
+        }
     try:
         write.prepare(out, names, facts)
         heights_m = _take_all(shots, jobs, progress)
@@ -185,7 +218,12 @@ def _stage(key: _SceneKey, light: Light) -> Stage:
 
 
 def _shots(
-    out: Path, names: tuple[str, ...], key: _SceneKey, lights: tuple[Light, Light], flight: Flight
+    out: Path,
+    names: tuple[str, ...],
+    key: _SceneKey,
+    lights: tuple[Light, Light],
+    flight: Flight,
+    taking: _Taking,
 ) -> list[_Shot]:
     metered = {
         sortie: _metered(key, lights[sortie], flight, [s for s in flight.stations if s.sortie == sortie])
@@ -194,7 +232,7 @@ def _shots(
     return [
         _Shot(
             out, name, key, lights[station.sortie], flight, station, i,
-            presets.development(key.seed, i, station.sortie, metered[station.sortie]),
+            presets.development(key.seed, i, station.sortie, metered[station.sortie]), taking,
         )
         for i, (name, station) in enumerate(zip(names, flight.stations, strict=True))
     ]  # fmt: skip
@@ -233,14 +271,20 @@ def _take(shot: _Shot) -> FloatArray:
     scene = _scene(shot.key).scene
     if (shot.out / "images" / shot.name).is_file():  # written last, whole or not at all
         return _heights(scene, read_raster(write.surface_path(shot.out, shot.name)))
-    view = _view(shot.flight, shot.station, shot.moment)
+    view = replace(_view(shot.flight, shot.station, shot.moment), sweep_m=shot.taking.sweep_m(shot.station))
     rng = presets.image_rng(shot.key.seed, shot.moment)
     rendered = render_image(_stage(shot.key, shot.light), view, shot.settings, rng)
     try:
-        write.write_rendered(shot.out, shot.name, rendered, shot.settings.jpeg_quality)
+        write.write_rendered(shot.out, shot.name, rendered, shot.settings.jpeg_quality, partial(_headed, shot))
     except OSError as error:
         raise _unwritable(shot.out, error) from error
     return _heights(scene, rendered.surface)
+
+
+def _headed(shot: _Shot, jpeg: bytes) -> bytes:
+    """Pictures of real lenses say what real ones do."""
+    camera_id = shot.station.camera_id
+    return write.with_focal_length(jpeg, shot.flight.cameras[camera_id], camera_id) if shot.taking.header else jpeg
 
 
 def _heights(scene: Scene, surface: NDArray[np.uint32]) -> FloatArray:
@@ -257,6 +301,14 @@ def _write_tables(out: Path, names: tuple[str, ...], flight: Flight, seed: int, 
     cameras = tuple(station.camera_id for station in flight.stations)
     write.write_file(out / "poses.csv", write.pose_table(names, exact, cameras))
     write.write_file(out / "poses_noisy.csv", write.pose_table(names, noisy, cameras))
+    centers_m = np.array([[e.x_m, e.y_m, e.z_m] for e in exact])
+    rng = np.random.default_rng([seed, _RECEIVER_STREAM])
+    for kind, errors_m, sigmas_m in (
+        ("rtk", receivers.rtk_errors_m(len(exact), rng), receivers.RTK_M),
+        ("gps", receivers.gps_errors_m(len(exact), rng), receivers.GPS_M),
+    ):
+        table = write.position_table(names, centers_m + errors_m, sigmas_m, cameras)
+        write.write_file(out / f"poses_{kind}.csv", table)
     write.write_file(out / "block.json", write.json_bytes(write.block_facts(flight, names, heights_m)))
 
 

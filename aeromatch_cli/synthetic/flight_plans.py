@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
+from aeromatch_cli.synthetic.lenses import REAL, real_lens
 from aeromatch_cli.synthetic.stations import Exterior, Station, exterior_of, make_camera
 
 FORWARD_OVERLAP, SIDE_OVERLAP = 0.70, 0.60
@@ -62,6 +63,9 @@ class Order:
     rng: np.random.Generator
 
     def camera(self, focal_share: float) -> Camera:
+        """Of that many picture widths; a real lens is another one with each call."""
+        if self.lens == REAL:
+            return real_lens(self.rng, self.width_px, self.height_px, focal_share)
         return make_camera(self.lens, self.width_px, self.height_px, focal_share)
 
     def rig(self) -> dict[str, Camera]:
@@ -148,7 +152,9 @@ def _plan_nadir(order: Order) -> _Planned:
 
 
 def _nadir_station(order: Order, spot: _Spot, height_m: float, sortie: int) -> Station:
-    return Station(_shot(spot, height_m, np.eye(3), order.rng.standard_normal(6)), _NADIR_ID, sortie, height_m)
+    return Station(
+        _shot(spot, height_m, np.eye(3), order.rng.standard_normal(6)), _NADIR_ID, sortie, height_m, spot.heading_deg
+    )
 
 
 def _plan_cross(order: Order) -> _Planned:
@@ -178,7 +184,7 @@ def _plan_tilted(order: Order) -> _Planned:
     stations = [_nadir_station(order, spot, order.height_m, 0) for spot in nadir]
     for spot in _nadir_strips(replace(order, images=order.images - along), order.height_m, _ACROSS_DEG):
         exterior = _shot(spot, order.height_m, _look(0.0, _TILTED_DEG), order.rng.standard_normal(6))
-        stations.append(Station(exterior, _NADIR_ID, 0, order.height_m))
+        stations.append(Station(exterior, _NADIR_ID, 0, order.height_m, spot.heading_deg))
     return {_NADIR_ID: order.camera(_NADIR_FOCAL)}, stations
 
 
@@ -187,18 +193,21 @@ def _plan_oblique(order: Order) -> _Planned:
 
 
 def _plan_dense_rig(order: Order) -> _Planned:
-    return _plan_rig(order, FORWARD_OVERLAP, SIDE_OVERLAP)
+    """Two strips at least: positions along one line leave the turn about it open."""
+    return _plan_rig(order, FORWARD_OVERLAP, SIDE_OVERLAP, fewest_strips=2)
 
 
-def _plan_rig(order: Order, forward_overlap: float, side_overlap: float) -> _Planned:
+def _plan_rig(order: Order, forward_overlap: float, side_overlap: float, fewest_strips: int = 1) -> _Planned:
     """Few strips and long ones: forward and back pictures meet two flying heights apart on the same strip."""
     cameras = order.rig()
     count = -(-order.images // len(cameras))
-    strips = max(1, round(float(np.sqrt(count / 3.0))))
+    strips = max(fewest_strips, round(float(np.sqrt(count / 3.0))))
     stations = []
     for spot in _strips(count, strips, *order.steps_m(forward_overlap, side_overlap)):
         wobble = order.rng.standard_normal(6)
-        stations += [Station(_shot(spot, order.height_m, _mount(c), wobble), c, 0, order.height_m) for c in cameras]
+        for camera_id in cameras:
+            exterior = _shot(spot, order.height_m, _mount(camera_id), wobble)
+            stations.append(Station(exterior, camera_id, 0, order.height_m, spot.heading_deg))
     return cameras, stations[: order.images]
 
 
@@ -220,7 +229,7 @@ def _plan_sweep(order: Order) -> _Planned:
 def _sweep_station(order: Order, spot: _Spot, height_m: float, angle_deg: float, sortie: int) -> Station:
     wobble = _SWEEP_STEADINESS * order.rng.standard_normal(6)
     # Rolled to look to the right by the angle: the top of the picture stays ahead.
-    return Station(_shot(spot, height_m, rotation_y(-angle_deg), wobble), _SWEEP_ID, sortie, height_m)
+    return Station(_shot(spot, height_m, rotation_y(-angle_deg), wobble), _SWEEP_ID, sortie, height_m, spot.heading_deg)
 
 
 def _plan_orbit(order: Order) -> _Planned:
@@ -249,7 +258,9 @@ def _around_the_middle(order: Order, headings_deg: Sequence[float], tilts_deg: S
         direction = float(np.rad2deg(np.arctan2(aim[0], aim[1])))
         tilted = float(np.rad2deg(np.arctan2(np.hypot(aim[0], aim[1]), -aim[2])))
         photo = _look(direction, tilted) @ rotation_z(_ORBIT_ROLL_SIGMA_DEG * wobble[5])
-        stations.append(Station(exterior_of(position, photo), "2", 0, height_m))
+        stations.append(
+            Station(exterior_of(position, photo), "2", 0, height_m, heading_deg + 90.0)
+        )  # around the middle
     return {"2": order.camera(_OBLIQUE_FOCAL)}, stations
 
 
@@ -295,7 +306,7 @@ def _mixed_round(order: Order, number: int) -> Iterator[Station]:
             away_m, look = (1.0 + 0.1 * ahead) * order.height_m, np.deg2rad(RIG_LOOKS_DEG[camera_id])
             spot = _mixed_spot(order, number, sortie, -away_m * float(np.sin(look)), -away_m * float(np.cos(look)))
             exterior = _shot(spot, height_m, _mount(camera_id), order.rng.standard_normal(6))
-            yield Station(exterior, camera_id, sortie, height_m)
+            yield Station(exterior, camera_id, sortie, height_m, spot.heading_deg)
             spot = _mixed_spot(order, number, sortie, -side * sweep_foot_m, 0.5 * ahead * advance_m)
             yield _sweep_station(order, spot, sweep_m, side * _MIXED_SWEEP_DEG, sortie)
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from aeromatch_cli.blocks.cameras import FULL_FRAME_DIAGONAL_MM
 from aeromatch_cli.data import Camera
-from aeromatch_cli.geometry.cameras import BROWN, MODELS
+from aeromatch_cli.geometry.cameras import BROWN, MODELS, focal_px
 
+# In the place of a lens model's name.
+REAL = "REAL"
 # Another copy of a lens has another focal length, by up to this share.
 _FOCAL_SPREAD = 0.03
 # Principal point: standard deviation and largest distance from the middle in each axis, as shares of the width.
@@ -22,7 +25,7 @@ _AFFINITY_MOST = 3e-4
 def real_lens(rng: np.random.Generator, width_px: int, height_px: int, focal_share: float = 0.9) -> Camera:
     """A lens of about focal_share picture widths, drawn at random; one-to-one over the picture and beyond.
 
-    Source of the ranges: self-calibrations of consumer drones, docs/results/calibration.md.
+    The ranges are set by hand to cover lenses of drones; they are no statistics of real ones.
     """
     focal = focal_share * width_px * (1.0 + rng.uniform(-_FOCAL_SPREAD, _FOCAL_SPREAD))
     off_px = width_px * np.clip(_CENTRE_SIGMA * rng.standard_normal(2), -_CENTRE_MOST, _CENTRE_MOST)
@@ -35,6 +38,11 @@ def real_lens(rng: np.random.Generator, width_px: int, height_px: int, focal_sha
         "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "b1": b1, "b2": b2,
     }  # fmt: skip
     return Camera(BROWN, width_px, height_px, tuple(float(values[name]) for name in MODELS[BROWN]))
+
+
+def focal_35mm(camera: Camera) -> int:
+    """The 35-mm equivalent as EXIF states it: in whole millimetres, over the diagonal."""
+    return round(focal_px(camera) / float(np.hypot(camera.width_px, camera.height_px)) * FULL_FRAME_DIAGONAL_MM)
 
 
 def _radial(rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -33,9 +33,12 @@ class RayCaster:
         TriangleMesh(self._embree, np.ascontiguousarray(scene.triangles_m, dtype=np.float32))
 
     def rough_hits(self, origin_m: FloatArray, directions: FloatArray) -> Hits:
-        """First surface of each ray from one place (3,) along directions (N, 3); distances float32, good to 0.1 mm."""
+        """First surface of each ray from one place (3,), or from one each (N, 3), along directions (N, 3).
+
+        Distances are float32, good to 0.1 mm.
+        """
         found = self._embree.run(
-            np.tile(np.asarray(origin_m, dtype=np.float32), (len(directions), 1)),
+            np.ascontiguousarray(np.broadcast_to(np.asarray(origin_m, dtype=np.float32), directions.shape)),
             np.ascontiguousarray(directions, dtype=np.float32),
             query="INTERSECT",
             output=1,
@@ -44,16 +47,17 @@ class RayCaster:
         return Hits(triangle_idx, np.where(triangle_idx >= 0, np.asarray(found["tfar"]), np.float32(np.inf)))
 
     def first_hits(self, origin_m: FloatArray, directions: FloatArray) -> Hits:
-        """First surface of each ray from one place (3,) along directions (N, 3) float64, any length.
+        """First surface of each ray from one place (3,), or from one each (N, 3), along directions (N, 3).
 
-        Exact to rounding: embree's float32 distance only chooses the triangle; the ray then meets its plane in float64.
+        Directions may have any length. Exact to rounding: embree's float32 distance only chooses the triangle; the ray
+        then meets its plane in float64.
         """
         rough = self.rough_hits(origin_m, directions)
         triangle_idx = rough.triangle_idx
         hit = triangle_idx >= 0
         normals = self._scene.normals[triangle_idx]
         along = np.einsum("ij,ij->i", normals, directions)
-        height = self._offsets[triangle_idx] - normals @ origin_m
+        height = self._offsets[triangle_idx] - np.einsum("ij,ij->i", normals, np.broadcast_to(origin_m, normals.shape))
         # A ray that grazes its triangle has no stable plane intersection; embree's own distance is the better one.
         steep = np.abs(along) > 1e-6 * np.linalg.norm(directions, axis=1)
         exact = np.divide(height, along, out=rough.distances.astype(np.float64), where=hit & steep)

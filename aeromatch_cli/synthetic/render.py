@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,18 +25,34 @@ _FLATTEST_COSINE = 0.06
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where a picture is taken. world_rotation: (3, 3) of cam_from_world; center_m: (3,). moment: its number."""
+    """Where a picture is taken. world_rotation: (3, 3) of cam_from_world; center_m: (3,). moment: its number.
+
+    sweep_m: (3,) by which the projection centre moves from the first row to the last, halfway through being at
+    center_m; None where all rows are exposed at once.
+    """
 
     camera: Camera
     world_rotation: FloatArray
     center_m: FloatArray
     moment: int
+    sweep_m: FloatArray | None = None
+
+    def at_row(self, row: int) -> View:
+        """As that row is exposed."""
+        if self.sweep_m is None:
+            return self
+        return replace(self, center_m=self.center_m + row_share(self.camera, row) * self.sweep_m)
 
     def directions(self, uv: FloatArray) -> FloatArray:
         """World directions (N, 3), one metre long along the optical axis, of normalised coordinates (N, 2)."""
         rotation = self.world_rotation.astype(uv.dtype)
         along: FloatArray = uv[:, :1] * rotation[0] + uv[:, 1:] * rotation[1] + rotation[2]
         return along
+
+
+def row_share(camera: Camera, rows: FloatArray | float) -> Any:
+    """How far a rolling shutter is at rows (N,) of a picture: -0.5 at the first, 0.5 at the last."""
+    return rows / (camera.height_px - 1) - 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +78,10 @@ def render_image(stage: Stage, view: View, settings: Development, rng: np.random
     sun = np.empty((height, width), dtype=np.uint8)
     linear = np.empty((height, width, 3), dtype=np.float32)
     radius2 = np.empty((height, width), dtype=np.float32)
-    rows = max(1, _BAND_PX // width)
+    rows = max(1, _BAND_PX // width) if view.sweep_m is None else 1
     for top in range(0, height, rows):
         band = slice(top, min(top + rows, height))
-        patch = _look(stage, view, top, band.stop)
+        patch = _look(stage, view.at_row(top), top, band.stop)
         shape = (band.stop - top, width)
         depth_m[band], surface[band] = patch.depth_m.reshape(shape), patch.surface.reshape(shape)
         sun[band], radius2[band] = patch.sun.reshape(shape), patch.radius2.reshape(shape)

@@ -34,13 +34,20 @@ class Station:
     """One picture to take.
 
     sortie: which flight of the day (0 or 1): light and season come from it. height_m: flying height above the datum
-    (z = 0) that was planned for this camera; the picture's own differs by the wobble.
+    (z = 0) that was planned for this camera; the picture's own differs by the wobble. heading_deg: where the aircraft
+    flies, clockwise from grid north.
     """
 
     exterior: Exterior
     camera_id: str
     sortie: int
     height_m: float
+    heading_deg: float
+
+    def velocity_m_s(self, speed_m_s: float) -> FloatArray:
+        """(3,) of level flight."""
+        heading = np.deg2rad(self.heading_deg)
+        return speed_m_s * np.array([np.sin(heading), np.cos(heading), 0.0])
 
 
 # Angle from the axis of a fisheye's corners at most.
@@ -55,7 +62,7 @@ def make_camera(lens: str, width_px: int, height_px: int, focal_share: float) ->
     would be further than 74 degrees from the axis. Raises ConfigError on an unknown lens.
     """
     if lens not in MODELS:
-        raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}")
+        raise ConfigError(f"lens {lens!r} is not known; use one of {', '.join(MODELS)}, or real")
     focal = focal_share * width_px
     if lens == FISHEYE:  # it projects by angles: those of the corners stay below a right angle
         focal = max(focal, 0.5 * float(np.hypot(width_px, height_px)) / _WIDEST_RAD)

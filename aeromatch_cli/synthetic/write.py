@@ -1,15 +1,19 @@
 """A rendered block on disk: pictures as a user would have them, and the truth beside them.
 
-OUT/images/city_0001.jpg ...         the pictures
+OUT/images/city_0001.jpg ...         the pictures; of real lenses with a header that states the focal length
 OUT/poses.csv                        exact: image,x,y,z,omega_deg,phi_deg,kappa_deg,camera; metres, degrees
 OUT/poses_noisy.csv                  the same with Gaussian noise, whose sigmas truth.json states
+OUT/poses_rtk.csv                    positions of an RTK receiver with their sigmas: image,x,y,z,sigma_x_m,...,camera
+OUT/poses_gps.csv                    the same of a GPS receiver without corrections, which drifts
 OUT/block.json                       cameras (COLMAP's names and corner origin), crs, percentiles of the surface heights
 OUT/dem.tif                          bare ground, float32 metres at cell centres, in the block's local frame
 OUT/truth/city_0001.depth.tif        (H, W) float32, metres along the optical axis at pixel centres, NaN for sky
 OUT/truth/city_0001.surface.tif      (H, W) uint32, what is visible: 1 + the index of the triangle, 0 for sky
 OUT/truth/city_0001.sun.png          (H, W) uint8, 255 x the share of the sun's disc in view; 0 also where the surface
                                      faces away from the sun. In shadow: below 128
-OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last
+OUT/truth.json                       scene, seed, flight, light and what else rebuilds the scene; written last. Of a
+                                     rolling shutter: seconds from the first row to the last, speed, velocities. Poses
+                                     are then of the middle row; depths count from each row's own projection centre
 OUT/synth.json                       the same, written first: what an interrupted block goes on with
 All rasters are lossless (TIFF: deflate with predictor; PNG).
 """
@@ -17,6 +21,7 @@ All rasters are lossless (TIFF: deflate with predictor; PNG).
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,10 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.data import Camera
+from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
 from aeromatch_cli.geometry.cameras import corner_params
 from aeromatch_cli.synthetic.flights import Flight
+from aeromatch_cli.synthetic.lenses import focal_35mm
 from aeromatch_cli.synthetic.render import Rendered
 from aeromatch_cli.synthetic.stations import Exterior
 from aeromatch_cli.synthetic.terrain import GroundGrid
@@ -72,8 +78,10 @@ def prepare(out: Path, names: tuple[str, ...], facts: dict[str, Any]) -> None:
     write_file(plan, wanted)
 
 
-def write_rendered(out: Path, name: str, rendered: Rendered, jpeg_quality: int) -> None:
-    """One picture and its truth."""
+def write_rendered(
+    out: Path, name: str, rendered: Rendered, jpeg_quality: int, finish: Callable[[bytes], bytes]
+) -> None:
+    """One picture, its file as `finish` leaves it, and its truth."""
     import cv2
 
     deflate = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR]
@@ -82,7 +90,7 @@ def write_rendered(out: Path, name: str, rendered: Rendered, jpeg_quality: int) 
     write_file(surface_path(out, name), _encoded(".tif", rendered.surface, [*deflate, horizontal]))
     write_file(sun_path(out, name), _encoded(".png", rendered.sun, []))
     bgr = np.ascontiguousarray(rendered.pixels[..., ::-1])
-    write_file(out / "images" / name, _encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality]))
+    write_file(out / "images" / name, finish(_encoded(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])))
 
 
 def read_raster(path: Path) -> NDArray[Any]:
@@ -130,6 +138,29 @@ def pose_table(names: tuple[str, ...], exteriors: tuple[Exterior, ...], cameras:
     for name, exterior, camera in zip(names, exteriors, cameras, strict=True):
         rows.append(",".join([name, *(repr(v) for v in asdict(exterior).values()), camera]))
     return ("\n".join(rows) + "\n").encode()
+
+
+def position_table(
+    names: tuple[str, ...], positions_m: FloatArray, sigmas_m: tuple[float, float, float], cameras: tuple[str, ...]
+) -> bytes:
+    """Positions (N, 3) alone, to the millimetre."""
+    rows = ["image,x,y,z,sigma_x_m,sigma_y_m,sigma_z_m,camera"]
+    for name, position_m, camera in zip(names, positions_m, cameras, strict=True):
+        rows.append(",".join([name, *(f"{v:.3f}" for v in position_m), *(f"{v:.3f}" for v in sigmas_m), camera]))
+    return ("\n".join(rows) + "\n").encode()
+
+
+def with_focal_length(jpeg: bytes, camera: Camera, camera_id: str) -> bytes:
+    """The picture with a header as a camera writes it: make, model and the 35-mm equivalent in whole millimetres."""
+    from PIL import ExifTags, Image
+
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "aeromatch", f"rendered {camera_id}"
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm(camera)
+    content = exif.tobytes()
+    segment = b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content
+    return jpeg[:2] + segment + jpeg[2:]
 
 
 def block_facts(flight: Flight, names: tuple[str, ...], heights_m: NDArray[Any]) -> dict[str, Any]:

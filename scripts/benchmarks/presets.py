@@ -56,7 +56,8 @@ def preset_rows(args: argparse.Namespace, judged: Judged, preset: str, folder: P
     """One row for each judged pair of a preset's run."""
     scene = judged.scene
     poses = given_poses(scene.poses.with_name(NOISY_POSES), args.poses)
-    given = [*poses, "--cameras", str(scene.block), "--crs", "local"]
+    lens = "exif" if args.lens else str(scene.block)  # the latter would be the exact calibration
+    given = [*poses, "--cameras", lens, "--crs", "local"]
     work = folder / "work"
     name, own_settings = parse_method(preset)
     settings = [*budget_settings(load(name, own_settings), args.keypoints), *own_settings, *args.set]
@@ -237,6 +238,7 @@ def main(arguments: Sequence[str]) -> None:
     )
     given = (_NOISY, _POSITIONS, _NOTHING)
     add("--poses", choices=given, default=_NOISY, help="what presets know of them")
+    add("--lens", choices=("real",), help="pictures through lenses of which EXIF says the focal length alone")
     add("--set", type=options.names, default="", metavar="KEY=VALUE", help="settings of every preset, comma-separated")
     add("--jobs", type=options.positive, default=2)
     add("--reference-weights", type=Path, metavar="DIR", help="weights of the peers that are networks")

@@ -82,6 +82,7 @@ def render_asked(args: argparse.Namespace, preset: str, *, flight: str, seed: in
     """Folder of a block as the options of `add_rendered` ask for it, below OUT/scenes."""
     width_px, height_px = size_px(args.size)
     size = {"width_px": width_px, "height_px": height_px, "images": args.images}
+    size |= {"lens": args.lens.upper()} if getattr(args, "lens", None) else {}
     return render_once(args.out / "scenes", preset, seed=args.seed if seed is None else seed, flight=flight, **size)
 
 

@@ -23,7 +23,7 @@ from aeromatch_cli.orientation.bundle.solve import solve
 
 # The standard deviation of image points is estimated again until it changes by less than this share.
 _SETTLED, _MAX_ROUNDS = 0.1, 5
-_ROUGH = 1e-3
+_ROUGH, _ROUGH_ROUNDS = 1e-3, 2
 # No coordinate of an image point is measured more exactly, pixels; where poses are rough, none counts as worse.
 _LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.05, 20.0
 # Distances of normally distributed residuals in the plane have this median, in standard deviations of a coordinate.
@@ -31,8 +31,14 @@ _MEDIAN_DISTANCE = 1.1774
 # What was stated of the accuracy of positions counts as much as so many residuals. Positions that are off by more than
 # the larger factor have another reason than their accuracy: they are not given up for it.
 _STATED_RESIDUALS, _MOST_FACTOR, _LEAST_FACTOR = 3.0, 5.0, 0.2
-# A position that is so many standard deviations from its image is not that of the image.
-_WRONG_SIGMAS = 5.0
+# A position that is so many standard deviations from its image is not that of the image. How large these are is told
+# by the share of positions that are right at least: of normally distributed ones so many have their largest coordinate
+# within so many standard deviations.
+_WRONG_SIGMAS, _RIGHT, _RIGHT_SIGMAS = 5.0, 0.8, 1.8
+# Before the block is adjusted, the poses of some are not known much better.
+_FAR_SIGMAS = 15.0
+# Positions that make residuals of image points larger by this factor bend the block.
+_BENT = 1.1
 # An unknown of calibration is held at its prior where its change is less than so many of its standard deviations and
 # the block has told less than half of what was not known of it; or where it moves no image point by so much of the
 # standard deviation of one.
@@ -74,6 +80,7 @@ class Adjusted:
 def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     """The block that fits its observations best, from `start`, whose image points may be off by many pixels."""
     stated = network
+    network, start = _without_far_positions(network, start)
     network, state = _with_image_sigma(network, start, options.tolerance)
     if options.final:
         held = _hold_undetermined(network, state, covariance(network, state)) if options.choose else network
@@ -89,15 +96,26 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
 
 
 def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tuple[Network, Unknowns]:
-    """The network solved with the accuracy of tie points that their residuals show."""
+    """The network with the accuracy of tie points that their residuals show, and its solution.
+
+    Positions weigh no more meanwhile than what they are off by allows: with too much weight they bend the block, and
+    image points would seem inexact.
+    """
     sigma_px = _sigma_px(network, state, redundant=False)
     for number in range(_MAX_ROUNDS):
         network = _of_sigma(network, sigma_px)
-        state = solve(network, state, _ROUGH if number == 0 else tolerance).state
+        state = solve(_loosened(network, state), state, _ROUGH if number == 0 else tolerance).state
         before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
         if number and abs(sigma_px / before - 1.0) < _SETTLED:
             break
     return _of_sigma(network, sigma_px), state
+
+
+def _loosened(network: Network, state: Unknowns) -> Network:
+    """The network with standard deviations of positions that most of their residuals agree with; the same where the
+    stated ones do."""
+    usual = _off_sigmas(network, state)[1]
+    return replace(network, position_sigmas_m=usual * network.position_sigmas_m) if usual > 1.0 else network
 
 
 def _of_sigma(network: Network, sigma_px: float) -> Network:
@@ -138,17 +156,31 @@ def _moved_px(network: Network, state: Unknowns, change: FloatArray) -> FloatArr
 
 
 def _explained(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
-    """The network with those further unknowns that its residuals speak for, and its solution."""
-    for tried in _explanations(network, state, options):
-        solved = solve(tried, state, _ROUGH)
-        unknowns = _freed_since(network, tried)
-        gain = 2.0 * (solve(network, state, _ROUGH).cost - solved.cost)
-        if gain < _WORTH_SQUARES * max(1, _count(unknowns)):
-            continue
-        values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(tried, solved.state), unknowns)
-        if (np.abs(values) > _WORTH_SIGMAS * sigmas).any():
-            network, state = tried, solved.state
-    return network, state
+    """The network with those further unknowns that its residuals speak for, the clearest first, and its solution."""
+    while True:
+        found = [_worth(network, state, tried) for tried in _explanations(network, state, options)]
+        taken = max((one for one in found if one is not None), key=lambda one: one[0], default=None)
+        if taken is None:
+            return network, state
+        network, state = taken[1:]
+
+
+def _worth(network: Network, state: Unknowns, tried: Network) -> tuple[float, Network, Unknowns] | None:
+    """By how much further unknowns lower the sum of squares, their network and its solution; None where that is too
+    little. Positions weigh by what they are off by once it is taken."""
+    unknowns = _freed_since(network, tried)
+    if not _count(unknowns):
+        return None
+    loose_m = _loosened(network, state).position_sigmas_m
+    after = solve(replace(tried, position_sigmas_m=loose_m), state, _ROUGH).state
+    fair = _loosened(tried, after)
+    solved = solve(fair, after, _ROUGH)
+    without = solve(replace(network, position_sigmas_m=fair.position_sigmas_m), state, _ROUGH)
+    gain = 2.0 * (without.cost - solved.cost)
+    if gain < _WORTH_SQUARES * _count(unknowns):
+        return None
+    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state), unknowns)
+    return (gain, tried, solved.state) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
 
 
 def _explanations(network: Network, state: Unknowns, options: Options) -> list[Network]:
@@ -199,17 +231,41 @@ def _sigmas(found: Covariance, freed: _Freed) -> FloatArray:
     return np.sqrt(np.maximum(np.concatenate([p[w] for p, w in zip(parts, freed, strict=True)]), 0.0))
 
 
+def _without_far_positions(network: Network, state: Unknowns) -> tuple[Network, Unknowns]:
+    """The network without positions that image points put far away, and a rough solution of it.
+
+    With all its weight a wrong position would bend the block to where it fits, and others would seem wrong.
+    """
+    worst, usual = _off_sigmas(network, state)
+    if worst.max(initial=0.0) <= _WRONG_SIGMAS:
+        return network, state
+    for _ in range(_ROUGH_ROUNDS):  # image points weigh rightly from the second on
+        looser = np.maximum(usual, worst / _WRONG_SIGMAS)
+        loose = replace(network, position_sigmas_m=network.position_sigmas_m * looser[:, None])
+        state = solve(_of_sigma(loose, _sigma_px(network, state, redundant=False)), state, _ROUGH).state
+        worst, _ = _off_sigmas(network, state)
+    worst, usual = _off_sigmas(network, state)
+    return _without(network, worst > _FAR_SIGMAS * usual), state
+
+
+def _without(network: Network, wrong: BoolArray) -> Network:
+    return replace(network, positions_m=np.where(wrong[:, None], np.nan, network.positions_m))
+
+
 def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns, FloatArray]:
     """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
     they are less exact than stated, horizontally and vertically."""
     stated, factors = network, np.asarray([1.0, 1.0])
+    tight = solve(stated, state, options.tolerance).state
+    bent = _sigma_px(stated, tight, redundant=True) > _BENT * stated.tie_sigma_px
+    network, state = (_loosened(stated, state), state) if bent else (stated, tight)
+    settled = network is stated
     for _ in range(_MAX_ROUNDS):
         wrong = _wrong_positions(network, state)
-        new = _position_factors(stated, state, covariance(network, state) if options.final else None, wrong)
-        if not wrong.any() and np.abs(new / factors - 1.0).max() < 2.0 * _SETTLED:
+        new = _position_factors(stated, network, state, covariance(network, state) if options.final else None, wrong)
+        if settled and not wrong.any() and np.abs(new / factors - 1.0).max() < 2.0 * _SETTLED:
             break
-        factors = new
-        stated = replace(stated, positions_m=np.where(wrong[:, None], np.nan, stated.positions_m))
+        factors, stated, settled = new, _without(stated, wrong), True
         network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
         state = solve(network, state, options.tolerance).state
     return network, state, factors
@@ -224,28 +280,39 @@ def position_residuals_m(network: Network, state: Unknowns) -> FloatArray:
     return np.where(network.located[:, None], network.positions_m - expected, np.nan)
 
 
-def _wrong_positions(network: Network, state: Unknowns) -> BoolArray:
-    """(N,) images whose positions contradict all others: the worst first, at most a fifth of all at once."""
+def _off_sigmas(network: Network, state: Unknowns) -> tuple[FloatArray, float]:
+    """(N,) largest coordinates of the residuals of positions, in standard deviations, 0 where there is none; and how
+    large these standard deviations are by most of them, at least 1."""
     off = np.abs(position_residuals_m(network, state)) / network.position_sigmas_m
     worst = np.where(np.isfinite(off), off, 0.0).max(axis=1)
-    usual = float(np.quantile(worst[network.located], 0.8)) if network.located.any() else 0.0
-    return np.asarray(worst > max(_WRONG_SIGMAS, usual))
+    if not network.located.any():
+        return worst, 1.0
+    usual = float(np.quantile(worst[network.located], _RIGHT, method="lower"))
+    return worst, max(1.0, usual / _RIGHT_SIGMAS)
 
 
-def _position_factors(network: Network, state: Unknowns, found: Covariance | None, wrong: BoolArray) -> FloatArray:
-    """(2,) by how much positions are less exact than stated, horizontally and vertically."""
-    used = network.located & ~wrong
+def _wrong_positions(network: Network, state: Unknowns) -> BoolArray:
+    """(N,) images whose positions contradict all others."""
+    worst, usual = _off_sigmas(network, state)
+    return np.asarray(worst > _WRONG_SIGMAS * usual)
+
+
+def _position_factors(
+    stated: Network, network: Network, state: Unknowns, found: Covariance | None, wrong: BoolArray
+) -> FloatArray:
+    """(2,) by how much positions are less exact than stated, horizontally and vertically; not more exact where it is
+    not known what the unknowns take of their residuals. network: with the weights that led to `state`."""
+    used = stated.located & ~wrong
     if not used.any():
         return np.ones(2)
-    sigmas_m = network.position_sigmas_m[used]
-    off = (position_residuals_m(network, state)[used] / sigmas_m) ** 2
+    off = (position_residuals_m(stated, state)[used] / stated.position_sigmas_m[used]) ** 2
     # What the unknowns take of the residuals, of each coordinate between all and nothing.
     taken = np.zeros_like(off)
     if found is not None:
         variances = np.diagonal(found.images[:, 3:, 3:], axis1=1, axis2=2)[used]
-        taken = np.clip(variances / sigmas_m**2, 0.0, 0.99)
+        taken = np.clip(variances / network.position_sigmas_m[used] ** 2, 0.0, 1.0)
     factors = []
     for axes in ([0, 1], [2]):
         redundancy = float((1.0 - taken[:, axes]).sum())
         factors.append(np.sqrt((off[:, axes].sum() + _STATED_RESIDUALS) / (redundancy + _STATED_RESIDUALS)))
-    return np.clip(factors, _LEAST_FACTOR, _MOST_FACTOR)
+    return np.clip(factors, 1.0 if found is None else _LEAST_FACTOR, _MOST_FACTOR)

@@ -2,7 +2,8 @@
 
 They rest on all unknowns together, calibration included. What no observation determines (place, heading and scale of a
 block without positions) is left out by inner constraints on the projection centres: errors count from the shape that
-fits best then (Meissl 1969; Triggs et al. 2000, section 9).
+fits best then (Meissl 1969; Triggs et al. 2000, section 9). Where positions hold the frame, what they leave open, such
+as the turn about a line of images, counts as open by half a turn.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def covariance(network: Network, state: Unknowns) -> Covariance:
     size, held = 6 * layout.blocks, normals.held
     first = 6 * layout.images
     if size <= _MAX_TOGETHER:
-        whole = _inverse(normals.matrix.toarray(), _free_movements(network, state, normals))
+        whole = _inverse(normals.matrix.toarray(), _free_movements(network, state, normals), _in_world(network))
         whole *= ~(held[:, None] | held)
         blocks = np.array([whole[k : k + 6, k : k + 6] for k in range(0, size, 6)])
         rest = whole[first:, first:]
@@ -132,6 +133,11 @@ def _of_last(matrix: sparse.csr_matrix, first: int) -> FloatArray:
     return np.asarray(scale[first:, None] * solver.solve(columns)[first:])
 
 
+def _in_world(network: Network) -> bool:
+    """Whether something holds the frame of the world: deviations are those in it, not those of the shape."""
+    return bool(network.located.any() or len(network.control))
+
+
 def _free_movements(network: Network, state: Unknowns, normals: Reduced) -> FloatArray:
     """(6 B, D) movements of the whole block that no observation sees: of three shifts, three turns and the scale."""
     layout, centers_m = Layout.of(network), state.centers_m
@@ -148,12 +154,25 @@ def _free_movements(network: Network, state: Unknowns, normals: Reduced) -> Floa
     if network.held.any():
         return movements[:, :0]
     others = sum((part.T @ (part @ movements) for part in normals.others), start=np.zeros_like(movements))
-    strengths, axes = np.linalg.eigh(movements.T @ others)
+    strengths, axes = np.linalg.eigh(movements.T @ others + _of_control(network, state, extent_m))
     return np.asarray(movements @ axes[:, strengths < _FREE_INFORMATION])
 
 
-def _inverse(normal: FloatArray, free: FloatArray) -> FloatArray:
-    """Covariance of normal equations; with movements that they leave free, that of a free network."""
+def _of_control(network: Network, state: Unknowns, extent_m: float) -> FloatArray:
+    """(7, 7) what control points say of the movements."""
+    away_m = state.points_m[network.control] - state.centers_m.mean(axis=0)
+    moved = np.zeros((len(away_m), 3, 7))
+    moved[:, :, :3] = extent_m * np.eye(3)
+    for axis in range(3):
+        moved[:, :, 3 + axis] = np.cross(np.eye(3)[axis], away_m)
+    moved[:, :, 6] = away_m
+    observed = (moved / network.control_sigmas_m[:, :, None]).reshape(-1, 7)
+    return np.asarray(observed.T @ observed)
+
+
+def _inverse(normal: FloatArray, free: FloatArray, in_world: bool) -> FloatArray:
+    """Covariance of normal equations; with movements that they leave free, that of a free network, or of one whose
+    frame is known as far as it is."""
     from scipy import linalg
 
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # radians, metres and pixels alike
@@ -167,6 +186,8 @@ def _inverse(normal: FloatArray, free: FloatArray) -> FloatArray:
     covariance = scale[:, None] * (inverse - basis @ basis.T) * scale
     if not free.shape[1]:
         return np.asarray(covariance)
+    if in_world:
+        return np.asarray(covariance + (np.pi * free) @ (np.pi * free).T)
     # From the shape that fits best in the scaled unknowns to that in the projection centres.
     at_centers = np.zeros(len(normal))
     at_centers.reshape(-1, 6)[:, 3:] = free.reshape(-1, 6, free.shape[1])[:, 3:].any(axis=2)

@@ -42,7 +42,7 @@ def image_points(model: Any, images: list[int], points: list[int]) -> tuple[IntA
 def _grouped(values: IntArray, order: IntArray) -> tuple[list[int], list[IntArray]]:
     """Different values of a sorted array, and what belongs to each."""
     different, starts = np.unique(values, return_index=True)
-    return different.tolist(), np.split(order, starts[1:])
+    return different.tolist(), np.split(order, starts[1:]) if len(starts) else []
 
 
 def lens_of(camera: Any) -> FloatArray:

@@ -80,9 +80,9 @@ def project_with_derivatives(network: Network, state: Unknowns) -> Projected:
 
 
 def _normalised(local: FloatArray) -> tuple[FloatArray, FloatArray]:
-    depth = local[:, 2]
-    near = _LEAST_DEPTH * float(np.median(np.abs(depth))) if len(depth) else 0.0
-    depth = np.where(depth > near, depth, np.nan)
+    depth, somewhere = local[:, 2], np.isfinite(local).all(axis=1)
+    near = _LEAST_DEPTH * float(np.median(np.abs(depth[somewhere]))) if somewhere.any() else 0.0
+    depth = np.where(somewhere & (depth > near), depth, np.nan)
     return local[:, 0] / depth, local[:, 1] / depth
 
 
@@ -107,13 +107,13 @@ def _distorted(network: Network, lens: FloatArray, u: FloatArray, v: FloatArray)
 
 def _fisheye_factor(lens: FloatArray, radius: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distorted over undistorted radius (M,), its derivative by the radius (M,), and by k1 to k4 (M, 4)."""
+    radius = np.maximum(radius, 1e-9)  # on the axis, the limit
     angle = np.arctan(radius)
-    safe = np.maximum(radius, 1e-9)
     terms = lens[:, 3:7]
     powers = angle[:, None] ** (2 * np.arange(1, 5))
     bent = angle * (1.0 + (terms * powers).sum(axis=1))
     slope = (1.0 + (terms * powers * (2 * np.arange(1, 5) + 1)).sum(axis=1)) / (1.0 + radius**2)
-    return bent / safe, (slope - bent / safe) / safe, powers * (angle / safe)[:, None]
+    return bent / radius, (slope - bent / radius) / radius, powers * (angle / radius)[:, None]
 
 
 def _distortion_derivatives(

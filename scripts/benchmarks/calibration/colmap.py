@@ -2,7 +2,7 @@
 
 colmap           incremental mapping: SIMPLE_RADIAL, the principal point in the middle
 colmap-opencv    its model adjusted once more as OPENCV, principal point free
-colmap-priors    the same with the given positions as observations
+colmap-priors    that adjusted once more, with the given positions as observations
 
 Run as a module: FOLDER and PEER. The folder holds what the exporter for COLMAP has written, and stated.npy: given
 positions (image number, x, y, z, sigma), which place the model in the world; found.npz is written into it.
@@ -81,8 +81,10 @@ def _solve(folder: Path, peer: str) -> None:
     stated = stated[np.isin(stated[:, 0], image_numbers(model))]
     _place(pycolmap, model, stated)
     if peer != "colmap":
-        _adjust(pycolmap, model, stated if peer == WITH_POSITIONS else stated[:0])
-        _place(pycolmap, model, stated if peer != WITH_POSITIONS else stated[:0])
+        _adjust(pycolmap, model)
+        _place(pycolmap, model, stated)
+    if peer == WITH_POSITIONS and len(stated) >= _FEWEST_POSITIONS:  # exact ones tear a model that is still bent
+        _adjust_with(pycolmap, model, stated)
     lens = next(iter(model.cameras.values())).model.name
     numbers, cameras = image_numbers(model), sorted(model.cameras)
     np.savez(
@@ -103,19 +105,25 @@ def _place(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
         model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), shift))
 
 
-def _adjust(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
-    """As OPENCV with a free principal point, in the frame of the positions, where there are enough."""
-    for camera in model.cameras.values():
-        focal, x, y, k1 = camera.params
-        camera.model = pycolmap.CameraModelId.OPENCV
-        camera.params = [focal, focal, x, y, k1, 0.0, 0.0, 0.0]
+def _options(pycolmap: ModuleType) -> Any:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = True
     options.ceres.solver_options.num_threads = 1
-    if len(stated) < _FEWEST_POSITIONS:
-        pycolmap.bundle_adjustment(model, options)
-        return
+    return options
+
+
+def _adjust(pycolmap: ModuleType, model: Any) -> None:
+    """As OPENCV with a free principal point."""
+    for camera in model.cameras.values():
+        focal, x, y, k1 = camera.params
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = [focal, focal, x, y, k1, 0.0, 0.0, 0.0]
+    pycolmap.bundle_adjustment(model, _options(pycolmap))
+
+
+def _adjust_with(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
+    """With positions (image number, x, y, z, sigma) as observations."""
     config = pycolmap.BundleAdjustmentConfig()
     for number in image_numbers(model):
         config.add_image(number)
@@ -129,7 +137,7 @@ def _adjust(pycolmap: ModuleType, model: Any, stated: FloatArray) -> None:
         for row in stated
     ]
     prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
-    pycolmap.create_pose_prior_ceres_bundle_adjuster(options, prior_options, config, priors, model).solve()
+    pycolmap.create_pose_prior_ceres_bundle_adjuster(_options(pycolmap), prior_options, config, priors, model).solve()
 
 
 if __name__ == "__main__":

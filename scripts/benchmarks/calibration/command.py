@@ -12,8 +12,8 @@ are exact. Of each line: the median over the scenes and seeds, in brackets the w
 point: errors of the median camera.
 
 Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle; colmap-opencv: its model adjusted once
-more as OPENCV with a free principal point; colmap-priors: so with the given positions as observations. Models of all
-are put into the world by the positions.
+more as OPENCV with a free principal point; colmap-priors: and so with the given positions as observations. Models are
+put into the world by the positions.
 
 Start mapped: what `map_block` finds; perturbed: exact poses made worse by 0.5 degrees and 1 % of the flying height,
 neighbours nearly alike.

@@ -26,9 +26,10 @@ from aeromatch_cli.orientation.mapping import Group, Mapper, Observed, map_block
 from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.strategies.exporters.contents import ExportContents, PairContents
 from aeromatch_cli.synthetic.flights import Flight, gsd_m, plan_flight
-from aeromatch_cli.synthetic.lenses import real_lens
+from aeromatch_cli.synthetic.lenses import focal_35mm, real_lens
 from aeromatch_cli.synthetic.presets import PRESETS
 from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.synthetic.receivers import GPS_M, RTK_M, gps_errors_m, rtk_errors_m
 from aeromatch_cli.synthetic.scene import build_scene
 from aeromatch_cli.synthetic.terrain import Area
 from benchmarks.calibration.tracks import Keypoints, Picture, Sight, chosen, look, measured, spread
@@ -40,12 +41,7 @@ FLIGHTS: Mapping[str, str] = MappingProxyType(
     {"nadir": "nadir", "cross": "cross", "mixed": "tilted", "five": "dense-rig", "two-heights": "two-heights"}
 )
 WIDTH_PX, HEIGHT_PX = 4000, 3000
-# Standard deviations as they are stated: of GPS, the common part and the noise of a picture together.
-GPS_COMMON_M, GPS_NOISE_M = 5.0, 1.0
-RTK_M = (0.02, 0.02, 0.03)
-_SIGMAS_M: Mapping[Positions, tuple[float, float, float]] = MappingProxyType(
-    {"gps5m": (float(np.hypot(GPS_COMMON_M, GPS_NOISE_M)),) * 3, "rtk2cm": RTK_M}
-)
+_SIGMAS_M: Mapping[Positions, tuple[float, float, float]] = MappingProxyType({"gps5m": GPS_M, "rtk2cm": RTK_M})
 # Attitudes of a gimbal: every picture by itself, and the mounting of the camera.
 _GIMBAL_DEG, _MOUNT_DEG = 1.0, 0.5
 # A drone keeps its height better than the flights of rendered blocks do, which would tell focal lengths too much.
@@ -192,8 +188,7 @@ def _pictures(planned: Flight, lenses: Mapping[str, Camera]) -> list[Picture]:
 def exif_camera(camera: Camera) -> Camera:
     """What EXIF says of a camera: the 35-mm equivalent in whole millimetres, and nothing of its lens."""
     diagonal_px = float(np.hypot(camera.width_px, camera.height_px))
-    focal_mm = round(focal_px(camera) / diagonal_px * FULL_FRAME_DIAGONAL_MM)
-    focal = focal_mm / FULL_FRAME_DIAGONAL_MM * diagonal_px
+    focal = focal_35mm(camera) / FULL_FRAME_DIAGONAL_MM * diagonal_px
     middle = 0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)
     return Camera("SIMPLE_RADIAL", camera.width_px, camera.height_px, (focal, *middle, 0.0))
 
@@ -235,7 +230,7 @@ def _observed(seen: _Seen, positions: Positions, rng: np.random.Generator, attit
     focal = dict.fromkeys(seen.contents.block.cameras, FOCAL_SIGMAS["35-mm equivalent"])
     if positions == "nothing":
         return Observed({}, focal, {})
-    errors_m = position_errors_m(positions, len(pictures), rng)
+    errors_m = (rtk_errors_m if positions == "rtk2cm" else gps_errors_m)(len(pictures), rng)
     turns = _turned(rng, _MOUNT_DEG, 1) * _turned(rng, _GIMBAL_DEG, len(pictures))
     poses, angles = {}, {}
     for picture, error_m, turn in zip(pictures, errors_m, turns, strict=True):
@@ -247,15 +242,6 @@ def _observed(seen: _Seen, positions: Positions, rng: np.random.Generator, attit
         if rotation is not None:
             angles[picture.image_id] = Angles("omega_phi_kappa", to_omega_phi_kappa(rotation))
     return Observed(poses, focal, angles)
-
-
-def position_errors_m(positions: Positions, count: int, rng: np.random.Generator) -> FloatArray:
-    """(N, 3) in the order of taking: RTK's are independent, GPS's drift and scatter."""
-    if positions == "rtk2cm":
-        return np.asarray(rng.standard_normal((count, 3)) * RTK_M)
-    phase = np.linspace(0.0, 1.0, count)[:, None] * rng.uniform(0.5, 1.5, 3) * np.pi
-    common = rng.standard_normal(3) * np.cos(phase) + rng.standard_normal(3) * np.sin(phase)
-    return np.asarray(GPS_COMMON_M * common + GPS_NOISE_M * rng.standard_normal((count, 3)))
 
 
 def _turned(rng: np.random.Generator, sigma_deg: float, count: int) -> Rotation:

@@ -15,9 +15,9 @@ from aeromatch_cli.synthetic.raycast import RayCaster
 _TOLERANCE_M = 2e-3
 # Farther away, in flying heights, an oblique picture has no tie points.
 _FARTHEST = 3.0
-# SIFT matches less and less as views differ: weight exp(-(angle / 25 degrees)^2), and nothing beyond 60.
+# An assumption: SIFT matches less and less as views differ, weight exp(-(angle / 25 degrees)^2), and nothing beyond 60.
 _LIKE_VIEW_DEG, _MOST_DEG = 25.0, 60.0
-# Lengths are 2 and more, each further image with this probability less: 40 % have two, the mean is 3.5.
+# An assumption, too: tracks have two images or more and end at each with this probability; means come out near 3.2.
 _END = 0.4
 # A wrong match is so many pixels along the epipolar line away from where the point is.
 _WRONG_PX = (3.0, 30.0)
