@@ -30,6 +30,8 @@ _WRONG_POSITIONS: Limits = (0.05, 0.3)
 # scatter by more than this share of it.
 _FLIGHT_SIGMAS: Limits = (2.0, None)
 _FLIGHT_SCATTER, _FLIGHT_IMAGES = 0.33, 2
+# Found values count that are so many of their own standard deviations.
+_SIGNIFICANT = 3.0
 # Between exposure and position: less is within what receivers do.
 _LAG_S: Limits = (0.1, None)
 # From the projection centre to the antenna: no drone is larger, so that something else has been found.
@@ -290,12 +292,13 @@ def _flights(evidence: Evidence) -> _Found:
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
                 yield _finding("step of heights", abs(step_m) / stated_m[2], _FLIGHT_SIGMAS, words, remedy)
-            shift_m = np.array([flight.get(f"shift_{axis}", [0.0])[0] for axis in "xyz"])
-            if shift_m.any():
+            shift_m, sigma_m = np.array([flight.get(f"shift_{axis}", [0.0, 0.0]) for axis in "xyz"]).T
+            if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
                 words = f"positions of flight {name} ({images} images) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
-                sigmas = float(np.abs(shift_m / np.array(stated_m)).max())
+                known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
+                sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
                 yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
             found.add(name)
             if "lag_s" in flight:
@@ -371,14 +374,17 @@ def _control(evidence: Evidence) -> _Found:
             "system, their heights and where they were measured"
         )
         yield Finding("control points", None, None, "doubtful", words)
-    errors_m = next((one["held_out_rms_m"] for one in inside if one.get("kept") and one.get("held_out_rms_m")), None)
-    errors_m = errors_m or control.get("check_rmse_m")
-    if not errors_m:
+    # Points left out of few leave a block that is not the one that all of them hold.
+    held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
+    errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
+    errors = [error_m for error_m in errors if error_m]
+    if not errors:
         yield "control points: too few to check the block by them"
         return
     pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
     # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
     stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    errors_m = max(errors, key=lambda error_m: float((np.array(error_m) / stated_m).max()))
     sigmas = float((np.array(errors_m) / stated_m).max())
     shown = ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
     words = f"points that took no part are met to {shown} m, {sigmas:.1f} times what can be expected"
