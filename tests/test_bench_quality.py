@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.quality.blocks import FAULTS, GOOD, Plan, Task
-from benchmarks.quality.command import evidence_of, main, summary_of
+from benchmarks.verdicts.blocks import FAULTS, GOOD, Plan, Task
+from benchmarks.verdicts.command import evidence_of, main, summary_of
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.geometry.cameras import focal_px

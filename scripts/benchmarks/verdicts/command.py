@@ -33,8 +33,8 @@ from benchmarks import options
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.accuracy import judged as by_truth
 from benchmarks.processes import fresh_process, limit_threads
-from benchmarks.quality.blocks import FAULTS, GOOD, Task
 from benchmarks.tables import Column, Row, number, table, write_rows
+from benchmarks.verdicts.blocks import FAULTS, GOOD, Task
 
 _MOST_FINDINGS = 3
 # Blocks that one process makes, which builds their scene once.
