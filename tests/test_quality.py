@@ -72,6 +72,11 @@ CONTROL = {
     "points": 5, "control": 3, "check": 2, "doubtful": [], "check_rmse_m": [0.02, 0.02, 0.03],
     "control_rmse_m": [0.01, 0.01, 0.01], "sigmas_m": [0.02, 0.02, 0.03],
 }  # fmt: skip
+# Of the adjustment with control points: check points are met to 37.5 cm in height.
+INSIDE = {
+    "used": ["P1", "P2", "P3"], "wrong": [], "exchanged": [], "held_out": "check points",
+    "held_out_rms_m": [0.02, 0.02, 0.375], "without_rms_m": [0.02, 0.02, 0.5], "kept": True,
+}  # fmt: skip
 
 
 def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
@@ -103,9 +108,12 @@ def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
         ({"group": lens(readout_s=[0.03, 0.001, 0.0, 0.03])}, "rolling shutter", 0.03, "good"),
         ({"group": lens(readout_s=[0.5, 0.001, 0.0, 0.03])}, "rolling shutter", 0.5, "doubtful"),
         ({"group": heights(bowl_m=0.3)}, "bowl", 10.0, "doubtful"),
+        ({"group": heights(sigma_m=0.3)}, "heights", 10.0, "doubtful"),
+        ({"group": heights(sigma_m=9.0) | positions(stated_m=[5.0] * 3)}, "heights", 300.0, "good"),
         ({"group": heights(tilt_m=5.0)}, "tilt", 2.862, "doubtful"),
         ({"group": flight(step_m=14.9)}, "step of heights", 14.9 / 0.03, "doubtful"),
         ({"group": flight(shift_x=[1.0, 0.01])}, "shift of a flight", 50.0, "doubtful"),
+        ({"adjust": {"control": CONTROL}, "group": {"control": INSIDE}}, "check points", 8.839, "bad"),
         ({"group": apart(14.9, 0.5)}, "flights apart", 2.98, "doubtful"),
         ({"group": apart(4.9, 0.5)}, "flights apart", 0.98, "good"),
         ({"group": flight(lag_s=[0.5, 0.01])}, "delay of positions", 0.5, "doubtful"),
@@ -153,6 +161,11 @@ def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
         quality = judged_with(adjust={"groups": parts})
         assert found(quality, "parts").value == pytest.approx(stated_m / 2.0 / 0.03)  # the smaller one has four images
         assert quality.verdict == level
+
+
+def test_a_shift_that_is_not_significant_is_none() -> None:
+    quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
+    assert quality.verdict == "good"
 
 
 def test_flights_that_scatter_as_much_as_they_lie_apart_are_not_apart() -> None:

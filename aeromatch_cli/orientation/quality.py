@@ -30,6 +30,8 @@ _WRONG_POSITIONS: Limits = (0.05, 0.3)
 # scatter by more than this share of it.
 _FLIGHT_SIGMAS: Limits = (2.0, None)
 _FLIGHT_SCATTER, _FLIGHT_IMAGES = 0.33, 2
+# Found values count that are so many of their own standard deviations.
+_SIGNIFICANT = 3.0
 # Between exposure and position: less is within what receivers do.
 _LAG_S: Limits = (0.1, None)
 # From the projection centre to the antenna: no drone is larger, so that something else has been found.
@@ -56,6 +58,8 @@ _LENS_SIGMAS: Limits = (3.0, 6.0)
 # may be tilted, degrees, which is what one strip has about its line.
 _BOWL_PIXELS: Limits = (5.0, None)
 _TILT_DEG: Limits = (2.0, None)
+# Expected errors of heights as a whole: ground pixels, or so many standard deviations of the heights of positions.
+_HEIGHT_PIXELS, _HEIGHT_SIGMAS = 5.0, 3.0
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
 # Parts that share too few points lie to each other as exactly as positions put each of them, ground pixels.
@@ -288,12 +292,13 @@ def _flights(evidence: Evidence) -> _Found:
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
                 yield _finding("step of heights", abs(step_m) / stated_m[2], _FLIGHT_SIGMAS, words, remedy)
-            shift_m = np.array([flight.get(f"shift_{axis}", [0.0])[0] for axis in "xyz"])
-            if shift_m.any():
+            shift_m, sigma_m = np.array([flight.get(f"shift_{axis}", [0.0, 0.0]) for axis in "xyz"]).T
+            if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
                 words = f"positions of flight {name} ({images} images) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
-                sigmas = float(np.abs(shift_m / np.array(stated_m)).max())
+                known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
+                sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
                 yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
             found.add(name)
             if "lag_s" in flight:
@@ -369,14 +374,17 @@ def _control(evidence: Evidence) -> _Found:
             "system, their heights and where they were measured"
         )
         yield Finding("control points", None, None, "doubtful", words)
-    errors_m = next((one["held_out_rms_m"] for one in inside if one.get("kept") and one.get("held_out_rms_m")), None)
-    errors_m = errors_m or control.get("check_rmse_m")
-    if not errors_m:
+    # Points left out of few leave a block that is not the one that all of them hold.
+    held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
+    errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
+    errors = [error_m for error_m in errors if error_m]
+    if not errors:
         yield "control points: too few to check the block by them"
         return
     pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
     # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
     stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    errors_m = max(errors, key=lambda error_m: float((np.array(error_m) / stated_m).max()))
     sigmas = float((np.array(errors_m) / stated_m).max())
     shown = ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
     words = f"points that took no part are met to {shown} m, {sigmas:.1f} times what can be expected"
@@ -450,21 +458,42 @@ def _calibration(evidence: Evidence) -> _Found:
 
 
 def _deformation(evidence: Evidence) -> _Found:
+    """Of the group that is worst in each respect."""
     pixel_m = evidence.adjust.get("ground_pixel_m")
-    heights = next((group["heights"] for group in evidence.groups if group.get("heights")), None)
-    if not heights or not pixel_m:
+    known = [group for group in evidence.groups if group.get("heights")]
+    if not known or not pixel_m:
         yield "expected deformation: the block was not adjusted, or has too few points"
         return
-    bowl = heights["bowl_m"] / pixel_m
-    metres = f" ({heights['bowl_m']:.2g} m)" if evidence.metric else ""
-    words = f"the middle of the block may lie {bowl:.1f} ground pixels{metres} above or below its border"
+
+    def length(value_m: float) -> str:
+        metres = f" ({value_m:.2g} m)" if evidence.metric else ""
+        return f"{value_m / pixel_m:.1f} ground pixels{metres}"
+
+    def part(group: Mapping[str, Any]) -> str:
+        return "the block" if len(evidence.groups) == 1 else f"the part of {group['images']} images"
+
+    worst = max(known, key=lambda group: group["heights"]["bowl_m"])
+    bowl_m = worst["heights"]["bowl_m"]
+    words = f"the middle of {part(worst)} may lie {length(bowl_m)} above or below its border"
     remedy = f"straight views from one height do not determine it; {_STRIPS}"
-    yield _finding("bowl", bowl, _BOWL_PIXELS, words, remedy)
-    angle = float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"])))
-    if any(group["kind"] != "level" for group in evidence.groups):
-        words = f"the block may be tilted by {angle:.2f} degrees"
-        remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
-        yield _finding("tilt", angle, _TILT_DEG, words, remedy)
+    yield _finding("bowl", bowl_m / pixel_m, _BOWL_PIXELS, words, remedy)
+    placed = [group for group in known if group["kind"] != "level"]
+    if not placed:
+        return
+    angles = [float(np.rad2deg(np.arctan2(g["heights"]["tilt_m"], g["heights"]["reach_m"]))) for g in placed]
+    angle, worst = max(zip(angles, placed, strict=True), key=lambda one: one[0])
+    words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
+    remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
+    yield _finding("tilt", angle, _TILT_DEG, words, remedy)
+    placed = [group for group in placed if group.get("positions")]
+    if placed:
+        worst = max(placed, key=lambda group: group["heights"]["sigma_m"])
+        sigma_m, stated_m = worst["heights"]["sigma_m"], worst["positions"]["stated_m"][2]
+        # As exact as positions are is as exact as can be asked for.
+        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / pixel_m)
+        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {stated_m:.2g} m"
+        remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
+        yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
 
 
 def _kept_poses(evidence: Evidence) -> _Found:

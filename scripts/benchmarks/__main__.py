@@ -22,7 +22,7 @@ TABLE: Table = {
         "bundle adjustment of simulated tie points with real lenses, beside COLMAP, by exact truth",
     ),
     "quality": (
-        "benchmarks.quality.command",
+        "benchmarks.verdicts.command",
         "whether a verdict can be believed: blocks spoilt in known ways, and good ones, by exact truth",
     ),
     "similar": ("benchmarks.similar", "pairs of images without poses by image retrieval, against reference overlaps"),

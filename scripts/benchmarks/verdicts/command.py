@@ -33,10 +33,12 @@ from benchmarks import options
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.accuracy import judged as by_truth
 from benchmarks.processes import fresh_process, limit_threads
-from benchmarks.quality.blocks import FAULTS, GOOD, Task
 from benchmarks.tables import Column, Row, number, table, write_rows
+from benchmarks.verdicts.blocks import FAULTS, GOOD, Task
 
 _MOST_FINDINGS = 3
+# Blocks that one process makes, which builds their scene once.
+_TOGETHER = 9
 
 
 def evidence_of(task: Task) -> tuple[Evidence, Row]:
@@ -104,8 +106,9 @@ def rows_of(out: Path, names: Sequence[tuple[str, str]], tie_points: int, jobs: 
             plan, _ = (FAULTS if kind == "spoilt" else GOOD)[name]
             key = plan.scene, plan.seed
             batches.setdefault(key, []).append((name, kind, path))
+    parts = [batch[at : at + _TOGETHER] for batch in batches.values() for at in range(0, len(batch), _TOGETHER)]
     with fresh_process(jobs, limit_threads, 1) as pool:
-        for _ in pool.map(_run_all, batches.values(), [tie_points] * len(batches)):
+        for _ in pool.map(_run_all, parts, [tie_points] * len(parts)):
             pass
     for path in paths.values():
         yield _judged(read_json(path))
@@ -140,7 +143,7 @@ def main(arguments: Sequence[str]) -> None:
     parser = options.make_parser("quality", __doc__)
     add = parser.add_argument
     add("--only", default="", metavar="WORDS", help="blocks whose names hold these words")
-    add("--points", type=options.positive, default=600, help="about so many tie points in an image")
+    add("--points", type=options.positive, default=1000, help="about so many tie points in an image")
     add("--jobs", type=options.positive, default=2)
     options.add_output(parser)
     args = options.parse(parser, arguments, {"only": "factory", "points": 500})

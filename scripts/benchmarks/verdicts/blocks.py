@@ -46,7 +46,7 @@ def good_task(block: SimulatedBlock) -> Task:
 class Plan:
     """What is simulated; a task is made of it and spoilt."""
 
-    scene: str = "hills"
+    scene: str = "farmland"
     flight: str = "cross"
     images: int = 16
     positions: Positions = "rtk2cm"
