@@ -160,9 +160,9 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     given, steps_m = _without_steps(model, given)
     positions_m, sigmas_m = given.positions_m[rows], given.mean_sigmas_m[rows]
     placement = _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
-    # A wrong focal length puts images far from positions that are right: those count that may be.
+    # A wrong focal length puts images far from positions that are right, however exact these are: the adjustment tells.
     off_m = np.linalg.norm(centers_of(model, ids) - positions_m, axis=1)
-    counts = (off_m <= _FAR_SIGMAS * sigmas_m) & (placement.kind == "positions")
+    counts = (placement.agreeing | (off_m <= _FAR_SIGMAS * sigmas_m)) & (placement.kind == "positions")
     levels = np.full((len(ids), 3), np.inf)
     if placement.kind == "positions" and np.isfinite(placement.level_sigma_deg):
         # What tilts or terrain say of the whole block, as observations of all images that together are as exact.

@@ -22,7 +22,7 @@ Calibration = Literal["auto", "given", "focal", "brown"]
 # each by what they move the corner of the picture, as a share of its distance from the middle; decentring likewise;
 # affinity and skew as a share of the focal length. Lenses of consumer cameras: Luhmann et al., Close-Range
 # Photogrammetry, section 3.3; principal points 15 to 24 px off in pictures of 1,000 to 4,000 px.
-_CENTRE, _RADIAL, _DECENTRING, _AFFINITY = 0.02, 0.05, 0.0007, 0.0002
+_CENTRE, _RADIAL, _DECENTRING, _AFFINITY = 0.02, 0.05, 0.002, 0.0002
 # A calibration that was stated is this much nearer to the truth than nothing; it was made at another time, temperature
 # and focus.
 _STATED = 0.25

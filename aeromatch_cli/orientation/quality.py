@@ -431,7 +431,7 @@ def _calibration(evidence: Evidence) -> _Found:
             changes = {
                 name: abs(value - prior) / prior_sigma
                 for name, (value, _, prior, prior_sigma) in camera["parameters"].items()
-                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name != "readout_s"
+                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(camera["parameters"])
             }
             read_out = camera["parameters"].get("readout_s")
             if read_out and read_out[1] > 0.0:
@@ -455,6 +455,14 @@ def _calibration(evidence: Evidence) -> _Found:
             yield _finding("calibration", changes[name], _LENS_SIGMAS, words, remedy)
     if not told:
         yield "calibration: it was not adjusted"
+
+
+def _stated(parameters: Mapping[str, Sequence[float]]) -> set[str]:
+    """Parameters that are judged by what is known of them: of a lens that nobody has calibrated, terms of distortion
+    and affinity are what they are."""
+    terms = {"k1", "k2", "k3", "p1", "p2", "b1", "b2"}
+    calibrated = any(parameters[name][2] != 0.0 for name in terms & parameters.keys())
+    return {"f", "cx", "cy"} | (terms if calibrated else set())
 
 
 def _deformation(evidence: Evidence) -> _Found:
