@@ -6,7 +6,7 @@ Errors of check points are in ground pixels (their metres over the ground sampli
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,11 +24,13 @@ _STREAM = 301
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Cameras by camera_id; cam_from_world rotations (3, 3) and centres (3,) by image_id, all in one frame."""
+    """Cameras by camera_id; cam_from_world rotations (3, 3) and centres (3,) by image_id, all in one frame. sigmas_m:
+    standard deviations (3,) of the centres, where they are stated."""
 
     cameras: Mapping[str, Camera]
     rotations: Mapping[str, FloatArray]
     centers_m: Mapping[str, FloatArray]
+    sigmas_m: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of(cls, adjusted: AdjustedBlock) -> Found:
@@ -40,6 +42,7 @@ class Found:
             adjusted.cameras,
             {image_id: pose.rotation for image_id, pose in poses.items()},
             {image_id: pose.center_m for image_id, pose in poses.items()},
+            {image_id: pose.sigmas_m for image_id, pose in poses.items()},
         )
 
 
@@ -48,7 +51,7 @@ def judged(block: SimulatedBlock, found: Found) -> Row:
 
     horizontal_px, height_px: medians of absolute errors after the best similarity to truth; bend_px: 95 % of the
     heights are within. absolute_...: without it, where positions are exact enough. focal_percent, centre_px: the
-    median camera.
+    median camera. stated_ratio: see `_stated_ratio`.
     """
     used = {block.camera_of[image_id] for image_id in found.rotations}
     true = {k: block.cameras[k] for k in used}
@@ -62,6 +65,7 @@ def judged(block: SimulatedBlock, found: Found) -> Row:
         "focal_percent": 100.0 * float(np.median(focal)) if focal else None,
         "centre_px": float(np.median(centres)) if centres else None,
     }
+    row["stated_ratio"] = _stated_ratio(block, found)
     points = intersected(block, found)
     known = np.isfinite(points).all(axis=1)
     row["checked"] = int(known.sum())
@@ -72,6 +76,23 @@ def judged(block: SimulatedBlock, found: Found) -> Row:
         if block.positions == "rtk2cm":
             row |= _errors("absolute_", points[known] - true_m, block.gsd_m)
     return {key: plain(value) for key, value in row.items()}
+
+
+def _stated_ratio(block: SimulatedBlock, found: Found) -> float | None:
+    """Root mean square error of the projection centres over that of their stated standard deviations: as they are with
+    RTK, of the block's shape (after a similarity) without positions. None with GPS: what drifts has no deviation.
+    """
+    known = [i for i, sigmas in sorted(found.sigmas_m.items()) if np.isfinite(sigmas).all()]
+    if block.positions == "gps5m" or len(known) < _FEWEST_CHECKED:
+        return None
+    centers_m = np.array([found.centers_m[i] for i in known])
+    true_m = np.array([block.poses[i].center_m for i in known])
+    scale = 1.0
+    if block.positions == "nothing":
+        scale, rotation, shift = similarity(centers_m, true_m)
+        centers_m = scale * centers_m @ rotation.T + shift
+    stated_m = scale * np.array([found.sigmas_m[i] for i in known])
+    return float(np.sqrt(((centers_m - true_m) ** 2).mean() / (stated_m**2).mean()))
 
 
 def _errors(prefix: str, errors_m: FloatArray, gsd_m: float) -> Row:

@@ -9,7 +9,7 @@ degree, the mounting 0.5). nothing: none. Errors are those of about 60 check poi
 with the result, in ground pixels, after the best similarity to truth: medians of a block horizontally and in height,
 and within how many 95 % of the heights are (a bent block has large ones). Absolute: without similarity, where positions
 are exact. Of each line: the median over the scenes and seeds, in brackets the worst case. Focal length and principal
-point: errors of the median camera.
+point: errors of the median camera. Error / stated: of projection centres, over their stated standard deviations.
 
 Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle; colmap-opencv: its model adjusted once
 more as OPENCV with a free principal point; colmap-priors: and so with the given positions as observations. Models are
@@ -133,7 +133,8 @@ def _columns() -> list[Column[Sequence[Row]]]:
     cells = (
         ("horizontal, px", "horizontal_px", 2), ("height, px", "height_px", 2), ("95 % of heights, px", "bend_px", 2),
         ("absolute, horizontal", "absolute_horizontal_px", 2), ("absolute, height", "absolute_height_px", 2),
-        ("focal length, %", "focal_percent", 3), ("principal point, px", "centre_px", 1), ("s", "seconds", 1),
+        ("focal length, %", "focal_percent", 3), ("principal point, px", "centre_px", 1),
+        ("error / stated", "stated_ratio", 2), ("s", "seconds", 1),
     )  # fmt: skip
     return [("images oriented", _oriented), *((title, _cell(field, digits)[1]) for title, field, digits in cells)]
 
