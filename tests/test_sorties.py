@@ -12,7 +12,6 @@ from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.crs import convergence_deg, grid_from_geographic
 from aeromatch_cli.blocks.sorties import Capture, flights, velocities
-from aeromatch_cli.orientation.mapping import Observed
 
 ONE_DAY_S = 86400.0
 
@@ -166,18 +165,12 @@ def test_flights_and_velocities_of_a_folder(tmp_path: Path) -> None:
     inputs = read_inputs(tmp_path, "exif")
     ids = [image.image_id for image in inputs.images]
     assert [inputs.flights[i] for i in ids] == ["flight 1"] * 4 + ["flight 2"] * 4
-    assert [inputs.relative_heights_m[i] for i in ids] == [60.0 + n for n in range(8)]
     turn_deg = convergence_deg("EPSG:32633", np.array([52.501]), np.array([12.0]))[0]
     assert turn_deg == pytest.approx(-2.38, abs=0.01)  # west of the meridian, true north lies right of grid north
     north = np.diff(grid_from_geographic("EPSG:32633", np.array([52.5, 52.501]), np.array([12.0, 12.0])), axis=0)[0]
     north = north / np.linalg.norm(north)
     expected = [*(10.0 * north + 2.0 * np.array([north[1], -north[0]])), 0.5]
     np.testing.assert_allclose(inputs.velocities[ids[0]], expected, atol=1e-3)
-
-
-def test_what_is_observed_has_them_by_default() -> None:
-    observed = Observed({}, {}, {})
-    assert (observed.flights, observed.velocities, observed.relative_heights_m, observed.control) == ({}, {}, {}, ())
 
 
 def test_a_battery_is_told_by_the_take_off_height_alone(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ class BlockInputs:
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
     deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
     recognised: what the pose file was read as, and how many images it has, "" without one. flights, velocities: as in
-    `sorties`. relative_heights_m: image_id -> height above the take-off point.
+    `sorties`.
     """
 
     images: tuple[Image, ...]
@@ -83,7 +83,6 @@ class BlockInputs:
     recognised: str = ""
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
-    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +189,6 @@ def block_inputs(
         recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
         flights=flight_of,
         velocities=velocities(captures, flight_of),
-        relative_heights_m={
-            ids[name]: height_m for name, fact in facts.items() if (height_m := fact.relative_altitude_m) is not None
-        },
     )
 
 

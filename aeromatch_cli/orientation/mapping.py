@@ -57,8 +57,7 @@ class Observed:
     counts. cameras: camera_id -> Camera as it was stated; of others the block's own count. calibration, switches: what
     is free of them, see `calibration.freed`; rolling_shutter: whether read-out times are. flights: image_id -> name of
     its flight. velocities: image_id -> (3,) of
-    the aircraft in the world frame, metres per second, where it is known. relative_heights_m: image_id -> height above
-    the take-off point of its flight, where it is stated. control: surveyed points.
+    the aircraft in the world frame, metres per second, where it is known. control: surveyed points.
     """
 
     poses: Mapping[str, Pose]
@@ -70,7 +69,6 @@ class Observed:
     rolling_shutter: bool = True
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
-    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
 
 

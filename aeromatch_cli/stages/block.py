@@ -43,7 +43,7 @@ _GSD_TOLERANCE = 0.1
 class BlockRead:
     """A block as it is given, with what was learnt on the way.
 
-    recognised, flights, velocities, relative_heights_m: as in `read.BlockInputs`. gsd_before_m: gsd_m and
+    recognised, flights, velocities: as in `read.BlockInputs`. gsd_before_m: gsd_m and
     reduced_gsd_m that the workspace had, or None.
     ground_hint: the ground below relative altitudes, and its source.
     """
@@ -55,7 +55,6 @@ class BlockRead:
     angles: Mapping[str, Angles]
     flights: Mapping[str, str]
     velocities: Mapping[str, FloatArray]
-    relative_heights_m: Mapping[str, float]
     control: tuple[ControlPoint, ...]
     warnings: tuple[str, ...]
     failures: tuple[tuple[str, str], ...]
@@ -100,7 +99,6 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         angles=inputs.angles,
         flights=inputs.flights,
         velocities=inputs.velocities,
-        relative_heights_m=inputs.relative_heights_m,
         control=control,
         warnings=(*inputs.warnings, *_mask_warnings(settings, inputs.images), *remarks, *absent),
         failures=tuple((failure.name, failure.reason) for failure in inputs.failures),

@@ -45,7 +45,7 @@ class Context:
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
     share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal
     length in pixels that EXIF speaks for, where it contradicts the given one. angles: image_id -> attitude as it was
-    given. flights, velocities, relative_heights_m: as in `orientation.mapping.Observed`. control: surveyed points.
+    given. flights, velocities: as in `orientation.mapping.Observed`. control: surveyed points.
     """
 
     settings: Settings
@@ -61,7 +61,6 @@ class Context:
     angles: Mapping[str, Angles] = field(default_factory=dict)
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
-    relative_heights_m: Mapping[str, float] = field(default_factory=dict)
     control: tuple[ControlPoint, ...] = ()
     # By name; none where the images lie in a folder.
     remote: Mapping[str, RemoteFile] = field(default_factory=dict)
@@ -96,7 +95,6 @@ class Context:
             cameras={camera_id: self._stated_camera(camera_id) for camera_id in self.given.cameras},
             flights=self.flights,
             velocities=self.velocities,
-            relative_heights_m=self.relative_heights_m,
             control=self.control,
         )
 

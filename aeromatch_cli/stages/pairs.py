@@ -164,7 +164,6 @@ def _context(
         angles=found.angles,
         flights=found.flights,
         velocities=found.velocities,
-        relative_heights_m=found.relative_heights_m,
         remote=found.remote,
         control=found.control,
         shard=shard,
