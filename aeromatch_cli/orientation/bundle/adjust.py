@@ -41,8 +41,8 @@ _FAR_SIGMAS = 15.0
 _BENT = 1.1
 # An unknown of calibration is held at its prior where its change is less than so many of its standard deviations and
 # the block has told less than half of what was not known of it; or where it moves no image point by so much of the
-# standard deviation of one.
-_SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS = 3.0, 0.5, 0.5
+# standard deviation of one, or by so many pixels: no other program needs to be told of that.
+_SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS, _SEEN_PX = 3.0, 0.5, 0.5, 0.1
 # Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
 # their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
 _UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
@@ -140,9 +140,8 @@ def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> 
     change = np.abs(state.lens - network.lens_prior)
     unclear = change < _SIGNIFICANT_SIGMAS * sigmas
     untold = sigmas > _DETERMINED * np.where(np.isfinite(prior), prior, np.inf)
-    held = (prior > 0.0) & (
-        (unclear & untold) | (_moved_px(network, state, change) < _SEEN_SIGMAS * network.tie_sigma_px)
-    )
+    unseen = _moved_px(network, state, change) < max(_SEEN_SIGMAS * network.tie_sigma_px, _SEEN_PX)
+    held = (prior > 0.0) & ((unclear & untold) | unseen)
     held[:, LENS.index("f")] = False  # its prior weighs
     return replace(network, lens_sigmas=np.where(held, 0.0, prior)) if held.any() else network
 
