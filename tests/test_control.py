@@ -228,3 +228,19 @@ def test_control_points_of_another_place_are_said(truth: Truth, offset_m: tuple,
     assert all(word in line for word, line in zip(words, said, strict=True))
     local = SimpleNamespace(block=replace(truth.block, crs="local"), given=truth.block)
     assert adjust.control_remarks(local, offset_m) == []
+
+
+def test_what_control_points_did_in_the_adjustment_is_said() -> None:
+    control = {
+        "points": 5, "control": 5, "check": 0, "not_measured_in_two_images": [], "control_rmse_m": [0.01, 0.01, 0.02],
+    }  # fmt: skip
+    adjusted = {
+        "used": ["a", "b", "c", "d"], "wrong": ["e"], "exchanged": [], "held_out": "leave one out", "kept": True,
+        "held_out_rms_m": [0.02, 0.03, 0.04], "without_rms_m": [2.0, 3.0, 4.0],
+    }  # fmt: skip
+    assert control_words(control, [{}, adjusted]) == [
+        "control: 5 control points, 0 check points",
+        "control points that the others contradict: e; they were left out",
+        "4 control points take part in the adjustment: RMSE at each control point, adjusted without it x 0.020, y 0.030, "
+        "z 0.040 m, x 2.000, y 3.000, z 4.000 m without control",
+    ]

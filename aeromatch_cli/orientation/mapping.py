@@ -123,7 +123,7 @@ def refine_block(
         ],
     }
     with _task(contents, observed) as folder:
-        facts = _solved(folder, "refiner", task, "pycolmap's bundle adjustment")
+        facts = _solved(folder, "refiner", task, "the bundle adjustment")
         archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
     image_ids, flights = _image_ids(block), sorted(set(observed.flights.values()))
     named = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from aeromatch_cli.data import Block
@@ -147,7 +147,7 @@ def _adjust_lines(stage: StageReport, names: Mapping[str, str]) -> list[str]:
     if len(facts["groups"]) > 1:
         sizes = ", ".join(str(group["images"]) for group in facts["groups"])
         words.append(f"{len(facts['groups'])} groups of images, each oriented by itself: {sizes}")
-    words += control_words(facts["control"])
+    words += control_words(facts["control"], [group.get("control") or {} for group in facts["groups"]])
     words += facts["remarks"]
     outside = list(facts["outside"].items())
     words += [f"not oriented: {names.get(image_id, image_id)}: {reason}" for image_id, reason in outside[:10]]
@@ -184,8 +184,8 @@ def _consistency_lines(stage: StageReport, names: Mapping[str, str]) -> list[str
     return [f"          {words}; {facts['verified_matches']} verified matches are left{right}", *lines]
 
 
-def control_words(control: Mapping[str, Any] | None) -> list[str]:
-    """Errors at surveyed points."""
+def control_words(control: Mapping[str, Any] | None, adjusted: Sequence[Mapping[str, Any]] = ()) -> list[str]:
+    """Errors at surveyed points. adjusted: what control points did in the adjustment of every group."""
     if control is None:
         return []
     counts = f"control: {control['control']} control points, {control['check']} check points"
@@ -199,12 +199,33 @@ def control_words(control: Mapping[str, Any] | None) -> list[str]:
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
 
-    words = [counts, *wrong, offset_words(control)]
+    taking_part = _adjusted_words([one for one in adjusted if one], shown)
+    if any(one.get("used") for one in adjusted):
+        return [counts, *wrong, *taking_part]
+    words = [counts, *wrong, *taking_part, offset_words(control)]
     words.append(f"after a similarity to the control points: RMSE of the fit {shown(control['control_rmse_m'])} m")
     if control["check_rmse_m"] is not None:
         words[-1] += f", at {_CHECKED[control['check_kind']]} {shown(control['check_rmse_m'])} m"
     if control["doubtful"]:
         words.append(f"control points that the others contradict: {_listed(control['doubtful'])}")
+    return words
+
+
+def _adjusted_words(control: Sequence[Mapping[str, Any]], shown: Callable[[list[float]], str]) -> list[str]:
+    """What control points did in the adjustment."""
+    words = []
+    for one in control:
+        if one["exchanged"]:
+            words.append(f"names of control points that are exchanged: {_listed(one['exchanged'])}; they were left out")
+        if one["wrong"]:
+            words.append(f"control points that the others contradict: {_listed(one['wrong'])}; they were left out")
+        held_out = "check points" if one["held_out"] == "check points" else "each control point, adjusted without it"
+        with_m, without_m = one["held_out_rms_m"], one["without_rms_m"]
+        errors = f": RMSE at {held_out} {shown(with_m)} m, {shown(without_m)} m without control" if with_m else ""
+        if one["kept"]:
+            words.append(f"{len(one['used'])} control points take part in the adjustment{errors}")
+        else:
+            words.append(f"control points do not take part in the adjustment, which they do not make better{errors}")
     return words
 
 
