@@ -241,6 +241,6 @@ def test_what_control_points_did_in_the_adjustment_is_said() -> None:
     assert control_words(control, [{}, adjusted]) == [
         "control: 5 control points, 0 check points",
         "control points that the others contradict: e; they were left out",
-        "4 control points take part in the adjustment: RMSE at each control point, adjusted without it x 0.020, y 0.030, "
-        "z 0.040 m, x 2.000, y 3.000, z 4.000 m without control",
+        "4 control points take part in the adjustment: RMSE at each control point, adjusted without it x 0.020, y "
+        "0.030, z 0.040 m, x 2.000, y 3.000, z 4.000 m without control",
     ]
