@@ -39,8 +39,8 @@ _STEPS = 100
 _SOLVED_PX = 1e-6
 # A camera that is off by more (root mean square, as a share of the picture's width) is none.
 _LARGEST_MISFIT = 0.003
-# Nobody measures less in a picture: a camera that is off by less anywhere is the same one.
-SAME_PX = 0.02
+# Tie points are measured to this, about: a camera that is off by less anywhere is the same one.
+SAME_PX = 0.1
 # Of a fisheye lens, what is further from the axis (tangent of 70 degrees) has no place in models for other lenses.
 _WIDEST = math.tan(math.radians(70.0))
 

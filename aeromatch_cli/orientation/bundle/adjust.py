@@ -26,8 +26,9 @@ _SETTLED, _MAX_ROUNDS = 0.1, 5
 _ROUGH, _ROUGH_ROUNDS = 1e-3, 2
 # No coordinate of an image point is measured more exactly, pixels; where poses are rough, none counts as worse.
 _LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.05, 20.0
-# Distances of normally distributed residuals in the plane have this median, in standard deviations of a coordinate.
-_MEDIAN_DISTANCE = 1.1774
+# Distances of normally distributed residuals in the plane have this mean, in standard deviations of a coordinate. Those
+# beyond so many medians are outliers, and count as that: more than the loss leaves of them, less than they are.
+_MEAN_DISTANCE, _OUTLYING = 1.2533, 5.0
 # What was stated of the accuracy of positions counts as much as so many residuals. Positions that are off by more than
 # the larger factor have another reason than their accuracy: they are not given up for it.
 _STATED_RESIDUALS, _MOST_FACTOR, _LEAST_FACTOR = 3.0, 5.0, 0.2
@@ -40,12 +41,15 @@ _FAR_SIGMAS = 15.0
 # Positions that make residuals of image points larger by this factor bend the block.
 _BENT = 1.1
 # An unknown of calibration is held at its prior where its change is less than so many of its standard deviations and
-# the block has told less than half of what was not known of it; or where it moves no image point by so much of the
-# standard deviation of one, or by so many pixels: no other program needs to be told of that.
-_SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS, _SEEN_PX = 3.0, 0.5, 0.5, 0.1
+# the block has told less than half of what was not known of it, or it moves no image point by so much of the standard
+# deviation of one.
+_SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS = 3.0, 0.5, 0.5
 # Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
 # their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
 _UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
+# Errors of a receiver without corrections are the same for minutes: where less exact positions than this were stated,
+# metres, what all of a flight have in common is no better than one of them.
+_UNCORRECTED_M = 0.5
 # Standard deviations of what may explain residuals, before the block is asked: shifts of a flight's positions, metres;
 # their delay, seconds; the lever arm, metres; the read-out of a shutter, seconds.
 _SHIFT_M, _LAG_S, _LEVER_M, _READOUT_S = 20.0, 1.0, 0.5, 0.03
@@ -91,8 +95,18 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
         if explained is not network:
             network, state = _with_image_sigma(explained, state, options.tolerance)
     network, state, factors = _with_position_sigmas(network, state, options)
-    found = covariance(network, state) if options.final else None
+    found = covariance(_with_common_errors(network, stated), state) if options.final else None
     return Adjusted(network, state, network.tie_sigma_px, factors, found, stated)
+
+
+def _with_common_errors(network: Network, stated: Network) -> Network:
+    """The network as its standard deviations are to be stated: a flight's positions may be off together."""
+    common = network.flight_sigmas.copy()
+    for flight in range(network.flights):
+        sigmas_m = stated.position_sigmas_m[network.located & (network.flight == flight)]
+        if len(sigmas_m) and np.median(sigmas_m) > _UNCORRECTED_M:
+            common[flight, :3] = np.maximum(common[flight, :3], np.median(sigmas_m, axis=0))
+    return replace(network, flight_sigmas=common)
 
 
 def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tuple[Network, Unknowns]:
@@ -123,15 +137,16 @@ def _of_sigma(network: Network, sigma_px: float) -> Network:
 
 
 def _sigma_px(network: Network, state: Unknowns, *, redundant: bool) -> float:
-    """Standard deviation of a coordinate of a tie point, from the median residual and, with redundant, what the
-    unknowns have taken from it."""
+    """Standard deviation of a coordinate of a tie point, from the residuals and, with redundant, what the unknowns have
+    taken from them. Matches of small blocks have long tails: their median alone would promise too much."""
     apart_px = (residuals_in_sigmas(network, state) * network.sigma_px)[network.tie_points]
     if not len(apart_px):
         return 1.0
     coordinates = 2 * len(apart_px)
     unknowns = 3 * len(state.points_m) + 6 * int((~network.held).sum())
     taken = np.sqrt(coordinates / max(coordinates - unknowns, 0.1 * coordinates)) if redundant else 1.0
-    return float(np.clip(np.median(apart_px) / _MEDIAN_DISTANCE * taken, _LEAST_SIGMA_PX, _MOST_SIGMA_PX))
+    mean_px = np.minimum(apart_px, _OUTLYING * np.median(apart_px)).mean()
+    return float(np.clip(mean_px / _MEAN_DISTANCE * taken, _LEAST_SIGMA_PX, _MOST_SIGMA_PX))
 
 
 def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> Network:
@@ -140,8 +155,8 @@ def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> 
     change = np.abs(state.lens - network.lens_prior)
     unclear = change < _SIGNIFICANT_SIGMAS * sigmas
     untold = sigmas > _DETERMINED * np.where(np.isfinite(prior), prior, np.inf)
-    unseen = _moved_px(network, state, change) < max(_SEEN_SIGMAS * network.tie_sigma_px, _SEEN_PX)
-    held = (prior > 0.0) & ((unclear & untold) | unseen)
+    unseen = _moved_px(network, state, change) < _SEEN_SIGMAS * network.tie_sigma_px
+    held = (prior > 0.0) & unclear & (untold | unseen)
     held[:, LENS.index("f")] = False  # its prior weighs
     return replace(network, lens_sigmas=np.where(held, 0.0, prior)) if held.any() else network
 
