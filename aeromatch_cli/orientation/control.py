@@ -30,7 +30,7 @@ def control_figures(
     parallel or meet behind a camera, which are left out. None where too few are left.
     """
     rays = {point.name: _rays(adjusted, cameras, point) for point in points}
-    found = {point.name: _intersected(*rays[point.name]) for point in points}
+    found = {point.name: intersected(*rays[point.name]) for point in points}
     seen = [point for point in points if found[point.name] is not None]
     control = [point for point in seen if not point.check]
     checks = [point for point in seen if point.check]
@@ -97,7 +97,7 @@ def _rays(adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: Control
     return np.array(centers).reshape(-1, 3), np.array(rays).reshape(-1, 3)
 
 
-def _intersected(centers_m: FloatArray, rays: FloatArray) -> FloatArray | None:
+def intersected(centers_m: FloatArray, rays: FloatArray) -> FloatArray | None:
     """World point (3,) nearest to the rays; None below two, where they are parallel or meet behind a camera."""
     if len(rays) < 2 or not np.isfinite(rays).all():
         return None

@@ -13,13 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import FloatArray
+from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.geometry.cameras import BROWN, FISHEYE, world_rays
 from aeromatch_cli.orientation.adjusting import Outcome, Work, take_outcome
 from aeromatch_cli.orientation.bundle.adjust import adjust
 from aeromatch_cli.orientation.bundle.network import Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import cost
 from aeromatch_cli.orientation.bundle.solve import solve
+from aeromatch_cli.orientation.calibration import camera_of
+from aeromatch_cli.orientation.control import intersected
 
+# Control points farther from the block than this, metres, are in another coordinate system.
+_FAR_M = 300.0
 # Standard deviation of what the positions of a flight have in common, metres: from one geoid or datum to another.
 _DATUM_M = 100.0
 # Control points contradict each other where they raise the sum of squares by more than so many times what chance does;
@@ -68,12 +73,17 @@ def with_control(
     that took no part, with and without control; "kept".
     """
     images = set(outcome.images)
-    seen = [point for point in surveyed if point.seen_by(images) >= 2]
-    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
-    if not control:
-        return outcome, {}
     base = _Block(outcome.result.network, outcome.result.state, outcome)
+    seen = [point for point in surveyed if point.seen_by(images) >= 2 and np.isfinite(base.error_m(point)).all()]
+    control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
+    if not seen:
+        return outcome, {}
     without_m = np.array([base.error_m(point) for point in seen])
+    offset_m = np.median(without_m, axis=0)
+    if not control or float(np.abs(offset_m).max()) > _FAR_M:
+        errors_m = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
+        found = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": not control}
+        return outcome, found | {"held_out_rms_m": errors_m, "without_rms_m": errors_m}
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
@@ -137,37 +147,31 @@ class _Block:
             control_m=np.array([p.position_m for p in points]).reshape(-1, 3),
             control_sigmas_m=np.array([p.sigmas_m for p in points]).reshape(-1, 3),
         )
-        start_m = network.control_m - self._datum_m(points)
+        found = [self.place_m(p) for p in points]
+        start_m = [p.position_m if place is None else place for p, place in zip(points, found, strict=True)]
+        start_m = np.array(start_m).reshape(-1, 3)
         state = replace(self.state, points_m=np.concatenate([self.state.points_m[:ties], start_m]))
         return network, state
 
-    def _datum_m(self, points: Sequence[Surveyed]) -> FloatArray:
-        """(3,) by how much surveyed points lie off the block, where that is more than their relief: intersections start
-        from there."""
-        ground_m = np.median(self.state.points_m[: len(self.outcome.points)], axis=0)
-        off_m = np.median([p.position_m for p in points], axis=0) - ground_m if points else np.zeros(3)
-        return np.array([0.0, 0.0, off_m[2]])
+    def place_m(self, point: Surveyed) -> FloatArray | None:
+        """(3,) where the rays of the block meet, None where they do not."""
+        row = {number: k for k, number in enumerate(self.outcome.images)}
+        seen = [(row[n], x, y) for n, x, y in point.pixels if n in row]
+        rays = [
+            world_rays(self._camera(k), self.state.rotations[k], np.array([[x, y]]))[0] for k, x, y in seen
+        ]
+        return intersected(self.state.centers_m[[k for k, _, _ in seen]], np.array(rays).reshape(-1, 3))
+
+    def _camera(self, image: int) -> Camera:
+        """Of an image; the size of its pictures plays no part."""
+        camera = self.network.camera[image]
+        kind = Camera(FISHEYE if self.network.fisheye[camera] else BROWN, 0, 0, ())
+        return camera_of(self.state.lens[camera], kind)
 
     def error_m(self, point: Surveyed) -> FloatArray:
-        """(3,) where the rays of the block meet, less the surveyed position."""
-        network, state = self.with_points([point])
-        only = network.point == len(self.outcome.points)
-        held = replace(
-            network,
-            image=network.image[only],
-            point=np.zeros(int(only.sum()), dtype=np.int64),
-            xy_px=network.xy_px[only],
-            sigma_px=network.sigma_px[only],
-            control=np.zeros(0, dtype=np.int64),
-            control_m=np.zeros((0, 3)),
-            control_sigmas_m=np.zeros((0, 3)),
-            held=np.ones_like(network.held),
-            lens_sigmas=np.zeros_like(network.lens_sigmas),
-            mount_sigmas=np.zeros_like(network.mount_sigmas),
-            flight_sigmas=np.zeros_like(network.flight_sigmas),
-        )
-        found = solve(held, replace(state, points_m=state.points_m[-1:]), 1e-9).state
-        return np.asarray(found.points_m[0] - np.array(point.position_m))
+        """(3,) where the rays of the block meet, less the surveyed position; NaN where they do not."""
+        place_m = self.place_m(point)
+        return np.full(3, np.nan) if place_m is None else place_m - point.position_m
 
     def adjusted(self, work: Work, points: Sequence[Surveyed]) -> _Block:
         """The block with these control points, all else determined anew."""

@@ -161,7 +161,7 @@ def _write(
 
 def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Figures of the whole and of every group, and why images are not oriented."""
-    control = _control(context, adjusted)
+    control = _control(context, adjusted, figures)
     return {
         **block_figures(adjusted, context.block.images, figures),
         "positions_given": len(context.given.poses),
@@ -218,14 +218,20 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
     return []
 
 
-def _control(context: Context, adjusted: AdjustedBlock) -> dict[str, Any] | None:
+def _control(
+    context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]
+) -> dict[str, Any] | None:
+    """The block beside surveyed points, without those that the adjustment has found wrong or exchanged."""
     if not context.control:
         return None
+    found = [one.get("control") or {} for one in figures]
+    left_out = {name for one in found for key in ("wrong", "exchanged") for name in one.get(key, ())}
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
     # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
     beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
     placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
-    return control_figures(replace(adjusted, poses=placed), cameras, context.control)
+    points = [point for point in context.control if point.name not in left_out]
+    return control_figures(replace(adjusted, poses=placed), cameras, points)
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:

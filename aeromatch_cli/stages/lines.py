@@ -193,15 +193,15 @@ def control_words(control: Mapping[str, Any] | None, adjusted: Sequence[Mapping[
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.get("rays_do_not_meet")  # of earlier versions not
     wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
-    if control["control_rmse_m"] is None:
-        return [f"{counts}: fewer than 3 are measured in two oriented images, nothing to compare", *wrong]
-
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
 
     taking_part = _adjusted_words([one for one in adjusted if one], shown)
-    if any(one.get("used") for one in adjusted):
+    if any(one.get("used") for one in adjusted) or (taking_part and not control["control"]):
         return [counts, *wrong, *taking_part]
+    if control["control_rmse_m"] is None:
+        few = f"{counts}: fewer than 3 control points are measured in two oriented images, no similarity to them"
+        return [few, *wrong, *taking_part]
     words = [counts, *wrong, *taking_part, offset_words(control)]
     words.append(f"after a similarity to the control points: RMSE of the fit {shown(control['control_rmse_m'])} m")
     if control["check_rmse_m"] is not None:
@@ -222,7 +222,9 @@ def _adjusted_words(control: Sequence[Mapping[str, Any]], shown: Callable[[list[
         held_out = "check points" if one["held_out"] == "check points" else "each control point, adjusted without it"
         with_m, without_m = one["held_out_rms_m"], one["without_rms_m"]
         errors = f": RMSE at {held_out} {shown(with_m)} m, {shown(without_m)} m without control" if with_m else ""
-        if one["kept"]:
+        if one["kept"] and not one["used"]:
+            words.append(f"the block as it is: RMSE at check points {shown(with_m)} m" if with_m else "no check points")
+        elif one["kept"]:
             words.append(f"{len(one['used'])} control points take part in the adjustment{errors}")
         else:
             words.append(f"control points do not take part in the adjustment, which they do not make better{errors}")
