@@ -243,7 +243,7 @@ def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
     sizes = ", ".join(str(group["images"]) for group in placed[:5]) + (", ..." if len(placed) > 5 else "")
     words = (
         f"{len(placed)} parts ({sizes} images) share too few points and lie to each other as their positions put them, "
-        f"to {exact_m:.2g} m ({exact_m / pixel_m:.1f} ground pixels)"
+        f"to {plain(exact_m)} m ({exact_m / pixel_m:.1f} ground pixels)"
     )
     remedy = "more overlap between them, better positions, or control points in each tie them"
     yield _finding("parts", exact_m / pixel_m, _PARTS_PIXELS, words, remedy)
@@ -273,7 +273,7 @@ def _positions(evidence: Evidence) -> _Found:
             float(np.sqrt(shares @ [_rms(np.array(one[key])[axes]) ** 2 for one in found]))
             for key in ("rms_sigmas", "rms_m", "stated_m")
         )
-        words = f"positions are met {name} to {off_m:.3g} m, {sigmas:.1f} times the {stated_m:.3g} m stated"
+        words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
         yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, remedy)
 
 
@@ -283,11 +283,11 @@ def _flights(evidence: Evidence) -> _Found:
         positions, found = group.get("positions") or {}, set[str]()
         stated_m = positions.get("stated_m") or [np.inf] * 3
         for flight in group.get("flights", ()):
-            name, images = flight["flight"] or "without times", flight["images"]
+            name, images = _flight(flight["flight"]), flight["images"]
             step_m = flight.get("step_m", 0.0)
             if step_m:
                 words = (
-                    f"heights of flight {name} ({images} images) lie {abs(step_m):.1f} m "
+                    f"heights of {name} ({images} images) lie {abs(step_m):.1f} m "
                     f"{'above' if step_m > 0.0 else 'below'} those of the others, which was taken out"
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
@@ -295,20 +295,27 @@ def _flights(evidence: Evidence) -> _Found:
             shift_m, sigma_m = np.array([flight.get(f"shift_{axis}", [0.0, 0.0]) for axis in "xyz"]).T
             if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
-                words = f"positions of flight {name} ({images} images) are off by {shown} m, which was taken out"
+                words = f"positions of {name} ({images} images) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
                 known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
                 sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
                 yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
-            found.add(name)
+            found.add(flight["flight"])
             if "lag_s" in flight:
                 lag_s = flight["lag_s"][0]
-                words = f"positions of flight {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
+                words = f"positions of {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
                 remedy = "check the times by which positions were given to images"
                 yield _finding("delay of positions", abs(lag_s), _LAG_S, words, remedy)
 
         left = [one for one in positions.get("flights", ()) if one["flight"] not in found]
         yield from _apart(left, np.array(stated_m))
+
+
+def _flight(name: str) -> str:
+    """Names of flights may begin with that word."""
+    if not name:
+        return "the flight without times"
+    return name if name.lower().startswith("flight") else f"flight {name}"
 
 
 def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterator[Finding]:
@@ -323,9 +330,10 @@ def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterat
         if max(flight["scatter_m"][axis], most["scatter_m"][axis]) > _FLIGHT_SCATTER * abs(off_m[axis]):
             continue
         what = ("x", "y", "heights")[axis]
+        off = f"{'-' if off_m[axis] < 0.0 else '+'}{plain(abs(off_m[axis]), 3)} m"
         words = (
-            f"{what} of flight {flight['flight'] or 'without times'} ({flight['images']} images) lie "
-            f"{off_m[axis]:+.3g} m from those of the largest flight, which is in the result"
+            f"{what} of {_flight(flight['flight'])} ({flight['images']} images) lie {off} from those of the largest "
+            "flight, which is in the result"
         )
         remedy = "check their datum and base stations, or state the accuracy of both as they are"
         yield _finding("flights apart", float(abs(off_m[axis]) / stated_m[axis]), _FLIGHT_SIGMAS, words, remedy)
@@ -474,7 +482,7 @@ def _deformation(evidence: Evidence) -> _Found:
         return
 
     def length(value_m: float) -> str:
-        metres = f" ({value_m:.2g} m)" if evidence.metric else ""
+        metres = f" ({plain(value_m)} m)" if evidence.metric else ""
         return f"{value_m / pixel_m:.1f} ground pixels{metres}"
 
     def part(group: Mapping[str, Any]) -> str:
@@ -499,7 +507,7 @@ def _deformation(evidence: Evidence) -> _Found:
         sigma_m, stated_m = worst["heights"]["sigma_m"], worst["positions"]["stated_m"][2]
         # As exact as positions are is as exact as can be asked for.
         limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / pixel_m)
-        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {stated_m:.2g} m"
+        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {plain(stated_m)} m"
         remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
         yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
 
@@ -521,6 +529,11 @@ def _rms(values: Any) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+
+
+def plain(value: float, digits: int = 2) -> str:
+    """At least so many significant digits, without a power of ten where the number is large: 110, 2.9, 0.034."""
+    return f"{value:.0f}" if abs(value) >= 10.0 ** (digits - 1) else f"{value:.{digits}g}"
 
 
 def _rounded(value: float | None) -> float | None:
