@@ -213,8 +213,8 @@ def _frames(evidence: Evidence) -> _Found:
     given = int(evidence.adjust.get("positions_given", 0))
     used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
     kept = any(kind == "given" for kind in kinds)
+    # Control points that took no part show how the block is to be moved; they do not hold it.
     surveyed = sum(len((group.get("control") or {}).get("used", ())) for group in evidence.groups)
-    fitted = (evidence.adjust.get("control") or {}).get("control") or 0
     if used >= _HOLDING or surveyed >= _HOLDING or kept:
         return
     if given >= _HOLDING:
@@ -223,12 +223,10 @@ def _frames(evidence: Evidence) -> _Found:
             "system, the order of x and y, and which position belongs to which image"
         )
         yield Finding("positions", 1.0, _WRONG_POSITIONS[0], "bad", words)
-    elif fitted >= _HOLDING:
-        yield "positions: none are given; the control points show how the block is to be moved"
     else:
         words = (
             "shape only: nothing ties the block to the ground, place, north and scale are arbitrary: positions "
-            "(--poses) or three control points (--gcp) do"
+            "(--poses) do; control points alone show how the block is to be moved"
         )
         yield Finding("ground", None, None, "doubtful", words)
 
@@ -375,13 +373,12 @@ def _control(evidence: Evidence) -> _Found:
     words = f"{len(unlike)} of {count} surveyed points contradict the others"
     remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
     yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
-    refused = [one for one in inside if not one.get("kept", True)]
-    if refused:
-        words = (
-            "the control points do not make points better that took no part, and were left out: check their coordinate "
-            "system, their heights and where they were measured"
-        )
-        yield Finding("control points", None, None, "doubtful", words)
+    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
+    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
+    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    for one in inside:
+        if not one.get("kept", True):
+            yield _refused(one, stated_m)
     # Points left out of few leave a block that is not the one that all of them hold.
     held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
     errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
@@ -389,15 +386,30 @@ def _control(evidence: Evidence) -> _Found:
     if not errors:
         yield "control points: too few to check the block by them"
         return
-    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
-    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
-    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
     errors_m = max(errors, key=lambda error_m: float((np.array(error_m) / stated_m).max()))
     sigmas = float((np.array(errors_m) / stated_m).max())
-    shown = ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
-    words = f"points that took no part are met to {shown} m, {sigmas:.1f} times what can be expected"
+    words = f"points that took no part are met to {_axes(errors_m)} m, {sigmas:.1f} times what can be expected"
     remedy = "check their coordinates and measurements; more control points at the border of the block help"
     yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
+
+
+def _refused(control: Mapping[str, Any], stated_m: FloatArray) -> Finding:
+    """Control points that the adjustment left out: because it was as good without them, or because they do not fit."""
+    errors_m = [control.get(key) for key in ("held_out_rms_m", "without_rms_m")]
+    sigmas = max(float((np.array(one) / stated_m).max()) if one else np.inf for one in errors_m)
+    limit, without_m = _CONTROL_SIGMAS[0], errors_m[1]
+    if without_m and sigmas <= limit:
+        words = f"control points agree with the block to {_axes(without_m)} m and were not needed"
+        return Finding("control points", sigmas, limit, "good", words)
+    words = (
+        "the control points do not make points better that took no part, and were left out: check their coordinate "
+        "system, their heights and where they were measured"
+    )
+    return Finding("control points", sigmas if np.isfinite(sigmas) else None, limit, "doubtful", words)
+
+
+def _axes(errors_m: Sequence[float]) -> str:
+    return ", ".join(f"{axis} {error_m:.3f}" for axis, error_m in zip("xyz", errors_m, strict=True))
 
 
 def _errors(evidence: Evidence) -> _Found:
@@ -436,26 +448,32 @@ def _calibration(evidence: Evidence) -> _Found:
         for camera_id, camera in (group.get("calibration") or {}).items():
             if camera_id in told:  # a camera is one and the same for all groups
                 continue
+            parameters = camera["parameters"]
             changes = {
                 name: abs(value - prior) / prior_sigma
-                for name, (value, _, prior, prior_sigma) in camera["parameters"].items()
-                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(camera["parameters"])
+                for name, (value, _, prior, prior_sigma) in parameters.items()
+                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(parameters) | {"b1", "b2"}
             }
-            read_out = camera["parameters"].get("readout_s")
+            read_out = parameters.get("readout_s")
             if read_out and read_out[1] > 0.0:
                 words = f"camera {camera_id} reads a picture in {read_out[0]:+.3f} s (rolling shutter)"
                 remedy = "no shutter needs as long, or backwards: check the times of the images"
                 readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
                 yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
+            affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
+            if affinity:
+                name = max(affinity, key=lambda key: affinity[key])
+                words = _change(camera_id, name, parameters[name], affinity[name])
+                remedy = (
+                    "pixels of sensors are square: a rolling shutter looks like that where images have no velocities; "
+                    "give capture times or a shorter exposure"
+                )
+                yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
             if not changes:
                 continue
             told.add(camera_id)
             name = max(changes, key=lambda key: changes[key])
-            value, _, prior, prior_sigma = camera["parameters"][name]
-            words = (
-                f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- "
-                f"{_number(prior_sigma)} is known, {changes[name]:.1f} standard deviations"
-            )
+            words = _change(camera_id, name, parameters[name], changes[name])
             remedy = (
                 "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
                 "as well, and heights with it"
@@ -465,9 +483,17 @@ def _calibration(evidence: Evidence) -> _Found:
         yield "calibration: it was not adjusted"
 
 
+def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:
+    value, _, prior, prior_sigma = parameter
+    return (
+        f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- {_number(prior_sigma)} "
+        f"is known, {sigmas:.1f} standard deviations"
+    )
+
+
 def _stated(parameters: Mapping[str, Sequence[float]]) -> set[str]:
     """Parameters that are judged by what is known of them: of a lens that nobody has calibrated, terms of distortion
-    and affinity are what they are."""
+    are what they are, and those of affinity are judged by themselves."""
     terms = {"k1", "k2", "k3", "p1", "p2", "b1", "b2"}
     calibrated = any(parameters[name][2] != 0.0 for name in terms & parameters.keys())
     return {"f", "cx", "cy"} | (terms if calibrated else set())
