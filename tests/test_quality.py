@@ -165,6 +165,14 @@ def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
         assert quality.verdict == level
 
 
+@pytest.mark.parametrize(("name", "verdict"), [("cx", "doubtful"), ("f", "bad")])
+def test_a_block_of_unknown_tilt_does_not_tell_the_principal_point(name: str, verdict: str) -> None:
+    group = lens(**{name: [1100.0, 1.0, 1000.0, 10.0]})
+    assert judged_with(group=group).verdict == "bad"
+    quality = judged_with(group=group | heights(tilt_m=5.0))
+    assert found(quality, "calibration").level == quality.verdict == verdict
+
+
 def test_a_shift_that_is_not_significant_is_none() -> None:
     quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
     assert quality.verdict == "good"

@@ -92,7 +92,7 @@ def _general() -> Iterator[str]:
 def _plain_sections() -> list[str]:
     """Groups of settings that no strategy brings."""
     settings = Settings()
-    return [key for key in Settings.model_fields if key not in FAMILIES and isinstance(getattr(settings, key), BaseModel)]
+    return [key for key, value in settings if key not in FAMILIES and isinstance(value, BaseModel)]
 
 
 def _is_plain(annotation: Any) -> bool:

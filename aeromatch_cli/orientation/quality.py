@@ -472,13 +472,17 @@ def _calibration(evidence: Evidence) -> _Found:
             if not changes:
                 continue
             told.add(camera_id)
-            name = max(changes, key=lambda key: changes[key])
+            limits = dict.fromkeys(changes, _LENS_SIGMAS)
+            if _tilt_deg(group) > _TILT_DEG[0]:  # what does not tell its tilt does not tell the principal point either
+                limits |= dict.fromkeys({"cx", "cy"} & changes.keys(), (_LENS_SIGMAS[0], None))
+            levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
+            name = max(changes, key=lambda key: (levels[key], changes[key]))
             words = _change(camera_id, name, parameters[name], changes[name])
             remedy = (
                 "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
                 "as well, and heights with it"
             )
-            yield _finding("calibration", changes[name], _LENS_SIGMAS, words, remedy)
+            yield _finding("calibration", changes[name], limits[name], words, remedy)
     if not told:
         yield "calibration: it was not adjusted"
 
@@ -522,8 +526,8 @@ def _deformation(evidence: Evidence) -> _Found:
     placed = [group for group in known if group["kind"] != "level"]
     if not placed:
         return
-    angles = [float(np.rad2deg(np.arctan2(g["heights"]["tilt_m"], g["heights"]["reach_m"]))) for g in placed]
-    angle, worst = max(zip(angles, placed, strict=True), key=lambda one: one[0])
+    worst = max(placed, key=_tilt_deg)
+    angle = _tilt_deg(worst)
     words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
     remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
     yield _finding("tilt", angle, _TILT_DEG, words, remedy)
@@ -536,6 +540,12 @@ def _deformation(evidence: Evidence) -> _Found:
         words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {plain(stated_m)} m"
         remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
         yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
+
+
+def _tilt_deg(group: Mapping[str, Any]) -> float:
+    """Expected error of a part's tilt; 0 where it is not known."""
+    heights = group.get("heights")
+    return float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"]))) if heights else 0.0
 
 
 def _kept_poses(evidence: Evidence) -> _Found:
