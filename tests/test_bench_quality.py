@@ -63,7 +63,7 @@ def test_a_good_block_is_not_bad_and_a_spoilt_one_is_not_good() -> None:
     assert errors["focal_percent"] < 1.0
     for name, what in (
         ("focal length stated 26 % too long, to 1 %", "calibration"),
-        ("RTK rounded to metres", "wrong positions"),
+        ("RTK rounded to metres", "positions horizontally"),
     ):
         quality = judged(evidence_of(spoilt(task, name))[0])
         assert quality.verdict == "bad", name
