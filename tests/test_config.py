@@ -242,6 +242,32 @@ def test_overrides_reach_strategies_and_chains() -> None:
     assert load("baseline", ["export=none"]).export == ()
 
 
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("none", ()),
+        ("[]", ()),
+        ("b1", ("b1",)),
+        ("k1+k2", ("k1", "k2")),
+        ("k1 + k2+k3", ("k1", "k2", "k3")),
+        ("[b1, b2]", ("b1", "b2")),
+        ("f+cx+cy+k1+k2+k3+p1+p2+b1+b2", ("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2")),
+    ],
+)
+def test_lists_of_parameters_are_written_like_chains(text: str, names: tuple[str, ...]) -> None:
+    found = load("baseline", [f"adjust.hold={text}", f"adjust.free={text}"]).adjust
+    assert (found.hold, found.free) == (names, names)
+
+
+def test_an_unknown_parameter_of_a_list_is_named() -> None:
+    assert "(got 'k9')" in fault("baseline", "adjust.hold=k1+k9")
+
+
+def test_the_page_has_every_section() -> None:
+    text = page()
+    assert all(f"\n## {key}\n" in text for key in (*FAMILIES, "block", "adjust", "run"))
+
+
 @pytest.mark.parametrize("switch", ["match=lightglue", "match.name=lightglue", "match={name: lightglue}"])
 def test_another_strategy_drops_the_keys_of_the_first(switch: str) -> None:
     found = load("baseline", ["match.ratio=0.5", switch, "match.weights=x"])

@@ -36,6 +36,7 @@ def test_kappas_off_by_180_degrees_are_named_and_replaced(site: Site, rendered: 
     site.rewrite_poses(lambda rows: turned(rows, 180.0))
     outcome = site("run", *PAGE)
     assert outcome.code == 0
+    assert outcome.facts["quality"]["verdict"] == "doubtful"  # of its tilt
     warning = "warning: the given angles do not fit the pictures: all kappas are off by 180 degrees"
     assert warning in outcome.stderr
     errors = attitude_errors(site, rendered)
@@ -129,6 +130,9 @@ def test_surveyed_poses_stay_but_are_judged(site: Site, rendered: Path) -> None:
 def test_surveyed_poses_that_fit_nothing_are_said(site: Site) -> None:
     site.rewrite_poses(lambda rows: turned(rows, 180.0))
     outcome = site("run", "--set", "orient=given", *PAGE)
+    assert outcome.code == 1
+    assert outcome.facts["quality"]["verdict"] == "bad"
+    assert outcome.facts["quality"]["findings"][0]["what"] == "oriented images"
     words = "They do not fit the given poses; use orient=global instead of given"
     assert words in outcome.stdout
     assert words in (site.work / "report" / "index.html").read_text()

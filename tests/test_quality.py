@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged
+from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
@@ -105,6 +105,8 @@ def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
         # The factory's focal length is 1964 px to 1 %, the adjusted one 2480 px.
         ({"group": lens(f=[2480.0, 1.0, 1964.0, 19.64])}, "calibration", 26.27, "bad"),
         ({"group": lens(k1=[0.2, 0.001, -0.01, 0.05])}, "calibration", 4.2, "doubtful"),
+        ({"group": lens(b1=[9.0, 0.1, 0.0, 0.6])}, "affinity", 15.0, "doubtful"),
+        ({"group": lens(b1=[0.3, 0.1, 0.0, 0.6])}, "affinity", 0.5, "good"),
         ({"group": lens(readout_s=[0.03, 0.001, 0.0, 0.03])}, "rolling shutter", 0.03, "good"),
         ({"group": lens(readout_s=[0.5, 0.001, 0.0, 0.03])}, "rolling shutter", 0.5, "doubtful"),
         ({"group": heights(bowl_m=0.3)}, "bowl", 10.0, "doubtful"),
@@ -163,6 +165,14 @@ def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
         assert quality.verdict == level
 
 
+@pytest.mark.parametrize(("name", "verdict"), [("cx", "doubtful"), ("f", "bad")])
+def test_a_block_of_unknown_tilt_does_not_tell_the_principal_point(name: str, verdict: str) -> None:
+    group = lens(**{name: [1100.0, 1.0, 1000.0, 10.0]})
+    assert judged_with(group=group).verdict == "bad"
+    quality = judged_with(group=group | heights(tilt_m=5.0))
+    assert found(quality, "calibration").level == quality.verdict == verdict
+
+
 def test_a_shift_that_is_not_significant_is_none() -> None:
     quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
     assert quality.verdict == "good"
@@ -177,6 +187,35 @@ def test_a_block_that_nothing_ties_to_the_ground_has_a_shape_only() -> None:
     assert quality.verdict == "doubtful"
     assert quality.faults[0].sentence.startswith("shape only")
     assert "angles: none are given" in quality.unchecked
+    assert quality.unchecked.count("positions: none are given") == 1
+
+
+@pytest.mark.parametrize(("inside", "verdict"), [({}, "doubtful"), (INSIDE | {"held_out_rms_m": [0.02] * 3}, "good")])
+def test_control_points_hold_a_block_only_where_they_took_part(inside: dict[str, Any], verdict: str) -> None:
+    group = {"kind": "level", "positions": None, "control": inside}
+    quality = judged_with(group=group, adjust={"positions_given": 0, "residuals": {}, "control": CONTROL})
+    assert quality.verdict == verdict
+    assert [one.what for one in quality.faults] == ["ground"] * (verdict == "doubtful")
+    assert quality.unchecked.count("positions: none are given") == 1
+
+
+@pytest.mark.parametrize(("without_m", "level"), [(0.03, "good"), (0.5, "doubtful")])
+def test_control_points_that_were_left_out_are_good_where_they_agree(without_m: float, level: str) -> None:
+    inside = INSIDE | {
+        "used": [], "kept": False, "held_out_rms_m": [0.02, 0.02, 0.04], "without_rms_m": [0.02, 0.02, without_m]
+    }  # fmt: skip
+    quality = judged_with(group={"control": inside}, adjust={"control": CONTROL})
+    assert found(quality, "control points").level == quality.verdict == level
+    agreed = "control points agree with the block to x 0.020, y 0.020, z 0.030 m and were not needed"
+    assert (found(quality, "control points").sentence == agreed) is (level == "good")
+
+
+def test_flights_are_named_once_and_large_numbers_have_no_powers_of_ten() -> None:
+    flights = {"flights": [{"flight": "flight 2", "images": 6, "step_m": 14.93}]}
+    assert judged_with(group=flights).faults[0].sentence.startswith("heights of flight 2 (6 images) lie 14.9 m")
+    sentence = found(judged_with(group=heights(bowl_m=112.0)), "bowl").sentence
+    assert "(112 m)" in sentence
+    assert [plain(value) for value in (112.3, 9.99, 2.86, 0.034)] == ["112", "10", "2.9", "0.034"]
 
 
 def test_positions_of_which_none_is_used_are_bad() -> None:

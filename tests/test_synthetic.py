@@ -380,6 +380,11 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def test_a_rolling_shutter_needs_a_speed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="give --speed"):
+        render_block(tmp_path, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=2, readout_ms=40.0)
+
+
 def test_every_row_shows_what_its_own_projection_centre_sees(rolling: Path) -> None:
     truth = load_truth(rolling)
     shutter = json.loads((rolling / "truth.json").read_text())["rolling_shutter"]

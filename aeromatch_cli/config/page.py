@@ -50,7 +50,7 @@ def page() -> str:
 
 
 def _contents() -> Iterator[str]:
-    sections = ["presets", "general", "block", "run", *FAMILIES, "renamed-settings"]
+    sections = ["presets", "general", *_plain_sections(), *FAMILIES, "renamed-settings"]
     links = [f"[{name.replace('-', ' ')}](#{name})" for name in sections]
     yield f"Sections: {', '.join(links)}."
     yield ""
@@ -83,10 +83,16 @@ def _general() -> Iterator[str]:
     settings = Settings()
     yield from ("## general", "")
     yield from _table(settings, [key for key, field in Settings.model_fields.items() if _is_plain(field.annotation)])
-    for key in ("block", "run"):
+    for key in _plain_sections():
         section: BaseModel = getattr(settings, key)
         yield from (f"## {key}", "", str(Settings.model_fields[key].description), "")
         yield from _table(section, list(type(section).model_fields))
+
+
+def _plain_sections() -> list[str]:
+    """Groups of settings that no strategy brings."""
+    settings = Settings()
+    return [key for key, value in settings if key not in FAMILIES and isinstance(value, BaseModel)]
 
 
 def _is_plain(annotation: Any) -> bool:

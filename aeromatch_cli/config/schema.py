@@ -24,6 +24,16 @@ from aeromatch_cli.strategies.steps import STEPS
 LensParameter = Literal["f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2"]
 
 
+def listed(value: Any) -> Any:
+    """`a+b` is a list; null, `none` and nothing are the empty one."""
+    if value is None or value in ("", "none"):
+        return []
+    return [name.strip() for name in value.split("+")] if isinstance(value, str) else value
+
+
+LensParameters = Annotated[tuple[LensParameter, ...], BeforeValidator(listed)]
+
+
 def named(value: Any) -> Any:
     """A bare name stands for the strategy with its defaults."""
     return {"name": value} if isinstance(value, str) else value
@@ -140,11 +150,11 @@ class AdjustSettings(_Section):
         "(focal), or the whole of Brown's model whatever the block says of it (brown). Each has a prior by what was "
         "stated.",
     )
-    free: tuple[LensParameter, ...] = Field(
+    free: LensParameters = Field(
         (), description="Parameters that are unknowns in any case: f, cx, cy, k1, k2, k3, p1, p2, b1, b2."
     )
-    hold: tuple[LensParameter, ...] = Field(
-        (), description="Parameters that stay as they were stated in any case, such as [b1, b2]."
+    hold: LensParameters = Field(
+        (), description="Parameters that stay as they were stated in any case, such as b1+b2 or [b1, b2]."
     )
     rolling_shutter: bool = Field(
         True,

@@ -213,8 +213,8 @@ def _frames(evidence: Evidence) -> _Found:
     given = int(evidence.adjust.get("positions_given", 0))
     used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
     kept = any(kind == "given" for kind in kinds)
+    # Control points that took no part show how the block is to be moved; they do not hold it.
     surveyed = sum(len((group.get("control") or {}).get("used", ())) for group in evidence.groups)
-    fitted = (evidence.adjust.get("control") or {}).get("control") or 0
     if used >= _HOLDING or surveyed >= _HOLDING or kept:
         return
     if given >= _HOLDING:
@@ -223,12 +223,10 @@ def _frames(evidence: Evidence) -> _Found:
             "system, the order of x and y, and which position belongs to which image"
         )
         yield Finding("positions", 1.0, _WRONG_POSITIONS[0], "bad", words)
-    elif fitted >= _HOLDING:
-        yield "positions: none are given; the control points show how the block is to be moved"
     else:
         words = (
             "shape only: nothing ties the block to the ground, place, north and scale are arbitrary: positions "
-            "(--poses) or three control points (--gcp) do"
+            "(--poses) do; control points alone show how the block is to be moved"
         )
         yield Finding("ground", None, None, "doubtful", words)
 
@@ -243,7 +241,7 @@ def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
     sizes = ", ".join(str(group["images"]) for group in placed[:5]) + (", ..." if len(placed) > 5 else "")
     words = (
         f"{len(placed)} parts ({sizes} images) share too few points and lie to each other as their positions put them, "
-        f"to {exact_m:.2g} m ({exact_m / pixel_m:.1f} ground pixels)"
+        f"to {plain(exact_m)} m ({exact_m / pixel_m:.1f} ground pixels)"
     )
     remedy = "more overlap between them, better positions, or control points in each tie them"
     yield _finding("parts", exact_m / pixel_m, _PARTS_PIXELS, words, remedy)
@@ -273,7 +271,7 @@ def _positions(evidence: Evidence) -> _Found:
             float(np.sqrt(shares @ [_rms(np.array(one[key])[axes]) ** 2 for one in found]))
             for key in ("rms_sigmas", "rms_m", "stated_m")
         )
-        words = f"positions are met {name} to {off_m:.3g} m, {sigmas:.1f} times the {stated_m:.3g} m stated"
+        words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
         yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, remedy)
 
 
@@ -283,11 +281,11 @@ def _flights(evidence: Evidence) -> _Found:
         positions, found = group.get("positions") or {}, set[str]()
         stated_m = positions.get("stated_m") or [np.inf] * 3
         for flight in group.get("flights", ()):
-            name, images = flight["flight"] or "without times", flight["images"]
+            name, images = _flight(flight["flight"]), flight["images"]
             step_m = flight.get("step_m", 0.0)
             if step_m:
                 words = (
-                    f"heights of flight {name} ({images} images) lie {abs(step_m):.1f} m "
+                    f"heights of {name} ({images} images) lie {abs(step_m):.1f} m "
                     f"{'above' if step_m > 0.0 else 'below'} those of the others, which was taken out"
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
@@ -295,20 +293,27 @@ def _flights(evidence: Evidence) -> _Found:
             shift_m, sigma_m = np.array([flight.get(f"shift_{axis}", [0.0, 0.0]) for axis in "xyz"]).T
             if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
-                words = f"positions of flight {name} ({images} images) are off by {shown} m, which was taken out"
+                words = f"positions of {name} ({images} images) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
                 known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
                 sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
                 yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
-            found.add(name)
+            found.add(flight["flight"])
             if "lag_s" in flight:
                 lag_s = flight["lag_s"][0]
-                words = f"positions of flight {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
+                words = f"positions of {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
                 remedy = "check the times by which positions were given to images"
                 yield _finding("delay of positions", abs(lag_s), _LAG_S, words, remedy)
 
         left = [one for one in positions.get("flights", ()) if one["flight"] not in found]
         yield from _apart(left, np.array(stated_m))
+
+
+def _flight(name: str) -> str:
+    """Names of flights may begin with that word."""
+    if not name:
+        return "the flight without times"
+    return name if name.lower().startswith("flight") else f"flight {name}"
 
 
 def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterator[Finding]:
@@ -323,9 +328,10 @@ def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterat
         if max(flight["scatter_m"][axis], most["scatter_m"][axis]) > _FLIGHT_SCATTER * abs(off_m[axis]):
             continue
         what = ("x", "y", "heights")[axis]
+        off = f"{'-' if off_m[axis] < 0.0 else '+'}{plain(abs(off_m[axis]), 3)} m"
         words = (
-            f"{what} of flight {flight['flight'] or 'without times'} ({flight['images']} images) lie "
-            f"{off_m[axis]:+.3g} m from those of the largest flight, which is in the result"
+            f"{what} of {_flight(flight['flight'])} ({flight['images']} images) lie {off} from those of the largest "
+            "flight, which is in the result"
         )
         remedy = "check their datum and base stations, or state the accuracy of both as they are"
         yield _finding("flights apart", float(abs(off_m[axis]) / stated_m[axis]), _FLIGHT_SIGMAS, words, remedy)
@@ -367,13 +373,12 @@ def _control(evidence: Evidence) -> _Found:
     words = f"{len(unlike)} of {count} surveyed points contradict the others"
     remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
     yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
-    refused = [one for one in inside if not one.get("kept", True)]
-    if refused:
-        words = (
-            "the control points do not make points better that took no part, and were left out: check their coordinate "
-            "system, their heights and where they were measured"
-        )
-        yield Finding("control points", None, None, "doubtful", words)
+    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
+    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
+    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    for one in inside:
+        if not one.get("kept", True):
+            yield _refused(one, stated_m)
     # Points left out of few leave a block that is not the one that all of them hold.
     held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
     errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
@@ -381,15 +386,30 @@ def _control(evidence: Evidence) -> _Found:
     if not errors:
         yield "control points: too few to check the block by them"
         return
-    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
-    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
-    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
     errors_m = max(errors, key=lambda error_m: float((np.array(error_m) / stated_m).max()))
     sigmas = float((np.array(errors_m) / stated_m).max())
-    shown = ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
-    words = f"points that took no part are met to {shown} m, {sigmas:.1f} times what can be expected"
+    words = f"points that took no part are met to {_axes(errors_m)} m, {sigmas:.1f} times what can be expected"
     remedy = "check their coordinates and measurements; more control points at the border of the block help"
     yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
+
+
+def _refused(control: Mapping[str, Any], stated_m: FloatArray) -> Finding:
+    """Control points that the adjustment left out: because it was as good without them, or because they do not fit."""
+    errors_m = [control.get(key) for key in ("held_out_rms_m", "without_rms_m")]
+    sigmas = max(float((np.array(one) / stated_m).max()) if one else np.inf for one in errors_m)
+    limit, without_m = _CONTROL_SIGMAS[0], errors_m[1]
+    if without_m and sigmas <= limit:
+        words = f"control points agree with the block to {_axes(without_m)} m and were not needed"
+        return Finding("control points", sigmas, limit, "good", words)
+    words = (
+        "the control points do not make points better that took no part, and were left out: check their coordinate "
+        "system, their heights and where they were measured"
+    )
+    return Finding("control points", sigmas if np.isfinite(sigmas) else None, limit, "doubtful", words)
+
+
+def _axes(errors_m: Sequence[float]) -> str:
+    return ", ".join(f"{axis} {error_m:.3f}" for axis, error_m in zip("xyz", errors_m, strict=True))
 
 
 def _errors(evidence: Evidence) -> _Found:
@@ -428,38 +448,56 @@ def _calibration(evidence: Evidence) -> _Found:
         for camera_id, camera in (group.get("calibration") or {}).items():
             if camera_id in told:  # a camera is one and the same for all groups
                 continue
+            parameters = camera["parameters"]
             changes = {
                 name: abs(value - prior) / prior_sigma
-                for name, (value, _, prior, prior_sigma) in camera["parameters"].items()
-                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(camera["parameters"])
+                for name, (value, _, prior, prior_sigma) in parameters.items()
+                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(parameters) | {"b1", "b2"}
             }
-            read_out = camera["parameters"].get("readout_s")
+            read_out = parameters.get("readout_s")
             if read_out and read_out[1] > 0.0:
                 words = f"camera {camera_id} reads a picture in {read_out[0]:+.3f} s (rolling shutter)"
                 remedy = "no shutter needs as long, or backwards: check the times of the images"
                 readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
                 yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
+            affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
+            if affinity:
+                name = max(affinity, key=lambda key: affinity[key])
+                words = _change(camera_id, name, parameters[name], affinity[name])
+                remedy = (
+                    "pixels of sensors are square: a rolling shutter looks like that where images have no velocities; "
+                    "give capture times or a shorter exposure"
+                )
+                yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
             if not changes:
                 continue
             told.add(camera_id)
-            name = max(changes, key=lambda key: changes[key])
-            value, _, prior, prior_sigma = camera["parameters"][name]
-            words = (
-                f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- "
-                f"{_number(prior_sigma)} is known, {changes[name]:.1f} standard deviations"
-            )
+            limits = dict.fromkeys(changes, _LENS_SIGMAS)
+            if _tilt_deg(group) > _TILT_DEG[0]:  # what does not tell its tilt does not tell the principal point either
+                limits |= dict.fromkeys({"cx", "cy"} & changes.keys(), (_LENS_SIGMAS[0], None))
+            levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
+            name = max(changes, key=lambda key: (levels[key], changes[key]))
+            words = _change(camera_id, name, parameters[name], changes[name])
             remedy = (
                 "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
                 "as well, and heights with it"
             )
-            yield _finding("calibration", changes[name], _LENS_SIGMAS, words, remedy)
+            yield _finding("calibration", changes[name], limits[name], words, remedy)
     if not told:
         yield "calibration: it was not adjusted"
 
 
+def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:
+    value, _, prior, prior_sigma = parameter
+    return (
+        f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- {_number(prior_sigma)} "
+        f"is known, {sigmas:.1f} standard deviations"
+    )
+
+
 def _stated(parameters: Mapping[str, Sequence[float]]) -> set[str]:
     """Parameters that are judged by what is known of them: of a lens that nobody has calibrated, terms of distortion
-    and affinity are what they are."""
+    are what they are, and those of affinity are judged by themselves."""
     terms = {"k1", "k2", "k3", "p1", "p2", "b1", "b2"}
     calibrated = any(parameters[name][2] != 0.0 for name in terms & parameters.keys())
     return {"f", "cx", "cy"} | (terms if calibrated else set())
@@ -474,7 +512,7 @@ def _deformation(evidence: Evidence) -> _Found:
         return
 
     def length(value_m: float) -> str:
-        metres = f" ({value_m:.2g} m)" if evidence.metric else ""
+        metres = f" ({plain(value_m)} m)" if evidence.metric else ""
         return f"{value_m / pixel_m:.1f} ground pixels{metres}"
 
     def part(group: Mapping[str, Any]) -> str:
@@ -488,8 +526,8 @@ def _deformation(evidence: Evidence) -> _Found:
     placed = [group for group in known if group["kind"] != "level"]
     if not placed:
         return
-    angles = [float(np.rad2deg(np.arctan2(g["heights"]["tilt_m"], g["heights"]["reach_m"]))) for g in placed]
-    angle, worst = max(zip(angles, placed, strict=True), key=lambda one: one[0])
+    worst = max(placed, key=_tilt_deg)
+    angle = _tilt_deg(worst)
     words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
     remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
     yield _finding("tilt", angle, _TILT_DEG, words, remedy)
@@ -499,9 +537,15 @@ def _deformation(evidence: Evidence) -> _Found:
         sigma_m, stated_m = worst["heights"]["sigma_m"], worst["positions"]["stated_m"][2]
         # As exact as positions are is as exact as can be asked for.
         limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / pixel_m)
-        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {stated_m:.2g} m"
+        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {plain(stated_m)} m"
         remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
         yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
+
+
+def _tilt_deg(group: Mapping[str, Any]) -> float:
+    """Expected error of a part's tilt; 0 where it is not known."""
+    heights = group.get("heights")
+    return float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"]))) if heights else 0.0
 
 
 def _kept_poses(evidence: Evidence) -> _Found:
@@ -521,6 +565,11 @@ def _rms(values: Any) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+
+
+def plain(value: float, digits: int = 2) -> str:
+    """At least so many significant digits, without a power of ten where the number is large: 110, 2.9, 0.034."""
+    return f"{value:.0f}" if abs(value) >= 10.0 ** (digits - 1) else f"{value:.{digits}g}"
 
 
 def _rounded(value: float | None) -> float | None:

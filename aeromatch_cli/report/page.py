@@ -20,7 +20,7 @@ from aeromatch_cli.files import write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
-from aeromatch_cli.orientation.quality import Quality
+from aeromatch_cli.orientation.quality import Finding, Quality, plain
 from aeromatch_cli.report.adjustment import (
     Adjustment,
     Notice,
@@ -182,8 +182,15 @@ def _verdict(quality: Quality | None) -> list[tuple[str, str, str]]:
     if not quality.faults:
         return [(quality.verdict, "result: nothing speaks against the block", level)]
     first = quality.faults[0]
-    figure = "" if first.value is None else f" {first.value:.2g} (limit {first.limit:.2g})"
-    return [(quality.verdict, f"result: {first.what}{figure}", level)]
+    return [(quality.verdict, f"result: {first.what}{_figure(first)}", level)]
+
+
+def _figure(finding: Finding) -> str:
+    """With its limit, where there are numbers."""
+    if finding.value is None or not math.isfinite(finding.value):
+        return ""
+    limit = "" if finding.limit is None else f" (limit {plain(finding.limit)})"
+    return f" {plain(finding.value)}{limit}"
 
 
 def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock | None) -> list[CameraSection]:

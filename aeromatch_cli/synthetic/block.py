@@ -130,6 +130,8 @@ def render_block(
         raise ConfigError(
             f"a rolling shutter reads for 0 to 1000 ms at 0 to 100 m/s, got {readout_ms:g} ms at {speed_m_s:g} m/s"
         )
+    if readout_ms > 0.0 and speed_m_s == 0.0:
+        raise ConfigError("a rolling shutter shows nothing while the aircraft stands still; give --speed M_PER_S too")
     chosen = _checked(preset, seed, width_px, height_px, height_m, sun_deg)
     planned = flights.plan_flight(
         flight, images=images, width_px=width_px, height_px=height_px, height_m=height_m or chosen.height_m, lens=lens,
