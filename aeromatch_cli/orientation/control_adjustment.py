@@ -81,9 +81,9 @@ def with_control(
     without_m = np.array([base.error_m(point) for point in seen])
     offset_m = np.median(without_m, axis=0)
     if not control or float(np.abs(offset_m).max()) > _FAR_M:
-        errors_m = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
+        as_it_is = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
         found = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": not control}
-        return outcome, found | {"held_out_rms_m": errors_m, "without_rms_m": errors_m}
+        return outcome, found | {"held_out_rms_m": as_it_is, "without_rms_m": as_it_is}
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
@@ -149,17 +149,15 @@ class _Block:
         )
         found = [self.place_m(p) for p in points]
         start_m = [p.position_m if place is None else place for p, place in zip(points, found, strict=True)]
-        start_m = np.array(start_m).reshape(-1, 3)
-        state = replace(self.state, points_m=np.concatenate([self.state.points_m[:ties], start_m]))
+        points_m = np.concatenate([self.state.points_m[:ties], np.array(start_m).reshape(-1, 3)])
+        state = replace(self.state, points_m=points_m)
         return network, state
 
     def place_m(self, point: Surveyed) -> FloatArray | None:
         """(3,) where the rays of the block meet, None where they do not."""
         row = {number: k for k, number in enumerate(self.outcome.images)}
         seen = [(row[n], x, y) for n, x, y in point.pixels if n in row]
-        rays = [
-            world_rays(self._camera(k), self.state.rotations[k], np.array([[x, y]]))[0] for k, x, y in seen
-        ]
+        rays = [world_rays(self._camera(k), self.state.rotations[k], np.array([[x, y]]))[0] for k, x, y in seen]
         return intersected(self.state.centers_m[[k for k, _, _ in seen]], np.array(rays).reshape(-1, 3))
 
     def _camera(self, image: int) -> Camera:
@@ -171,7 +169,7 @@ class _Block:
     def error_m(self, point: Surveyed) -> FloatArray:
         """(3,) where the rays of the block meet, less the surveyed position; NaN where they do not."""
         place_m = self.place_m(point)
-        return np.full(3, np.nan) if place_m is None else place_m - point.position_m
+        return np.full(3, np.nan) if place_m is None else place_m - np.array(point.position_m)
 
     def adjusted(self, work: Work, points: Sequence[Surveyed]) -> _Block:
         """The block with these control points, all else determined anew."""

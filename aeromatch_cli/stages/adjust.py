@@ -218,9 +218,7 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
     return []
 
 
-def _control(
-    context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]
-) -> dict[str, Any] | None:
+def _control(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The block beside surveyed points, without those that the adjustment has found wrong or exchanged."""
     if not context.control:
         return None

@@ -193,6 +193,7 @@ def control_words(control: Mapping[str, Any] | None, adjusted: Sequence[Mapping[
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.get("rays_do_not_meet")  # of earlier versions not
     wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
+
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
 
