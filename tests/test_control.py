@@ -206,8 +206,10 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     control = outcome.facts["stages"]["adjust"]["facts"]["control"]
     assert control["control"] >= 6
     assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
-    assert "at each control point, fitted without it" in outcome.stdout
-    assert "to fit them the exported block is to be moved by x " in outcome.stdout
+    inside = outcome.facts["stages"]["adjust"]["facts"]["groups"][0]["control"]
+    assert (len(inside["used"]), inside["wrong"], inside["exchanged"]) == (control["control"], [], [])
+    assert max(inside["held_out_rms_m"][:2]) < 0.5 < max(inside["without_rms_m"])
+    assert "take part in the adjustment: RMSE at each control point, adjusted without it" in outcome.stdout
     assert control["doubtful"] == []
     assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()
 

@@ -22,7 +22,7 @@ def test_control_points_that_say_nothing_are_named():
     control = {"points": 4, "control": 4, "check": 0, "not_measured_in_two_images": ["p3", "p4"], "doubtful": [],
                "rays_do_not_meet": ["p2"], "control_rmse_m": None, "check_rmse_m": None}  # fmt: skip
     (notice,) = adjustment_notices([], Adjustment({"control": control}))
-    assert "fewer than 3 are measured in two oriented images" in notice.text
+    assert "fewer than 3 control points are measured in two oriented images" in notice.text
     assert "rays do not meet of p2" in notice.text
 
 
