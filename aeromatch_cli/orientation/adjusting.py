@@ -31,7 +31,7 @@ from aeromatch_cli.orientation.bundle.projection import project
 from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.placing import Placement, height_steps_m, place
-from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of
+from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of, rotations_of
 
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
 _LENS_RATIO = 3.0
@@ -147,11 +147,6 @@ class Outcome:
     placement: Placement | None = None
     steps_m: FloatArray | None = None
 
-    @property
-    def used(self) -> list[int]:
-        """Numbers of the images whose positions count."""
-        return [i for i, counts in zip(self.images, self.result.network.located, strict=True) if counts]
-
 
 def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -> Outcome:
     """Place a model in the world and adjust it with the given positions as observations.
@@ -170,7 +165,7 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     if placement.kind == "positions" and np.isfinite(placement.level_sigma_deg):
         # What tilts or terrain say of the whole block, as observations of all images that together are as exact.
         levels[:, :2] = np.deg2rad(placement.level_sigma_deg) * np.sqrt(len(ids))
-    now = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]).reshape(-1, 3, 3)
+    now = rotations_of(model, ids)
     outcome = _adjust(work, model, ids, given, counts, now, levels, np.zeros(6), held)
     if placement.kind == "level":  # its scale and place are those of an adjusted flying height
         _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
@@ -182,7 +177,7 @@ def _without_steps(model: Any, given: Given) -> tuple[Given, FloatArray]:
     ids = image_numbers(model)
     rows = np.array(ids, dtype=int) - 1
     steps_m = np.zeros(len(given.positions_m))
-    rotations = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])
+    rotations = rotations_of(model, ids)
     in_model = np.einsum("nji,nj->ni", rotations, given.ups[rows])
     seen = centers_of(model, ids), points_of(model), given.positions_m[rows], given.mean_sigmas_m[rows], in_model
     steps_m[rows] = height_steps_m(*seen, given.flights[rows])
@@ -305,13 +300,17 @@ def intersect(work: Work, model: Any, given: Given) -> None:
     network, start, points, numbers = _network(work, model, given)
     solved = solve(network, start, _INTERSECTED).state
     _take(work, model, image_numbers(model), points, numbers, solved)
-    state_errors(work, model, given)
+    _write_errors(model, network, solved, points)
 
 
 def state_errors(work: Work, model: Any, given: Given) -> float:
-    """Write the mean reprojection error of every point, pixels, into a model; that of all image points. Points behind
-    a camera have errors as large as a number can be."""
+    """Write the mean reprojection error of every point, pixels, into a model; that of all image points."""
     network, state, points, _ = _network(work, model, given)
+    return _write_errors(model, network, state, points)
+
+
+def _write_errors(model: Any, network: Network, state: Unknowns, points: Sequence[int]) -> float:
+    """The same of the network of a model. Points behind a camera have errors as large as a number can be."""
     apart_px = np.linalg.norm(project(network, state) - network.xy_px, axis=1)
     apart_px = np.where(np.isfinite(apart_px), apart_px, BEHIND_PX)
     counts = np.bincount(network.point, minlength=len(points))
@@ -334,7 +333,7 @@ def believed_tilts(pycolmap: ModuleType, model: Any, given: Given) -> FloatArray
     known = np.isfinite(given.rotations[rows]).all(axis=(1, 2))
     if placement.kind == "level" or not known.any():
         return given.ups
-    found = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])[known]
+    found = rotations_of(model, ids)[known]
     turns = found.transpose(0, 2, 1) @ given.rotations[rows][known]
     headings = np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1])
     most_deg = max(_WRONG_HEADING_DEG, _WRONG_HEADING_SIGMAS * placement.north_sigma_deg)
@@ -345,7 +344,7 @@ def believed_tilts(pycolmap: ModuleType, model: Any, given: Given) -> FloatArray
 def _placed(
     pycolmap: ModuleType, model: Any, ids: list[int], positions_m: FloatArray, sigmas_m: FloatArray, ups: FloatArray
 ) -> Placement:
-    rotations = np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids])
+    rotations = rotations_of(model, ids)
     in_model = np.einsum("nji,nj->ni", rotations, ups)
     placement = place(centers_of(model, ids), points_of(model), positions_m, sigmas_m, in_model)
     rotation = pycolmap.Rotation3d(placement.rotation)

@@ -21,6 +21,11 @@ def centers_of(model: Any, ids: list[int]) -> FloatArray:
     return np.array([model.images[i].projection_center() for i in ids])
 
 
+def rotations_of(model: Any, ids: list[int]) -> FloatArray:
+    """(N, 3, 3) cam_from_world."""
+    return np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]).reshape(-1, 3, 3)
+
+
 def points_of(model: Any) -> FloatArray:
     return np.array([model.points3D[i].xyz for i in sorted(model.points3D)]).reshape(-1, 3)
 
@@ -32,7 +37,7 @@ def arrays(model: Any, lenses: Mapping[int, FloatArray]) -> dict[str, Any]:
     cameras = sorted(lenses)
     return {
         "images": np.array(ids),
-        "rotations": np.array([model.images[i].cam_from_world().rotation.matrix() for i in ids]),
+        "rotations": rotations_of(model, ids),
         "centers_m": centers_of(model, ids),
         "cameras": np.array(cameras),
         "points_m": points_of(model),

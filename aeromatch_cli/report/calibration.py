@@ -15,10 +15,10 @@ from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import camera_of
 from aeromatch_cli.report.figures import (
     COLOURS,
+    PlanSize,
     evenly_chosen,
-    label_width,
-    name_ground_axes,
     new_axes,
+    plan_axes,
     round_length,
     svg,
 )
@@ -30,7 +30,7 @@ _MOST_IMAGES = 200
 # The arrow of this quantile is as long as this share of a cell.
 _USUAL, _SHARE = 0.9, 0.8
 _FIELD_IN, _FIELD_EDGES_IN = 6.6, (0.62, 0.12, 0.5, 0.55)  # left, right, bottom, top
-_MAP_IN, _MAP_HEIGHTS_IN, _MAP_BAR_IN, _MAP_EDGES_IN = 7.0, (3.0, 6.5), 1.1, (0.6, 0.35)
+_MAP = PlanSize(7.0, (3.0, 6.5), bar=1.1)
 _UNITS = {**dict.fromkeys(("f", "cx", "cy", "b1", "b2"), "px"), "readout_s": "s"}
 # Model parameters by their names in the table.
 _NAMES = {
@@ -214,20 +214,7 @@ def _height_map(points: FloatArray, pixel_m: float, *, in_world: bool) -> str:
 
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     margin = 0.06 * float((high - low).max()) or 1.0
-    low, high = low - margin, high + margin
-    left = label_width((low[1], high[1])) / 72.0
-    wide = _MAP_IN - left - _MAP_BAR_IN
-    height = float(np.clip(wide * (high - low)[1] / (high - low)[0] + sum(_MAP_EDGES_IN), *_MAP_HEIGHTS_IN))
-    margins = {
-        "left": left / _MAP_IN, "right": 1.0 - _MAP_BAR_IN / _MAP_IN,
-        "bottom": _MAP_EDGES_IN[0] / height, "top": 1.0 - _MAP_EDGES_IN[1] / height,
-    }  # fmt: skip
-    axes = new_axes(_MAP_IN, height, margins=margins)
-    name_ground_axes(axes, in_world=in_world)
-    size = axes.bbox.size
-    half = (0.5 * (high - low) / size).max() * size
-    middle = 0.5 * (low + high)
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+    axes = plan_axes(low - margin, high + margin, _MAP, in_world=in_world)
     scale = LinearSegmentedColormap.from_list("error", [COLOURS["k4"], COLOURS["k2"], COLOURS["k0"], COLOURS["bad"]])
     values = points[:, 2] if in_world else points[:, 2] / pixel_m
     drawn = axes.scatter(*points[:, :2].T, 42.0, c=values, cmap=scale, linewidth=0)

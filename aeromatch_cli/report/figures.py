@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from aeromatch_cli.data import IntArray
+from aeromatch_cli.data import FloatArray, IntArray
 
 # The page's light theme by the name of its CSS variable; k0-k5: few to many matches.
 COLOURS = {
@@ -62,6 +63,35 @@ def name_ground_axes(axes: Any, *, in_world: bool) -> None:
 def label_width(values: Iterable[float]) -> float:
     """Points that the axis label and the tick labels of metres need beside a vertical axis that shows these values."""
     return 32.0 + 6.4 * max(len(f"{value:.0f}") for value in values)
+
+
+@dataclass(frozen=True)
+class PlanSize:
+    """Inches of a plan: width, least and largest height, room for a colour bar at the right, below and above."""
+
+    width: float
+    heights: tuple[float, float]
+    bar: float
+    below: float = 0.6
+    above: float = 0.35
+
+
+def plan_axes(low: FloatArray, high: FloatArray, size: PlanSize, *, in_world: bool) -> Any:
+    """Axes of a plan from the corner low (2,) to high (2,), metres, of one scale in both directions."""
+    left = label_width((low[1], high[1])) / 72.0
+    wide = size.width - left - size.bar
+    edges = size.below + size.above
+    height = float(np.clip(wide * (high - low)[1] / (high - low)[0] + edges, *size.heights))
+    margins = {
+        "left": left / size.width, "right": 1.0 - size.bar / size.width,
+        "bottom": size.below / height, "top": 1.0 - size.above / height,
+    }  # fmt: skip
+    axes = new_axes(size.width, height, margins=margins)
+    name_ground_axes(axes, in_world=in_world)
+    half = (0.5 * (high - low) / axes.bbox.size).max() * axes.bbox.size
+    middle = 0.5 * (low + high)
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+    return axes
 
 
 def histogram_axes(counts: Iterable[int]) -> Any:

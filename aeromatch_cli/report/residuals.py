@@ -9,9 +9,9 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, PoseResidual
 from aeromatch_cli.geometry.frames import length_words
-from aeromatch_cli.report.figures import COLOURS, label_width, name_ground_axes, new_axes, round_length, svg
+from aeromatch_cli.report.figures import COLOURS, PlanSize, plan_axes, round_length, svg
 
-_WIDTH_IN, _HEIGHTS_IN, _BAR_IN, _EDGES_IN = 9.0, (3.4, 6.0), 1.5, (0.6, 0.35)
+_PLAN = PlanSize(9.0, (3.4, 6.0), bar=1.5)
 # The arrow of this quantile is as long as this share of the usual distance between neighbouring cameras.
 _USUAL, _SHARE = 0.9, 0.6
 # Steps of the colours.
@@ -78,20 +78,7 @@ def _plan(centers_m: FloatArray, offsets_m: FloatArray, titles: list[str]) -> st
     across_m = np.linalg.norm(offsets_m[:, :2], axis=1)
     usual_m = max(float(np.quantile(across_m, _USUAL)), _NOTHING_M)
     enlarged = _SHARE * spacing_m / usual_m
-    half = 0.5 * (high - low) + spacing_m
-    middle = 0.5 * (low + high)
-    left = label_width((middle[1] - half[1], middle[1] + half[1])) / 72.0
-    wide = _WIDTH_IN - left - _BAR_IN
-    height = float(np.clip(wide * half[1] / half[0] + sum(_EDGES_IN), *_HEIGHTS_IN))
-    margins = {
-        "left": left / _WIDTH_IN, "right": 1.0 - _BAR_IN / _WIDTH_IN,
-        "bottom": _EDGES_IN[0] / height, "top": 1.0 - _EDGES_IN[1] / height,
-    }  # fmt: skip
-    axes = new_axes(_WIDTH_IN, height, margins=margins)
-    name_ground_axes(axes, in_world=True)
-    size = axes.bbox.size
-    half = (half / size).max() * size
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+    axes = plan_axes(low - spacing_m, high + spacing_m, _PLAN, in_world=True)
     largest = max(float(np.abs(offsets_m[:, 2]).max()), _NOTHING_M)
     scale = LinearSegmentedColormap.from_list("height", [COLOURS["k0"], COLOURS["grid"], COLOURS["k4"]], N=_COLOURS)
     norm = BoundaryNorm(np.linspace(-largest, largest, _COLOURS + 1), _COLOURS)

@@ -18,6 +18,7 @@ from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.orientation.bundle.network import LENS, Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, equations, reduced
+from aeromatch_cli.orientation.bundle.solve import factorised
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -124,13 +125,10 @@ def _of_last(matrix: sparse.csr_matrix, first: int) -> FloatArray:
     from scipy import sparse
 
     scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-    scaled = (sparse.diags(scale) @ matrix @ sparse.diags(scale) + 1e-12 * sparse.identity(len(scale))).tocsc()
-    solver = sparse.linalg.splu(
-        scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
+    scaled = sparse.diags(scale) @ matrix @ sparse.diags(scale) + 1e-12 * sparse.identity(len(scale))
     columns = np.zeros((len(scale), len(scale) - first))
     columns[first:] = np.diag(scale[first:])
-    return np.asarray(scale[first:, None] * solver.solve(columns)[first:])
+    return np.asarray(scale[first:, None] * factorised(scaled).solve(columns)[first:])
 
 
 def _in_world(network: Network) -> bool:

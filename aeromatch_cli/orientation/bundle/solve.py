@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.bundle.network import Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, cost, equations, reduced
+
+if TYPE_CHECKING:
+    from scipy import sparse
+    from scipy.sparse.linalg import SuperLU
 
 # The damping of the first step, the bounds, and by how much it changes from step to step.
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e6
@@ -41,13 +46,14 @@ def solve(network: Network, state: Unknowns, tolerance: float, *, near: bool = F
         made = equations(network, state)
         while damping <= _MOST_DAMPING:
             tried = _moved(network, state, reduced(made, damping))
-            if tried is not None and cost(network, tried) < best:
+            found = np.inf if tried is None else cost(network, tried)
+            if tried is not None and found < best:
                 break
             damping *= _RAISED
         else:
             break
         assert tried is not None
-        step, found = step + 1, cost(network, tried)
+        step += 1
         gain, best, state = 1.0 - found / best, found, tried
         settled = gain < tolerance
         if settled and damping <= _FREE_DAMPING:
@@ -82,9 +88,15 @@ def _solution(normals: Reduced) -> FloatArray:
         if len(right) <= _FULL_SIZE:
             factor = linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)
             return np.asarray(scale * linalg.cho_solve(factor, right, check_finite=False))
-        solver = sparse.linalg.splu(
-            scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        return np.asarray(scale * solver.solve(right))
+        return np.asarray(scale * factorised(scaled).solve(right))
     except (linalg.LinAlgError, RuntimeError):  # not positive definite, singular
         return np.full(len(right), np.nan)
+
+
+def factorised(matrix: sparse.csr_matrix) -> SuperLU:
+    """The factors of a symmetric, positive definite matrix, ordered for few of them."""
+    from scipy import sparse
+
+    return sparse.linalg.splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
