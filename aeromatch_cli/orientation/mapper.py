@@ -32,7 +32,7 @@ from aeromatch_cli.orientation.adjusting import (
 from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.flips import turned_back
 from aeromatch_cli.orientation.placing import Placement
-from aeromatch_cli.orientation.process import quiet_pycolmap
+from aeromatch_cli.orientation.process import ANY_DISTORTION, quiet_pycolmap
 from aeromatch_cli.orientation.results import arrays, figures
 
 # Mapping starts again with the focal lengths that it found until none changes by more than this share.
@@ -198,8 +198,6 @@ def _global(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict
 
 def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     with pycolmap.Database.open(database) as opened:
-        # Terms that divide follow noise; a camera of that model has a calibration to begin with.
-        divided = any(camera.model.name == "FULL_OPENCV" for camera in opened.read_all_cameras())
         tracks = max(_LEAST_TRACKS, min(_TRACKS_PER_IMAGE, _TRACKS // max(1, opened.num_images())))
         most = max(Counter(image.camera_id for image in opened.read_all_images()).values(), default=0)
     options = pycolmap.GlobalPipelineOptions()
@@ -210,8 +208,16 @@ def _global_options(pycolmap: ModuleType, database: Path, free: bool) -> Any:
     options.mapper.skip_retriangulation = True
     options.mapper.bundle_adjustment.ceres.solver_options.function_tolerance = _COST_TOLERANCE
     options.mapper.bundle_adjustment.refine_focal_length = free
-    options.mapper.bundle_adjustment.refine_extra_params = free and most >= _DISTORTION_IMAGES and not divided
+    options.mapper.bundle_adjustment.refine_extra_params = (
+        free and most >= _DISTORTION_IMAGES and not _divided(pycolmap, database)
+    )
     return options
+
+
+def _divided(pycolmap: ModuleType, database: Path) -> bool:
+    """Whether a camera has terms that divide: these follow noise, and it has a calibration to begin with."""
+    with pycolmap.Database.open(database) as opened:
+        return any(camera.model.name == "FULL_OPENCV" for camera in opened.read_all_cameras())
 
 
 def _incremental(pycolmap: ModuleType, database: Path, out: Path, free: bool) -> dict[int, Any]:
@@ -219,7 +225,9 @@ def _incremental(pycolmap: ModuleType, database: Path, out: Path, free: bool) ->
     options.random_seed, options.num_threads = 0, 1
     options.min_model_size = _MIN_IMAGES
     options.extract_colors = False
-    options.ba_refine_focal_length = options.ba_refine_extra_params = free
+    options.ba_refine_focal_length = free
+    options.ba_refine_extra_params = free and not _divided(pycolmap, database)
+    options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = ANY_DISTORTION
     found: dict[int, Any] = pycolmap.incremental_mapping(database, out, out, options=options)
     return found
 

@@ -13,6 +13,10 @@ from types import ModuleType
 from aeromatch_cli.errors import InputError, tells_of_memory
 from aeromatch_cli.workers import ONE_THREAD
 
+# COLMAP passes over cameras with a distortion parameter beyond 1, unless told otherwise. Long lenses have such: the
+# parameters of equal distortions grow with powers of the focal length.
+ANY_DISTORTION = 1e9
+
 
 def run_process(module: str, folder: Path, result: str, what: str) -> Path:
     """The file `result` that a module of this package makes in `folder`.

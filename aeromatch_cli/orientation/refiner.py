@@ -39,7 +39,7 @@ from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
 from aeromatch_cli.orientation.control_adjustment import Surveyed, with_control
 from aeromatch_cli.orientation.joining import Part, joined
-from aeromatch_cli.orientation.process import quiet_pycolmap
+from aeromatch_cli.orientation.process import ANY_DISTORTION, quiet_pycolmap
 from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, tracks_of
 from aeromatch_cli.orientation.spread import take_poses, thinned
 
@@ -326,6 +326,7 @@ def _options(pycolmap: ModuleType) -> Any:
     options.random_seed, options.num_threads = 0, 1
     options.extract_colors = False
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = ANY_DISTORTION
     return options
 
 
