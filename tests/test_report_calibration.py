@@ -18,7 +18,7 @@ IMAGES = [Image(i, f"{i}.jpg", 800, 600, "1") for i in "ab"]
 KNOWN = {"f": 690.0, "cx": 399.5, "cy": 299.5}
 FACTS: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
     "calibration": {"1": {"images": 2, "correlations": [["f", "k1", -0.95]], "parameters": {
-        "f": [700.0, 0.5, 690.0, 20.0], "cx": [399.5, 0.0, 399.5, 16.0], "cy": [299.5, 0.0, 299.5, 16.0],
+        "f": [700.0, 0.5, 690.0, 20.0], "cx": [400.0, 0.0, 400.0, 16.0], "cy": [300.0, 0.0, 300.0, 16.0],
         "k1": [0.0, 0.001, 0.0, 0.05],
     }}},
     "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0,
@@ -45,7 +45,7 @@ def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
     (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
     assert section.words == "2 images, PINHOLE, 800 x 600 px"
     assert section.rows[0] == ("f, focal length", "px", "700.00", "0.50", "690.00", "20.00", "+0.5", "k1 -0.95")
-    assert section.rows[1] == ("cx, principal point", "px", "399.50", "held", "399.50", "16.00", "", "")
+    assert section.rows[1] == ("cx, principal point", "px", "400.00", "held", "400.00", "16.00", "", "")
 
 
 def test_fields_show_what_the_calibration_does_and_what_remains() -> None:

@@ -121,7 +121,8 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
   were found in), `positions_given` (images),
   `sigma_position_m` (median over the images whose frame has metres, else null), `sigma_angle_deg` (median), `groups`
   (see below), `outside`
-  (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
+  (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters as in a camera file: cx
+  and cy from the corner of the first pixel), `remarks`,
   `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
   `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
   (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was
@@ -141,7 +142,8 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
   - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
     projection centre to the antenna, in the camera's frame): value, standard deviation.
   - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
-    known before and its standard deviation; `correlations`: up to five pairs above 0.9: two names, correlation.
+    known before and its standard deviation, cx and cy from the corner of the first pixel; `correlations`: up to five
+    pairs above 0.9: two names, correlation.
   - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
     middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
     both are of), `points`: x, y and standard deviation of points over the block. Of a group in a frame of its own in

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.adjusting import Given, Outcome
 from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
 from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
@@ -136,16 +137,18 @@ def _mounts(outcome: Outcome) -> dict[str, Any]:
 
 
 def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
-    """By parameter: value, standard deviation (0 where it was held), prior and its standard deviation."""
+    """By parameter: value, standard deviation (0 where it was held), prior and its standard deviation. cx and cy count
+    from the corner of the first pixel, as in camera files."""
     network, state, found, stated = (
         outcome.result.network, outcome.result.state, outcome.result.found, outcome.result.stated
     )  # fmt: skip
     sigmas = np.zeros(len(LENS)) if found is None else found.lens_sigmas[row]
     free = network.lens_sigmas[row] > 0.0
+    corner_px = np.array([COLMAP_OFFSET_PX * (name in ("cx", "cy")) for name in LENS])
+    values, priors = state.lens[row] + corner_px, stated.lens_prior[row] + corner_px
     parameters = {
         name: [
-            float(state.lens[row, k]), float(sigmas[k]) if free[k] else 0.0, float(stated.lens_prior[row, k]),
-            float(stated.lens_sigmas[row, k]),
+            float(values[k]), float(sigmas[k]) if free[k] else 0.0, float(priors[k]), float(stated.lens_sigmas[row, k]),
         ]
         for k, name in enumerate(LENS)
         if name != "unused" and (name != "readout_s" or free[k])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
-from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.cameras import corner_params, focal_px
 
 # Images with fewer points of three images and more are held by their neighbours one by one.
 _FEW_POINTS = 20
@@ -33,7 +33,7 @@ def block_figures(
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
         "groups": [dict(one) for one in groups],
         "cameras": {
-            camera_id: [camera.model, camera.width_px, camera.height_px, list(camera.params)]
+            camera_id: [camera.model, camera.width_px, camera.height_px, list(corner_params(camera))]
             for camera_id, camera in sorted(adjusted.cameras.items())
         },
     }

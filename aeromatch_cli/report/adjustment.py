@@ -10,12 +10,16 @@ from typing import Any
 from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.residuals import read_residuals
+from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import control_words
 from aeromatch_cli.stages.stage_report import facts_on_file
+
+# Where cx and cy of cameras count from, on the page and in facts.
+PRINCIPAL_POINT = "cx, cy from the corner of the first pixel, as in COLMAP"
 
 
 @dataclass(frozen=True)
@@ -102,9 +106,10 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
     sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
-    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts.get("cameras", {}).items()}
+    stated = facts.get("cameras", {}).items()
+    cameras = {i: from_colmap(model, width, height, tuple(params)) for i, (model, width, height, params) in stated}
     if cameras:
-        found.append(("Cameras after the adjustment", camera_words(cameras)))
+        found.append((f"Cameras after the adjustment ({PRINCIPAL_POINT})", camera_words(cameras)))
     control = facts["control"]
     if control and control["control_rmse_m"]:
         found.append(("Control points", f"{control['control']}; {offset_words(control)}"))
@@ -141,10 +146,10 @@ def counted(count: int, one: str, several: str) -> str:
 
 
 def camera_words(cameras: Mapping[str, Camera]) -> str:
-    """One camera a line: its model, size and parameters."""
+    """One camera a line: its model, size and parameters, as a camera file has them."""
     words = []
     for camera_id, camera in sorted(cameras.items()):
-        params = ", ".join(f"{value:g}" for value in camera.params)
+        params = ", ".join(f"{value:g}" for value in corner_params(camera))
         words.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
     more = [f"and {len(words) - 10} more"] if len(words) > 10 else []
     return "\n".join(words[:10] + more)

@@ -11,6 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import normalise, project
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import camera_of
 from aeromatch_cli.report.figures import (
@@ -114,6 +115,7 @@ def _grid(camera: Camera) -> tuple[int, int, float]:
 def _moved(parameters: Mapping[str, Sequence[float]], camera: Camera, camera_id: str) -> tuple[str, str] | None:
     """By how much the adjusted camera moves image points against the one known before."""
     lens = np.array([parameters[name][2] if name in parameters else 0.0 for name in LENS])
+    lens[[LENS.index("cx"), LENS.index("cy")]] -= COLMAP_OFFSET_PX
     before = camera_of(lens, camera)
     columns, rows, cell_px = _grid(camera)
     middles = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * cell_px

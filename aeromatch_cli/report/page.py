@@ -22,6 +22,7 @@ from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.quality import Finding, Quality, plain
 from aeromatch_cli.report.adjustment import (
+    PRINCIPAL_POINT,
     Adjustment,
     Notice,
     adjustment_notices,
@@ -112,6 +113,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     drawn.write_beside(context.workspace.report.parent / "pairs")
     return _template().render(
         version=__version__,
+        principal_point=PRINCIPAL_POINT,
         colours=COLOURS,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
@@ -302,7 +304,7 @@ def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
         ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
         ("Ground", block.ground_source),
         ("Ground sampling distance", "unknown" if gsd_m is None else f"{gsd_m:.3g} m"),
-        ("Cameras", camera_words(block.cameras)),
+        (f"Cameras ({PRINCIPAL_POINT})", camera_words(block.cameras)),
         ("Images in", context.settings.block.images),
     ]
 

@@ -23,6 +23,7 @@ from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
+from aeromatch_cli.geometry.cameras import corner_params
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
@@ -206,7 +207,7 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     workspace, image_id = work.workspace, image.image_id
     camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
-    lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in camera.params)}")
+    lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in corner_params(camera))}")
     world = read_json(workspace.block)
     origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
     adjusted = work.adjusted.poses.get(image_id) if work.adjusted is not None else None

@@ -36,6 +36,8 @@ from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
 VERSION = 22
+# Of what adjusted.json states of the same adjustment.
+_FACTS_VERSION = 1
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -113,7 +115,7 @@ def _fingerprint(context: Context, groups: Sequence[Group]) -> str:
     ids = sorted(image.image_id for image in block.images)
     state = [ids, sorted(block.cameras.items()), sorted(block.poses.items()), sorted(poses.items())]
     pairs = [(p.image_id0, p.image_id1, pair_fingerprint(context, p)) for p in context.pairs]
-    versions = VERSION, library_version("pycolmap")
+    versions = VERSION, _FACTS_VERSION, library_version("pycolmap")
     held = [(group.kind, group.images) for group in groups]
     control = [
         (p.name, p.position_m, p.sigmas_m, p.check, p.sigma_px, sorted(p.pixels.items())) for p in observed.control
