@@ -173,6 +173,20 @@ def test_a_block_of_unknown_tilt_does_not_tell_the_principal_point(name: str, ve
     assert found(quality, "calibration").level == quality.verdict == verdict
 
 
+def test_the_setting_that_holds_a_calibration_is_named() -> None:
+    whole = dict.fromkeys(("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2"), "adjust.calibration=given")
+    quality = judged_with(adjust={"held_by": whole, "reprojection_error_px": 0.9})
+    assert "calibration: adjust.calibration=given holds all parameters" in quality.unchecked
+    assert found(quality, "reprojection error").sentence.endswith(
+        "; adjust.calibration=given holds all parameters of cameras as stated, which may be wrong"
+    )
+    assert "adjust." not in found(judged_with(adjust={"reprojection_error_px": 0.9}), "reprojection error").sentence
+    partly = judged_with(adjust={"held_by": {"f": "adjust.hold"}})
+    finding = found(partly, "calibration")
+    assert finding.sentence.startswith("calibration of camera camera_1: cx 2005.0 where 1999.5 +- 80.0 is known")
+    assert finding.sentence.endswith("(adjust.hold holds f)")
+
+
 def test_a_shift_that_is_not_significant_is_none() -> None:
     quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
     assert quality.verdict == "good"

@@ -48,6 +48,12 @@ def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
     assert section.rows[1] == ("cx, principal point", "px", "400.00", "held", "400.00", "16.00", "", "")
 
 
+def test_a_setting_that_holds_a_parameter_is_named() -> None:
+    adjusted, keypoints = block(np.zeros(2))
+    (section,) = camera_sections(FACTS | {"held_by": {"cx": "adjust.hold"}}, adjusted, IMAGES, keypoints.__getitem__)
+    assert [row[3] for row in section.rows] == ["0.50", "held by adjust.hold", "held", "0.001000"]
+
+
 def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
     adjusted, keypoints = block(np.array([0.3, -0.4]))
     (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)

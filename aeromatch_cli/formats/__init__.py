@@ -123,6 +123,8 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
   (see below), `outside`
   (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters as in a camera file: cx
   and cy from the corner of the first pixel), `remarks`,
+  `held_by` (parameter of cameras -> setting that holds it), `readout_not_tried` (why the read-out time of a rolling
+  shutter was no unknown, null where it was),
   `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
   `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
   (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.cameras import BROWN, MODELS
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -272,7 +273,7 @@ def _positions(evidence: Evidence) -> _Found:
             for key in ("rms_sigmas", "rms_m", "stated_m")
         )
         words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
-        yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, remedy)
+        yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, _with_held(evidence, remedy))
 
 
 def _flights(evidence: Evidence) -> _Found:
@@ -423,7 +424,7 @@ def _errors(evidence: Evidence) -> _Found:
         "poses or cameras do not fit the matches: let the pictures find them (orient=global), and check --cameras and "
         "--poses"
     )
-    yield _finding("reprojection error", found_px, limits, words, remedy)
+    yield _finding("reprojection error", found_px, limits, words, _with_held(evidence, remedy))
 
 
 def _multiplicity(evidence: Evidence) -> _Found:
@@ -443,7 +444,7 @@ def _multiplicity(evidence: Evidence) -> _Found:
 
 def _calibration(evidence: Evidence) -> _Found:
     """The parameter of every camera that differs most from what is known of it."""
-    told = set[str]()
+    told, held = set[str](), evidence.adjust.get("held_by", {})
     for group in evidence.groups:
         for camera_id, camera in (group.get("calibration") or {}).items():
             if camera_id in told:  # a camera is one and the same for all groups
@@ -460,6 +461,7 @@ def _calibration(evidence: Evidence) -> _Found:
                 remedy = "no shutter needs as long, or backwards: check the times of the images"
                 readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
                 yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
+            changes = {name: change for name, change in changes.items() if name not in held}
             affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
             if affinity:
                 name = max(affinity, key=lambda key: affinity[key])
@@ -478,13 +480,32 @@ def _calibration(evidence: Evidence) -> _Found:
             levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
             name = max(changes, key=lambda key: (levels[key], changes[key]))
             words = _change(camera_id, name, parameters[name], changes[name])
+            words += f" ({_held_words(evidence)})" if held else ""
             remedy = (
                 "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
                 "as well, and heights with it"
             )
             yield _finding("calibration", changes[name], limits[name], words, remedy)
     if not told:
-        yield "calibration: it was not adjusted"
+        yield f"calibration: {_held_words(evidence) or 'it was not adjusted'}"
+
+
+def _held_words(evidence: Evidence) -> str:
+    """Which settings hold which parameters of the cameras, "" where none does."""
+    by_setting: dict[str, list[str]] = {}
+    for name, setting in evidence.adjust.get("held_by", {}).items():
+        by_setting.setdefault(setting, []).append(name)
+    whole = len(MODELS[BROWN])
+    return ", ".join(
+        f"{setting} holds {'all parameters' if len(names) == whole else ', '.join(names)}"
+        for setting, names in by_setting.items()
+    )
+
+
+def _with_held(evidence: Evidence, remedy: str) -> str:
+    """The remedy for what a wrong calibration may have done, with the settings that have held parameters of it."""
+    held = _held_words(evidence)
+    return f"{remedy}; {held} of cameras as stated, which may be wrong" if held else remedy
 
 
 def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:

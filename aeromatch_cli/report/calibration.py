@@ -81,11 +81,12 @@ def camera_sections(
             )
             words = f"{calibration['images']} images, {camera.model}, {camera.width_px} x {camera.height_px} px"
             shown = tuple(field for field in fields if field is not None)
-            sections[camera_id] = CameraSection(camera_id, words, tuple(_rows(calibration)), shown)
+            rows = tuple(_rows(calibration, facts.get("held_by", {})))
+            sections[camera_id] = CameraSection(camera_id, words, rows, shown)
     return [sections[camera_id] for camera_id in sorted(sections)]
 
 
-def _rows(calibration: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _rows(calibration: Mapping[str, Any], held_by: Mapping[str, str]) -> Iterator[tuple[str, ...]]:
     related: dict[str, list[str]] = {}
     for first, second, value in calibration["correlations"]:
         related.setdefault(first, []).append(f"{second} {value:+.2f}")
@@ -98,7 +99,7 @@ def _rows(calibration: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             _NAMES.get(name, name),
             _UNITS.get(name, ""),
             f"{value:.{digits}f}",
-            "held" if held else f"{sigma:.{digits}f}",
+            (f"held by {held_by[name]}" if name in held_by else "held") if held else f"{sigma:.{digits}f}",
             f"{prior:.{digits}f}",
             f"{prior_sigma:.{digits}f}" if prior_sigma > 0.0 else "",
             change,

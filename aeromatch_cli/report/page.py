@@ -134,6 +134,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
             context.block.gsd_m,
         ),
         cameras=_cameras(context, adjustment, adjusted),
+        readout_not_tried=adjustment.facts.get("readout_not_tried"),
         heights=heights_section(adjustment.facts, in_world=adjustment.in_world),
         residuals=surveyed_rows(adjustment.facts),
         block=_block_facts(context, in_world=adjustment.in_world),
