@@ -172,8 +172,9 @@ def _workspace(work: _Work) -> Shown:
                 when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
                 lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
     written = set(stages.get("export", {}).get("facts", {}))
+    older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
     lines += [
-        f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
+        f"export      {one}{older if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
     ]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
