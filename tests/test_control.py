@@ -70,6 +70,33 @@ def test_check_points_show_their_own_error(truth: Truth) -> None:
     assert figures["reprojection_error_px"] < 1e-3
 
 
+def test_residuals_are_as_large_as_survey_and_measurements_let_expect(truth: Truth) -> None:
+    """Of 200 points surveyed and measured with known errors, in a block of another scale too."""
+    rows, rng, sigmas_m, sigma_px = list(range(0, 400, 2)), np.random.default_rng(0), (0.02, 0.02, 0.03), 2.0
+    exact = surveyed(truth, rows, rng.normal(0.0, sigmas_m, (200, 3)), set())
+    points = [
+        replace(p, pixels={i: px + rng.normal(0.0, sigma_px, 2) for i, px in p.pixels.items()}, sigma_px=sigma_px)
+        for p in exact
+    ]
+    whole = adjusted_truth(truth)
+    figures = control_figures(whole, cameras(truth), points)
+    residuals, stated = (np.array([figures[key][p.name] for p in points]) for key in ("residuals", "point_sigmas_m"))
+    assert (stated > 1.05 * np.array(sigmas_m)).all()  # the survey alone is less
+    np.testing.assert_allclose(np.sqrt(((residuals / stated) ** 2).mean(axis=0)), 1.0, atol=0.1)
+    # Of 2 px in each coordinate, of which three unknowns of a point take a part.
+    images = np.mean([len(own) for own in figures["image_residuals_px"].values()])
+    expected_px = sigma_px * np.sqrt(2.0) * np.sqrt(1.0 - 3.0 / (2.0 * images))
+    assert figures["reprojection_error_px"] == pytest.approx(expected_px, rel=0.1)
+    halved = {i: replace(pose, center_m=0.5 * pose.center_m) for i, pose in whole.poses.items()}
+    small = control_figures(replace(whole, poses=halved), cameras(truth), points, metric=False)
+    np.testing.assert_allclose([small["point_sigmas_m"][p.name] for p in points], stated, rtol=0.02)
+    assert small["ground_pixel_m"] == pytest.approx(figures["ground_pixel_m"], rel=0.01)
+    assert small["offset_m"] is None
+    scale = small["transformation"]["scale"]
+    assert scale == pytest.approx(2.0, rel=1e-3)
+    assert f"to fit them the exported block is to be scaled to {scale:.4g} m per unit" in control_words(small)
+
+
 def test_without_check_points_each_is_left_out_once(truth: Truth) -> None:
     rows = list(range(0, 400, 40))
     rng = np.random.default_rng(0)

@@ -10,6 +10,7 @@ import pytest
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.adjustment import surveyed_rows
 from aeromatch_cli.report.calibration import camera_sections, heights_section
 
@@ -21,7 +22,7 @@ FACTS: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
         "f": [700.0, 0.5, 690.0, 20.0], "cx": [400.0, 0.0, 400.0, 16.0], "cy": [300.0, 0.0, 300.0, 16.0],
         "k1": [0.0, 0.001, 0.0, 0.05],
     }}},
-    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0,
+    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0, "pixel_m": 0.1,
                 "points": [[0.0, 0.0, 0.1], [50.0, 10.0, 0.15], [20.0, 60.0, 0.2]]},
 }]}  # fmt: skip
 
@@ -65,7 +66,8 @@ def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
 
 
 def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:
-    world, own = (heights_section(FACTS, in_world=in_world) for in_world in (True, False))
+    [group] = FACTS["groups"]
+    world, own = heights_section(FACTS), heights_section({"groups": [{"heights": without_units(group["heights"])}]})
     assert world is not None
     assert own is not None
     assert "median 0.150 m (1.5 ground pixels)" in world.words
@@ -73,15 +75,16 @@ def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() 
     assert "median 1.5 ground pixels" in own.words
     assert "metres" in world.plan
     assert "metres" not in own.plan
-    assert heights_section({"groups": []}, in_world=True) is None
+    assert heights_section({"groups": []}) is None
 
 
 def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:
     control = {
         "residuals": {"P1": [0.02, -0.01, 0.06], "P2": [0.0, 0.0, 0.3]}, "checks": ["P2"],
-        "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]},
+        "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]}, "ground_pixel_m": 0.1,
+        "image_residuals_px": {"P1": {"a": [0.3, -0.4], "b": [0.0, 0.0]}, "P2": {}},
     }  # fmt: skip
-    assert surveyed_rows({"control": control, "ground_pixel_m": 0.1}) == [
-        ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0"),
-        ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0"),
+    assert surveyed_rows({"control": control}) == [
+        ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0", "2", "0.35"),  # of 0.5 and 0 px
+        ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0", "0", ""),
     ]

@@ -23,9 +23,9 @@ _HEIGHTS = 150
 _CELLS = 12
 
 
-def adjustment_facts(outcome: Outcome, given: Given) -> dict[str, Any]:
-    """Of one group. given: what its images had. Keys are described in `formats` (adjusted.json); images, flights and
-    cameras are numbers, see `with_names`."""
+def adjustment_facts(outcome: Outcome, given: Given, *, metric: bool) -> dict[str, Any]:
+    """Of one group. given: what its images had. metric: whether lengths of its frame are metres. Keys are described in
+    `formats` (adjusted.json); images, flights and cameras are numbers, see `with_names`."""
     result = outcome.result
     network, state, found = result.network, result.state, result.found
     facts: dict[str, Any] = {
@@ -36,7 +36,7 @@ def adjustment_facts(outcome: Outcome, given: Given) -> dict[str, Any]:
         "calibration": {str(n): _calibration(outcome, k) for k, n in enumerate(outcome.cameras)},
     }
     if found is not None:
-        facts["heights"] = _heights(network, state, found)
+        facts["heights"] = _heights(network, state, found, "_m" if metric else "")
     return facts
 
 
@@ -165,12 +165,13 @@ def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
     }
 
 
-def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, Any]:
+def _heights(network: Network, state: Unknowns, found: Covariance, unit: str) -> dict[str, Any]:
     """Expected errors of the heights of points over the block.
 
-    sigma_m: median standard deviation; bowl_m, tilt_m: standard deviation of how much the middle of the block lies
-    above its border, and one side above the other, at the extent of the points. map: cells with their standard
-    deviation. reach_m: half that extent. Where place and scale are open (a free network) they are those of the shape.
+    sigma: median standard deviation; bowl, tilt: standard deviation of how much the middle of the block lies above its
+    border, and one side above the other, at the extent of the points. points: places with their standard deviation.
+    reach: half that extent. pixel: what one is on the ground. Where place and scale are open (a free network) they are
+    those of the shape. unit: behind the names of lengths, "" where they have none.
     """
     rows = _spread(network, state)
     if len(rows) < 6:
@@ -186,12 +187,21 @@ def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, 
     heights_m = np.sqrt(np.maximum(np.diag(together), 0.0))
     cells = [[float(px), float(py), float(sigma)] for (px, py), sigma in zip(xy, heights_m, strict=True)]
     return {
-        "sigma_m": float(np.median(heights_m)),
-        "bowl_m": float(sigmas[3]),
-        "tilt_m": float(np.hypot(sigmas[1], sigmas[2])),
-        "reach_m": reach,
+        f"sigma{unit}": float(np.median(heights_m)),
+        f"bowl{unit}": float(sigmas[3]),
+        f"tilt{unit}": float(np.hypot(sigmas[1], sigmas[2])),
+        f"reach{unit}": reach,
+        f"pixel{unit}": _ground_pixel(network, state),
         "points": cells,
     }
+
+
+def _ground_pixel(network: Network, state: Unknowns) -> float:
+    """What a pixel is on the ground, in units of the frame: median over images of those of their points."""
+    away = state.points_m[network.point] - state.centers_m[network.image]
+    depths = np.einsum("mi,mi->m", away, state.rotations[network.image, 2])
+    pixels = depths / state.lens[network.camera[network.image], 0]
+    return float(np.median([np.median(pixels[network.image == image]) for image in np.unique(network.image)]))
 
 
 def _spread(network: Network, state: Unknowns) -> IntArray:

@@ -48,14 +48,12 @@ def images_per_point(adjusted: AdjustedBlock) -> IntArray:
 
 
 def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> float | None:
-    """What a pixel is on the ground, in units of the largest frame: median over images of the distance of their points
-    over the focal length."""
-    frames = [adjusted.frames.get(image_id, 0) for image_id in adjusted.poses]
-    largest = max(set(frames), key=frames.count, default=0)
+    """What a pixel is on the ground: median over the images that positions have placed of the distance of their points
+    over the focal length; None without any."""
     sizes = []
     for image_id, pose in adjusted.poses.items():
         track = adjusted.tracks.get(image_id)
-        if track is not None and len(track) and adjusted.frames.get(image_id, 0) == largest:
+        if track is not None and len(track) and image_id not in adjusted.frames:
             depths: FloatArray = (adjusted.points_m[track[:, 1]] - pose.center_m) @ pose.rotation[2]
             sizes.append(float(np.median(depths)) / focal_px(adjusted.cameras[camera_ids[image_id]]))
     return _median(sizes)

@@ -123,17 +123,17 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
 
 
 def surveyed_rows(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels and standard deviations)."""
-    control = facts.get("control") or {}
-    stated, pixel_m, rows = control.get("point_sigmas_m", {}), facts.get("ground_pixel_m"), []
+    """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels, the largest of the three in
+    standard deviations, images, root mean square of its residuals there in pixels)."""
+    control, rows = facts.get("control") or {}, []
     for name, error_m in control.get("residuals", {}).items():
         metres = [f"{value:+.3f}" for value in error_m]
-        pixels = "" if not pixel_m else f"{math.hypot(*error_m) / pixel_m:.1f}"
-        sigmas = ""
-        if name in stated:
-            sigmas = f"{max(abs(e) / s for e, s in zip(error_m, stated[name], strict=True)):.1f}"
-        part = "check" if name in control.get("checks", ()) else "control"
-        rows.append((name, part, *metres, pixels, sigmas))
+        pixels = f"{math.hypot(*error_m) / control['ground_pixel_m']:.1f}"
+        sigmas = f"{max(abs(e) / s for e, s in zip(error_m, control['point_sigmas_m'][name], strict=True)):.1f}"
+        lengths_px = [math.hypot(*off_px) for off_px in control["image_residuals_px"][name].values()]
+        in_images = f"{math.hypot(*lengths_px) / math.sqrt(len(lengths_px)):.2f}" if lengths_px else ""
+        part = "check" if name in control["checks"] else "control"
+        rows.append((name, part, *metres, pixels, sigmas, f"{len(lengths_px)}", in_images))
     return rows
 
 

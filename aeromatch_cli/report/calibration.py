@@ -14,6 +14,7 @@ from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import camera_of
+from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.figures import (
     COLOURS,
     PlanSize,
@@ -191,27 +192,27 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     return svg(axes.figure, title, "lens", {})
 
 
-def heights_section(facts: Mapping[str, Any], *, in_world: bool) -> HeightsSection | None:
+def heights_section(facts: Mapping[str, Any]) -> HeightsSection | None:
     """Of the largest group whose errors are known. facts: of the stage adjust."""
-    pixel_m = facts.get("ground_pixel_m")
-    heights = next((group["heights"] for group in facts.get("groups", ()) if group.get("heights")), None)
-    if not heights or not pixel_m:
+    stated = next((group["heights"] for group in facts.get("groups", ()) if group.get("heights")), None)
+    if not stated:
         return None
+    heights, in_world = without_units(stated), "pixel_m" in stated
     points = np.array(heights["points"], dtype=np.float64).reshape(-1, 3)
 
-    def length(value_m: float) -> str:
-        pixels = f"{value_m / pixel_m:.1f} ground pixels"
-        return f"{value_m:.3f} m ({pixels})" if in_world else pixels
+    def length(what: str) -> str:
+        pixels = f"{heights[what] / heights['pixel']:.1f} ground pixels"
+        return f"{heights[what]:.3f} m ({pixels})" if in_world else pixels
 
     words = (
         f"Standard deviations of the heights of {len(points)} points, as measurements and geometry let expect them; "
-        f"median {length(heights['sigma_m'])}. The middle of the block may lie {length(heights['bowl_m'])} above or "
-        f"below its border, one side {length(heights['tilt_m'])} above or below the middle."
+        f"median {length('sigma')}. The middle of the block may lie {length('bowl')} above or "
+        f"below its border, one side {length('tilt')} above or below the middle."
     )
-    return HeightsSection(_height_map(points, pixel_m, in_world=in_world), words)
+    return HeightsSection(_height_map(points, heights["pixel"], in_world=in_world), words)
 
 
-def _height_map(points: FloatArray, pixel_m: float, *, in_world: bool) -> str:
+def _height_map(points: FloatArray, pixel: float, *, in_world: bool) -> str:
     """(P, 3) x, y and standard deviation of points."""
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -219,7 +220,7 @@ def _height_map(points: FloatArray, pixel_m: float, *, in_world: bool) -> str:
     margin = 0.06 * float((high - low).max()) or 1.0
     axes = plan_axes(low - margin, high + margin, _MAP, in_world=in_world)
     scale = LinearSegmentedColormap.from_list("error", [COLOURS["k4"], COLOURS["k2"], COLOURS["k0"], COLOURS["bad"]])
-    values = points[:, 2] if in_world else points[:, 2] / pixel_m
+    values = points[:, 2] if in_world else points[:, 2] / pixel
     drawn = axes.scatter(*points[:, :2].T, 42.0, c=values, cmap=scale, linewidth=0)
     place = axes.get_position()
     beside = axes.figure.add_axes((place.x1 + 0.02, place.y0, 0.028, place.height))

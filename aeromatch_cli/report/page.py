@@ -135,7 +135,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         ),
         cameras=_cameras(context, adjustment, adjusted),
         readout_not_tried=adjustment.facts.get("readout_not_tried"),
-        heights=heights_section(adjustment.facts, in_world=adjustment.in_world),
+        heights=heights_section(adjustment.facts),
         residuals=surveyed_rows(adjustment.facts),
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),

@@ -38,7 +38,7 @@ from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
 VERSION = 22
 # Of what adjusted.json states of the same adjustment.
-_FACTS_VERSION = 2
+_FACTS_VERSION = 3
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -252,7 +252,7 @@ def _control(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mappin
     beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
     placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
     points = [point for point in context.control if point.name not in left_out]
-    return control_figures(replace(adjusted, poses=placed), cameras, points)
+    return control_figures(replace(adjusted, poses=placed), cameras, points, metric=context.block.metric)
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:
