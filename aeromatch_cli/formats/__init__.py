@@ -108,9 +108,9 @@ lengths of the line, `m`, or `arbitrary` in a frame of its own.
 Written by `adjust`: the adjusted block beside what was given, and how well its images fit their points. One line per
 adjusted image: `image` (its name); `dx_m`, `dy_m`, `dz_m`: adjusted less given position; `rotation_x_deg`,
 `rotation_y_deg`, `rotation_z_deg`: rotation vector about the axes of the world that turns the given attitude into the
-adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in standard deviations
-of what was given. All are empty where nothing was given, and in a frame of its own. `error_px`: mean reprojection
-error; `points`: of the image; `images_per_point`: how many images see them, mean.
+adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in the standard
+deviations that were stated, each axis in its own. All are empty where nothing was given, and in a frame of its own.
+`error_px`: mean reprojection error; `points`: of the image; `images_per_point`: how many images see them, mean.
 
 ### orientation/adjusted.json
 

@@ -132,6 +132,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
             read_position_residuals(context, adjustment),
             {row.image_id: row.name for row in images},
             context.block.gsd_m,
+            adjustment.facts.get("groups", ()),
         ),
         cameras=_cameras(context, adjustment, adjusted),
         readout_not_tried=adjustment.facts.get("readout_not_tried"),
