@@ -148,6 +148,16 @@ def test_two_points_determine_nothing(truth: Truth) -> None:
     assert (figures["control"], figures["transformation"], figures["check_rmse_m"]) == (2, None, None)
 
 
+def test_check_points_alone_have_the_residuals_of_the_block_as_it_is(truth: Truth) -> None:
+    rows = [0, 40, 80, 120]
+    points = surveyed(truth, rows, np.tile([0.03, -0.04, 0.12], (4, 1)), set(rows))
+    figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+    assert figures["residuals"] == {f"p{row}": [-0.03, 0.04, -0.12] for row in rows}
+    assert [*figures["point_sigmas_m"]] == figures["checks"] == [*figures["residuals"]]
+    own = control_figures(adjusted_truth(truth), cameras(truth), points, metric=False)
+    assert "residuals" not in own  # nothing says what its units are
+
+
 @pytest.mark.parametrize("head", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
 def test_a_list_is_read_into_the_block(tmp_path: Path, head: str) -> None:
     path = tmp_path / "gcp_list.txt"

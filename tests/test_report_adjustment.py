@@ -49,3 +49,17 @@ def test_cameras_count_from_the_corner_of_the_first_pixel_in_facts_and_on_the_pa
         "Cameras after the adjustment (cx, cy from the corner of the first pixel, as in COLMAP)",
         "1: PINHOLE, 800 x 600 px, 700, 700, 400, 300",
     )
+
+
+def test_check_points_alone_are_told_of_the_block_as_it_is():
+    control = {"points": 4, "control": 0, "check": 4, "not_measured_in_two_images": [], "doubtful": [],
+               "control_rmse_m": None, "check_rmse_m": None, "residuals": {"p1": [2.0, 3.0, 4.0]}}  # fmt: skip
+    inside = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": True,
+              "held_out_rms_m": [2.0, 3.0, 4.0], "without_rms_m": [2.0, 3.0, 4.0]}  # fmt: skip
+    facts = {"images": 9, "points": 1, "track_length": 3.0, "reprojection_error_px": 0.2, "sigma_position_m": None,
+             "sigma_angle_deg": None, "control": control, "groups": [{"control": inside}]}  # fmt: skip
+    assert adjustment_rows(Adjustment(facts))[-1] == (
+        "Control: 0 control points, 4 check points",
+        "the block as it is: RMSE at check points x 2.000, y 3.000, z 4.000 m",
+    )
+    assert adjustment_notices([], Adjustment(facts)) == []

@@ -56,15 +56,15 @@ def test_the_weights_of_positions_stand_beside_their_stated_accuracy() -> None:
     section = residual_section(adjusted(), found, NAMES, 0.1, [small, large])
     assert section is not None
     assert section.words.endswith(
-        " By their residuals the adjustment takes positions as exact to 1.8 times the stated standard deviations "
-        "horizontally and 0.62 times vertically."
+        " By what they are off the adjustment weighs them with 1.8 times the stated standard deviations horizontally "
+        "and 0.6 times vertically."
     )
     shifted = residual_section(adjusted(), found, NAMES, 0.1, [large | {"flights": [{"flight": "A"}]}])
     assert shifted is not None
     assert shifted.words.endswith(" What was found of flights and antennas is part of the residuals here.")
     without = residual_section(adjusted(), found, NAMES, 0.1, [large | {"positions": None}])
     assert without is not None
-    assert "By their residuals" not in without.words
+    assert "weighs them" not in without.words
 
 
 def test_the_plan_shows_each_camera_in_the_colour_of_its_height() -> None:

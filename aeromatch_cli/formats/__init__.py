@@ -153,12 +153,12 @@ deviations that were stated, each axis in its own. All are empty where nothing w
     makes them better).
 - `control`: the block beside all surveyed points. `points`, `control`, `check` (counts), `not_measured_in_two_images`,
   `rays_do_not_meet`, `doubtful` (names); `transformation` (the similarity onto the control points: `scale`,
-  `rotation_vector_deg`, `shift_m`) and after it `residuals` (name -> x, y, z, metres), `control_rmse_m`,
-  `check_rmse_m`, `check_kind`; `checks` (names); `offset_m` (before it, median; null in a frame without metres);
-  `point_sigmas_m` (name -> standard deviations of its residual, as stated of the survey and of the image measurements,
-  both together), `sigmas_m` (median of those of the check points, else of the control points); `image_residuals_px`
-  (name -> image_id -> x, y: measured less seen where the rays of the point meet), `reprojection_error_px` (root mean
-  square of their lengths); `ground_pixel_m` (at the points).
+  `rotation_vector_deg`, `shift_m`; null with fewer than three of them) and after it `residuals` (name -> x, y, z,
+  metres), `control_rmse_m`, `check_rmse_m`, `check_kind`; `checks` (names); `offset_m` (before it, median; null in a
+  frame without metres); `point_sigmas_m` (name -> standard deviations of its residual, as stated of the survey and of
+  the image measurements, both together), `sigmas_m` (median of those of the check points, else of the control points);
+  `image_residuals_px` (name -> image_id -> x, y: measured less seen where the rays of the point meet),
+  `reprojection_error_px` (root mean square of their lengths); `ground_pixel_m` (at the points).
 
 ### orientation/adjusted.npz
 

@@ -28,11 +28,11 @@ def control_figures(
     of the check points; without any, of every control point under the transformation of the others (leave-one-out).
     `offset_m`: from the block as it is to the surveyed positions, median over the control points, None of a block
     without metres. `doubtful`: control points that the others contradict. `residuals`: name -> x, y, z after the
-    transformation; `checks`: names; `point_sigmas_m`, `sigmas_m`: standard deviations of these residuals by what was
-    stated of survey and image measurements, and the median of those at which errors count. `image_residuals_px`: name
-    -> image_id -> x, y, measured less seen where the rays meet. `ground_pixel_m`: what a pixel is at the points.
-    `rays_do_not_meet`: points whose rays are parallel or meet behind a camera, which are left out. None where too few
-    are left.
+    transformation, of a block that none is known of as it is; `checks`: names; `point_sigmas_m`, `sigmas_m`: standard
+    deviations of these residuals by what was stated of survey and image measurements, and the median of those at which
+    errors count. `image_residuals_px`: name -> image_id -> x, y, measured less seen where the rays meet.
+    `ground_pixel_m`: what a pixel is at the points. `rays_do_not_meet`: points whose rays are parallel or meet behind a
+    camera, which are left out. None where too few are left.
     """
     rays = {point.name: _rays(adjusted, cameras, point) for point in points}
     found = {point.name: intersected(*rays[point.name]) for point in points}
@@ -54,12 +54,21 @@ def control_figures(
         "reprojection_error_px": _rms_length([one for own in image_residuals.values() for one in own.values()]),
     }
     if seen and (metric or fit is not None):
-        turned = fit[0] * fit[1] if fit is not None else np.eye(3)
-        moves = {p.name: _pixel_moves(adjusted, cameras, p, in_block[p.name]) @ np.linalg.inv(turned) for p in seen}
+        placed = fit if fit is not None else (1.0, np.eye(3), np.zeros(3))
+        turned = np.linalg.inv(placed[0] * placed[1])
+        moves = {p.name: _pixel_moves(adjusted, cameras, p, in_block[p.name]) @ turned for p in seen}
         sigmas_m = {p.name: np.hypot(p.sigmas_m, _measured_sigmas_m(moves[p.name], p.sigma_px)) for p in seen}
         figures |= {
             "point_sigmas_m": {name: [float(f"{v:.4g}") for v in own] for name, own in sigmas_m.items()},
             "sigmas_m": np.median([sigmas_m[p.name] for p in checks or control], axis=0).tolist(),
+            "residuals": {
+                point.name: [round(float(v), 4) for v in error]
+                for point, error in zip(
+                    [*control, *checks], _errors(placed, [*control, *checks], in_block), strict=True
+                )
+            },
+            "checks": [point.name for point in checks],
+            "ground_pixel_m": 1.0 / float(np.median(np.linalg.norm(np.concatenate([*moves.values()]), axis=1))),
         }
     if fit is None:
         unknown = ("offset_m", "transformation", "control_rmse_m", "check_rmse_m", "check_kind")
@@ -83,12 +92,6 @@ def control_figures(
         "check_rmse_m": _rmse(independent),
         "check_kind": kind,
         "doubtful": _doubtful(control, in_block),
-        "residuals": {
-            point.name: [round(float(v), 4) for v in error]
-            for point, error in zip([*control, *checks], _errors(fit, [*control, *checks], in_block), strict=True)
-        },
-        "checks": [point.name for point in checks],
-        "ground_pixel_m": 1.0 / float(np.median(np.linalg.norm(np.concatenate([*moves.values()]), axis=1))),
     }
 
 

@@ -77,7 +77,7 @@ def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> li
     names, adjusted = {row.image_id: row.name for row in images}, adjustment.facts
     found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
     control = adjusted.get("control")
-    if control and (control["control_rmse_m"] is None or control.get("rays_do_not_meet")):
+    if control and (not control.get("residuals") or control.get("rays_do_not_meet")):
         # What the section below cannot show.
         found.append(Notice("warn", "Note on the control points", ". ".join(control_words(control))))
     outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
@@ -119,6 +119,9 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
             found.append((f"{kind}, after it", f"RMSE {_metres(control['check_rmse_m'])}"))
         if control["doubtful"]:
             found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
+    elif control and control.get("residuals"):
+        counts, *words = control_words(control, [group.get("control") or {} for group in facts["groups"]])
+        found.append((counts.capitalize(), "; ".join(words)))
     return found
 
 

@@ -138,6 +138,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         readout_not_tried=adjustment.facts.get("readout_not_tried"),
         heights=heights_section(adjustment.facts),
         residuals=surveyed_rows(adjustment.facts),
+        residuals_after_fit=bool((adjustment.facts.get("control") or {}).get("transformation")),
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),

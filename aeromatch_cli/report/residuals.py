@@ -72,8 +72,8 @@ def _weights(groups: Sequence[Mapping[str, Any]]) -> str:
         return ""
     across, up = most["positions"]["factors"]
     words = (
-        f" By their residuals the adjustment takes positions as exact to {across:.2g} times the stated standard "
-        f"deviations horizontally and {up:.2g} times vertically."
+        f" By what they are off the adjustment weighs them with {across:.1f} times the stated standard deviations "
+        f"horizontally and {up:.1f} times vertically."
     )
     explained = most["flights"] or any("lever_x" in mount for mount in most["mounts"].values())
     return words + (" What was found of flights and antennas is part of the residuals here." if explained else "")

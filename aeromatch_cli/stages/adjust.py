@@ -38,7 +38,7 @@ from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
 VERSION = 22
 # Of what adjusted.json states of the same adjustment.
-_FACTS_VERSION = 4
+_FACTS_VERSION = 5
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
