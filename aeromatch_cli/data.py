@@ -103,9 +103,10 @@ class PoseResidual:
     """An adjusted pose beside the one given, and how well the image fits its points.
 
     position_m: (3,) adjusted less given, x, y, z of the world. rotation_deg: (3,) rotation vector, about the same axes,
-    that turns the given attitude into the adjusted one. position_sigmas, rotation_sigmas: (3,) both in standard
-    deviations of what was given. NaN where nothing was given, and in a frame that no position ties to the world.
-    error_px: mean reprojection error; points: how many; images_per_point: mean of them. NaN without points.
+    that turns the given attitude into the adjusted one. position_sigmas, rotation_sigmas: (3,) both in the standard
+    deviations that were stated, each axis in its own. NaN where nothing was given, and in a frame that no position
+    ties to the world. error_px: mean reprojection error; points: how many; images_per_point: mean of them. NaN without
+    points.
     """
 
     position_m: FloatArray

@@ -185,6 +185,12 @@ class Workspace:
         """Folders of all exports, also of earlier ones."""
         return sorted(path for path in self.exports.parent.glob("[!.]*") if path.is_dir())
 
+    @property
+    def export_is_older(self) -> bool:
+        """Whether stages before the last export have made something since."""
+        made = self.stage_report("export")
+        return made.is_file() and self.ran_since(made, "filter", "refine", "adjust", "consistency")
+
     def changed_tables(self) -> list[str]:
         """Names of the tables of the block that are not as they were written, or gone. Raises as `check_version`."""
         self.check_version()

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from conftest import IMAGES, Site
 from scipy.spatial.transform import Rotation
 from test_export_colmap import CAMERA_A, CAMERA_B, ORIGIN_M, Truth, make_truth
 
+from aeromatch_cli.config import load
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pose
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
@@ -331,6 +333,22 @@ def test_the_exported_model_has_points_and_the_databases_keypoints(truth: Truth,
         for prior, image_id in zip(database.read_all_pose_priors(), IMAGE_IDS, strict=True):
             np.testing.assert_allclose(np.ravel(prior.position), positions[image_id].center_m, atol=1e-9)
             assert prior.position_covariance[0, 0] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("changed", "velocities", "why"),
+    [
+        ([], {"a": [4.0, 0.0, 0.0]}, None),
+        ([], {"a": [0.0, 0.0, 0.0], "outside": [4.0, 0.0, 0.0]}, "the velocity of the aircraft is not known; capture "
+         "times of images with positions tell it, or DJI's XMP"),
+        (["adjust.rolling_shutter=false"], {"a": [4.0, 0.0, 0.0]}, "adjust.rolling_shutter=false"),
+        (["orient=given"], {"a": [4.0, 0.0, 0.0]}, "orient=given"),
+    ],
+)  # fmt: skip
+def test_why_no_read_out_time_was_tried_is_said(changed: list[str], velocities: Any, why: str | None) -> None:
+    observed = Observed({}, {}, {}, velocities={i: np.array(v) for i, v in velocities.items()})
+    context: Any = SimpleNamespace(settings=load("baseline", changed), observed=observed)
+    assert adjust.readout_not_tried(context, {"a"}) == why
 
 
 @pytest.mark.slow

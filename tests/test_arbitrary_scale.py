@@ -7,6 +7,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,6 +81,8 @@ def test_the_table_of_poses_names_the_unit_of_each_line() -> None:
     for metric, expected in ((True, ["m", "arbitrary", "m"]), (False, ["arbitrary"] * 3)):
         rows = list(csv.DictReader(orientation_text(adjusted, replace(block, metric=metric)).splitlines()))
         assert [row["unit"] for row in rows] == expected
+        assert [bool(row["sigma_x_m"]) for row in rows] == [unit == "m" for unit in expected]
+        assert all(row["sigma_omega_deg"] for row in rows)
         assert [row["frame"] for row in rows] == ["world", "own 1", "predicted"]
 
 
@@ -87,6 +90,16 @@ def test_the_table_of_poses_names_the_unit_of_each_line() -> None:
 def test_the_world_of_an_export_names_its_unit(tmp_path: Path, metric: bool, unit: str) -> None:
     write_world(tmp_path, flown(metric=metric))
     assert json.loads((tmp_path / "world.json").read_text())["unit"] == unit
+
+
+def lengths(facts: Any) -> set[str]:
+    """Names of figures that are metres, wherever they stand."""
+    if isinstance(facts, list):
+        return set().union(*map(lengths, facts))
+    if not isinstance(facts, dict):
+        return set()
+    own = {name for name, value in facts.items() if name.endswith("_m") and value is not None}
+    return own.union(*map(lengths, facts.values()))
 
 
 @pytest.mark.slow
@@ -99,6 +112,9 @@ def test_a_run_without_positions_says_no_metre(site: Site) -> None:
     assert stages["pairs"]["facts"]["block"]["gsd_m"] is None
     assert stages["adjust"]["facts"]["images"] > 0
     assert stages["adjust"]["facts"]["sigma_position_m"] is None
+    assert lengths(stages) == {"origin_m"}  # of a frame that has none
+    (group,) = stages["adjust"]["facts"]["groups"]
+    assert 0.0 < group["heights"]["sigma"] / group["heights"]["pixel"] < 10.0
     shown = invoke("show", site.work, site.names()[0]).stdout
     assert "units of arbitrary length" in shown
     assert not METRES.search(shown)

@@ -17,7 +17,7 @@ from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.bundle.network import LENS, READOUT
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, image_points, lens_of, set_lens, take, unknowns_of
 from aeromatch_cli.orientation.bundle.projection import project
-from aeromatch_cli.orientation.calibration import Calibration, LensPrior, camera_of, freed, lens_prior
+from aeromatch_cli.orientation.calibration import Calibration, LensPrior, camera_of, freed, held_by, lens_prior
 from aeromatch_cli.orientation.calibration import lens_of as lens_of_camera
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
@@ -86,6 +86,20 @@ def test_what_is_free_of_a_camera(calibration: Calibration, images: int, names: 
     sigmas = freed(prior(), calibration, {}, images)
     assert {LENS[k] for k in np.flatnonzero(sigmas)} == set(names.split())
     np.testing.assert_array_equal(sigmas[sigmas > 0], prior().sigmas[sigmas > 0])
+
+
+@pytest.mark.parametrize("calibration", ["given", "focal", "auto", "brown"])
+@pytest.mark.parametrize("switches", [{}, {"f": False, "k3": False}, {"f": True, "cx": True, "b2": False}])
+def test_the_settings_that_hold_are_named_for_what_they_hold(
+    calibration: Calibration, switches: dict[str, bool]
+) -> None:
+    sigmas = freed(prior(), calibration, switches, 20)
+    found = held_by(calibration, switches)
+    assert set(found) == {LENS[k] for k in range(10) if sigmas[k] == 0.0}
+    assert {name for name, setting in found.items() if setting == "adjust.hold"} == {
+        name for name, free in switches.items() if not free
+    }
+    assert set(found.values()) <= {"adjust.hold", f"adjust.calibration={calibration}"}
 
 
 def test_switches_free_and_hold_in_any_case() -> None:

@@ -70,6 +70,33 @@ def test_check_points_show_their_own_error(truth: Truth) -> None:
     assert figures["reprojection_error_px"] < 1e-3
 
 
+def test_residuals_are_as_large_as_survey_and_measurements_let_expect(truth: Truth) -> None:
+    """Of 200 points surveyed and measured with known errors, in a block of another scale too."""
+    rows, rng, sigmas_m, sigma_px = list(range(0, 400, 2)), np.random.default_rng(0), (0.02, 0.02, 0.03), 2.0
+    exact = surveyed(truth, rows, rng.normal(0.0, sigmas_m, (200, 3)), set())
+    points = [
+        replace(p, pixels={i: px + rng.normal(0.0, sigma_px, 2) for i, px in p.pixels.items()}, sigma_px=sigma_px)
+        for p in exact
+    ]
+    whole = adjusted_truth(truth)
+    figures = control_figures(whole, cameras(truth), points)
+    residuals, stated = (np.array([figures[key][p.name] for p in points]) for key in ("residuals", "point_sigmas_m"))
+    assert (stated > 1.05 * np.array(sigmas_m)).all()  # the survey alone is less
+    np.testing.assert_allclose(np.sqrt(((residuals / stated) ** 2).mean(axis=0)), 1.0, atol=0.1)
+    # Of 2 px in each coordinate, of which three unknowns of a point take a part.
+    images = np.mean([len(own) for own in figures["image_residuals_px"].values()])
+    expected_px = sigma_px * np.sqrt(2.0) * np.sqrt(1.0 - 3.0 / (2.0 * images))
+    assert figures["reprojection_error_px"] == pytest.approx(expected_px, rel=0.1)
+    halved = {i: replace(pose, center_m=0.5 * pose.center_m) for i, pose in whole.poses.items()}
+    small = control_figures(replace(whole, poses=halved), cameras(truth), points, metric=False)
+    np.testing.assert_allclose([small["point_sigmas_m"][p.name] for p in points], stated, rtol=0.02)
+    assert small["ground_pixel_m"] == pytest.approx(figures["ground_pixel_m"], rel=0.01)
+    assert small["offset_m"] is None
+    scale = small["transformation"]["scale"]
+    assert scale == pytest.approx(2.0, rel=1e-3)
+    assert f"to fit them the exported block is to be scaled to {scale:.4g} m per unit" in control_words(small)
+
+
 def test_without_check_points_each_is_left_out_once(truth: Truth) -> None:
     rows = list(range(0, 400, 40))
     rng = np.random.default_rng(0)
@@ -119,6 +146,16 @@ def test_a_point_whose_rays_meet_behind_the_cameras_is_named_and_left_out(truth:
 def test_two_points_determine_nothing(truth: Truth) -> None:
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, [0, 40], np.zeros((2, 3)), set()))
     assert (figures["control"], figures["transformation"], figures["check_rmse_m"]) == (2, None, None)
+
+
+def test_check_points_alone_have_the_residuals_of_the_block_as_it_is(truth: Truth) -> None:
+    rows = [0, 40, 80, 120]
+    points = surveyed(truth, rows, np.tile([0.03, -0.04, 0.12], (4, 1)), set(rows))
+    figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+    assert figures["residuals"] == {f"p{row}": [-0.03, 0.04, -0.12] for row in rows}
+    assert [*figures["point_sigmas_m"]] == figures["checks"] == [*figures["residuals"]]
+    own = control_figures(adjusted_truth(truth), cameras(truth), points, metric=False)
+    assert "residuals" not in own  # nothing says what its units are
 
 
 @pytest.mark.parametrize("head", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
@@ -211,7 +248,9 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     assert max(inside["held_out_rms_m"][:2]) < 0.5 < max(inside["without_rms_m"])
     assert "take part in the adjustment: RMSE at each control point, adjusted without it" in outcome.stdout
     assert control["doubtful"] == []
-    assert "Control points, each left out once" in (done_site.work / "report" / "index.html").read_text()
+    page = (done_site.work / "report" / "index.html").read_text()
+    assert "Control points, each left out once" in page
+    assert "The read-out time of a rolling shutter was not tried: the velocity of the aircraft is not known" in page
 
 
 @pytest.mark.parametrize(

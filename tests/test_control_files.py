@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import invoke
 from pyproj import CRS, Transformer
 
 from aeromatch_cli.blocks.control import read_control
@@ -230,6 +231,24 @@ def test_two_files_that_may_be_the_other_half(tmp_path: Path) -> None:
         write(tmp_path, name, MARKS)
     with pytest.raises(ConfigError, match=r"a\.csv and b\.csv beside it do: name the right one with --gcp-marks"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        (("--gcp-marks", "marks.csv"), "--gcp-marks"),
+        (("--gcp-use", "check"), "--gcp-use"),
+        (("--gcp-use", "adjust"), "--gcp-use"),
+        (("--set", "block.gcp_use=check", "--gcp-marks", "marks.csv"), "--gcp-marks and --gcp-use"),
+    ],
+)
+def test_words_on_control_points_need_control_points(tmp_path: Path, given: tuple[str, ...], named: str) -> None:
+    outcome = invoke("run", "--images", tmp_path, "--workspace", tmp_path / "work", *given)
+    assert outcome.code == 2
+    assert f"error: {named} without control points: name the file that holds them with --gcp" in outcome.stderr
+    assert not (tmp_path / "work").exists()
+    with_them = invoke("run", "--images", tmp_path, "--workspace", tmp_path / "work", *given, "--gcp", "gcps.csv")
+    assert "without control points" not in with_them.stderr
 
 
 def test_degrees_of_a_block_without_crs(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain
+from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain, without_units
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
@@ -19,7 +19,8 @@ GROUP: dict[str, Any] = {
         "stated_m": [0.02, 0.02, 0.03], "factors": [1.0, 1.0],
     },
     "calibration": {"camera_1": CALIBRATED},
-    "heights": {"sigma_m": 0.05, "bowl_m": 0.06, "tilt_m": 0.03, "reach_m": 100.0, "points": []},
+    "heights": {"sigma_m": 0.05, "bowl_m": 0.06, "tilt_m": 0.03, "reach_m": 100.0, "pixel_m": 0.03,
+                "points": []},
 }  # fmt: skip
 ADJUSTED: dict[str, Any] = {
     "images": 12, "points": 3000, "track_length": 3.4, "held_by_pairs": 0, "reprojection_error_px": 0.3,
@@ -70,7 +71,7 @@ def heights(**changes: float) -> dict[str, Any]:
 TURNED = {"rotation_sigmas_median": [5.0, 5.0, 0.1], "rotation_deg_median": [5.0, 5.0, 0.1]}
 CONTROL = {
     "points": 5, "control": 3, "check": 2, "doubtful": [], "check_rmse_m": [0.02, 0.02, 0.03],
-    "control_rmse_m": [0.01, 0.01, 0.01], "sigmas_m": [0.02, 0.02, 0.03],
+    "control_rmse_m": [0.01, 0.01, 0.01], "sigmas_m": [0.025, 0.025, 0.042426],
 }  # fmt: skip
 # Of the adjustment with control points: check points are met to 37.5 cm in height.
 INSIDE = {
@@ -173,6 +174,20 @@ def test_a_block_of_unknown_tilt_does_not_tell_the_principal_point(name: str, ve
     assert found(quality, "calibration").level == quality.verdict == verdict
 
 
+def test_the_setting_that_holds_a_calibration_is_named() -> None:
+    whole = dict.fromkeys(("f", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "b1", "b2"), "adjust.calibration=given")
+    quality = judged_with(adjust={"held_by": whole, "reprojection_error_px": 0.9})
+    assert "calibration: adjust.calibration=given holds all parameters" in quality.unchecked
+    assert found(quality, "reprojection error").sentence.endswith(
+        "; adjust.calibration=given holds all parameters of cameras as stated, which may be wrong"
+    )
+    assert "adjust." not in found(judged_with(adjust={"reprojection_error_px": 0.9}), "reprojection error").sentence
+    partly = judged_with(adjust={"held_by": {"f": "adjust.hold"}})
+    finding = found(partly, "calibration")
+    assert finding.sentence.startswith("calibration of camera camera_1: cx 2005.0 where 1999.5 +- 80.0 is known")
+    assert finding.sentence.endswith("(adjust.hold holds f)")
+
+
 def test_a_shift_that_is_not_significant_is_none() -> None:
     quality = judged_with(group=flight(shift_x=[1.0, 0.5], shift_y=[0.0, 0.5], shift_z=[0.0, 0.5]))
     assert quality.verdict == "good"
@@ -225,9 +240,11 @@ def test_positions_of_which_none_is_used_are_bad() -> None:
 
 
 def test_lengths_of_a_frame_without_metres_are_no_metres() -> None:
-    group = {"kind": "level", "positions": None, **heights(bowl_m=0.3)}
-    for metric, metres in ((True, True), (False, False)):
-        bowl = found(judged_with(group=group, metric=metric, adjust={"positions_given": 0}), "bowl")
+    known = heights(bowl_m=0.3)["heights"]
+    for own, metres in ((known, True), (without_units(known), False)):
+        group = {"kind": "level", "positions": None, "heights": own}
+        bowl = found(judged_with(group=group, adjust={"positions_given": 0, "ground_pixel_m": None}), "bowl")
+        assert bowl.value == pytest.approx(10.0)
         assert ("0.3 m" in bowl.sentence) is metres
 
 

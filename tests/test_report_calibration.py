@@ -10,6 +10,7 @@ import pytest
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import project
+from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.adjustment import surveyed_rows
 from aeromatch_cli.report.calibration import camera_sections, heights_section
 
@@ -18,10 +19,10 @@ IMAGES = [Image(i, f"{i}.jpg", 800, 600, "1") for i in "ab"]
 KNOWN = {"f": 690.0, "cx": 399.5, "cy": 299.5}
 FACTS: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
     "calibration": {"1": {"images": 2, "correlations": [["f", "k1", -0.95]], "parameters": {
-        "f": [700.0, 0.5, 690.0, 20.0], "cx": [399.5, 0.0, 399.5, 16.0], "cy": [299.5, 0.0, 299.5, 16.0],
+        "f": [700.0, 0.5, 690.0, 20.0], "cx": [400.0, 0.0, 400.0, 16.0], "cy": [300.0, 0.0, 300.0, 16.0],
         "k1": [0.0, 0.001, 0.0, 0.05],
     }}},
-    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0,
+    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0, "pixel_m": 0.1,
                 "points": [[0.0, 0.0, 0.1], [50.0, 10.0, 0.15], [20.0, 60.0, 0.2]]},
 }]}  # fmt: skip
 
@@ -45,7 +46,13 @@ def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
     (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
     assert section.words == "2 images, PINHOLE, 800 x 600 px"
     assert section.rows[0] == ("f, focal length", "px", "700.00", "0.50", "690.00", "20.00", "+0.5", "k1 -0.95")
-    assert section.rows[1] == ("cx, principal point", "px", "399.50", "held", "399.50", "16.00", "", "")
+    assert section.rows[1] == ("cx, principal point", "px", "400.00", "held", "400.00", "16.00", "", "")
+
+
+def test_a_setting_that_holds_a_parameter_is_named() -> None:
+    adjusted, keypoints = block(np.zeros(2))
+    (section,) = camera_sections(FACTS | {"held_by": {"cx": "adjust.hold"}}, adjusted, IMAGES, keypoints.__getitem__)
+    assert [row[3] for row in section.rows] == ["0.50", "held by adjust.hold", "held", "0.001000"]
 
 
 def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
@@ -59,7 +66,8 @@ def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
 
 
 def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:
-    world, own = (heights_section(FACTS, in_world=in_world) for in_world in (True, False))
+    [group] = FACTS["groups"]
+    world, own = heights_section(FACTS), heights_section({"groups": [{"heights": without_units(group["heights"])}]})
     assert world is not None
     assert own is not None
     assert "median 0.150 m (1.5 ground pixels)" in world.words
@@ -67,15 +75,16 @@ def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() 
     assert "median 1.5 ground pixels" in own.words
     assert "metres" in world.plan
     assert "metres" not in own.plan
-    assert heights_section({"groups": []}, in_world=True) is None
+    assert heights_section({"groups": []}) is None
 
 
 def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:
     control = {
         "residuals": {"P1": [0.02, -0.01, 0.06], "P2": [0.0, 0.0, 0.3]}, "checks": ["P2"],
-        "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]},
+        "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]}, "ground_pixel_m": 0.1,
+        "image_residuals_px": {"P1": {"a": [0.3, -0.4], "b": [0.0, 0.0]}, "P2": {}},
     }  # fmt: skip
-    assert surveyed_rows({"control": control, "ground_pixel_m": 0.1}) == [
-        ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0"),
-        ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0"),
+    assert surveyed_rows({"control": control}) == [
+        ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0", "2", "0.35"),  # of 0.5 and 0 px
+        ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0", "0", ""),
     ]

@@ -49,6 +49,24 @@ def test_the_table_has_root_mean_squares_in_metres_pixels_and_deviations() -> No
     assert len(residual_section(adjusted(), found, NAMES, None).rows) == 2  # type: ignore[union-attr]
 
 
+def test_the_weights_of_positions_stand_beside_their_stated_accuracy() -> None:
+    found = dict.fromkeys("abc", residual([0.0, 0.0, 0.2]))
+    small = {"positions": {"used": 2, "factors": [5.0, 5.0]}, "flights": [], "mounts": {}}
+    large = {"positions": {"used": 9, "factors": [1.84, 0.62]}, "flights": [], "mounts": {}}
+    section = residual_section(adjusted(), found, NAMES, 0.1, [small, large])
+    assert section is not None
+    assert section.words.endswith(
+        " By what they are off the adjustment weighs them with 1.8 times the stated standard deviations horizontally "
+        "and 0.6 times vertically."
+    )
+    shifted = residual_section(adjusted(), found, NAMES, 0.1, [large | {"flights": [{"flight": "A"}]}])
+    assert shifted is not None
+    assert shifted.words.endswith(" What was found of flights and antennas is part of the residuals here.")
+    without = residual_section(adjusted(), found, NAMES, 0.1, [large | {"positions": None}])
+    assert without is not None
+    assert "weighs them" not in without.words
+
+
 def test_the_plan_shows_each_camera_in_the_colour_of_its_height() -> None:
     found = {"a": residual([3.0, 0.0, 9.0]), "b": residual([0.0, 4.0, 9.0]), "c": residual([0.0, 0.0, -9.0])}
     section = residual_section(adjusted(), found, NAMES, 0.1)

@@ -73,6 +73,15 @@ def test_residuals_are_what_was_put_in() -> None:
     assert [one.images_per_point for one in found.values()] == pytest.approx([2.25, 2.25, 3.0])
 
 
+def test_each_axis_counts_in_its_own_stated_deviation() -> None:
+    adjusted, keypoints = block()
+    poses = {i: replace(pose, sigmas_m=(0.02, 0.05, 0.5)) for i, pose in given(adjusted).items()}
+    found = residuals_of(adjusted, poses, IMAGES, keypoints.__getitem__)
+    for image_id, one in found.items():
+        expected = np.array(SHIFTS_M[image_id]) / [0.02, 0.05, 0.5]
+        np.testing.assert_allclose(one.position_sigmas, expected, atol=1e-9)
+
+
 def test_an_image_in_a_frame_of_its_own_lies_beside_nothing_given() -> None:
     found = made({"a": 1})
     assert np.isnan(found["a"].position_m).all()

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from conftest import UNORIENTED, Site
+from conftest import UNORIENTED, Site, invoke
 
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
@@ -33,6 +33,25 @@ def test_exports_that_the_settings_no_longer_name_are_said_to_be_old(done_site: 
     assert told.code == 0
     assert f"export    {done_site.work / 'export' / 'tracks'} is of earlier settings" in told.stdout
     assert "colmap is of earlier" not in told.stdout
+
+
+@pytest.mark.slow
+def test_an_export_of_an_earlier_adjustment_is_said_to_be_old(done_site: Site) -> None:
+    held = "--set", "adjust.calibration=given"
+    folder = done_site.work / "export" / "colmap"
+    old = f"export    {folder} is of an earlier adjustment: `aeromatch export` makes it anew"
+    assert "of an earlier adjustment" not in done_site("adjust").stdout
+    for _ in range(2):  # also where the adjustment is up to date
+        assert old in done_site("adjust", *held).stdout
+    assert "colmap, of an earlier adjustment: run aeromatch export" in invoke("show", done_site.work).stdout
+    assert done_site("export", *held).done() == {"export": 1}
+    for command in ("adjust", "report"):
+        assert "of an earlier adjustment" not in done_site(command, *held).stdout
+    # Made again, and the same: the export is up to date.
+    done_site("adjust", "--overwrite", *held)
+    assert done_site("export", *held).done() == {}
+    assert "of an earlier adjustment" not in done_site("adjust", *held).stdout
+    assert "of an earlier adjustment" not in invoke("show", done_site.work).stdout
 
 
 @pytest.mark.slow

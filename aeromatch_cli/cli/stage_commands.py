@@ -41,6 +41,7 @@ from aeromatch_cli.cli.progress import RUN_STAGES, SHARD_STAGES, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
+    from aeromatch_cli.config.schema import BlockSettings
     from aeromatch_cli.stages.run import Result
 
 # Commands that start anew where no preset is named.
@@ -188,6 +189,7 @@ def stage_command(name: str) -> Callable[..., None]:
                 run=as_texts(run),
                 workspace=_absolute(workspace),
             )
+            _check_control(block, settings.block)
             course = SHARD_STAGES if shard else RUN_STAGES
             shown = progress_shown(quiet, course if name == "run" else ())
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
@@ -195,6 +197,19 @@ def stage_command(name: str) -> Callable[..., None]:
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)
 
     return command
+
+
+def _check_control(given: Mapping[str, Any], block: BlockSettings) -> None:
+    """Raises ConfigError where something is said of control points, and there are none. given: the options, None where
+    one is left out."""
+    defaults = type(block).model_fields
+    idle = [
+        f"--{name.replace('_', '-')}"
+        for name in ("gcp_marks", "gcp_use")
+        if given[name] is not None or getattr(block, name) != defaults[name].default
+    ]
+    if idle and not block.gcp:
+        raise ConfigError(f"{' and '.join(idle)} without control points: name the file that holds them with --gcp")
 
 
 def _recipe(config: str | None, command: str, workspace: Path | None) -> str:

@@ -87,18 +87,12 @@ def evaluate_workspace(
     finally:
         progress.stop()
     consumer: Mapping[str, Any] = {"skipped": "not asked for"}
-    if mapping and _export_is_older(workspace):
+    if mapping and workspace.export_is_older:
         consumer = {"skipped": "the export is of earlier matches: run aeromatch export"}
     elif mapping:
         consumer = map_both(workspace.export("colmap") / "database.db", truth.images_folder)
     seconds = time.monotonic() - started
     return Evaluation(work, truth_folder, truth.kind, len(images), left_out, tuple(rows), consumer, seconds)
-
-
-def _export_is_older(workspace: Workspace) -> bool:
-    """Whether stages before the export ran after it."""
-    made = workspace.stage_report("export")
-    return made.is_file() and workspace.ran_since(made, "filter", "refine", "consistency")
 
 
 def _check_pictures(workspace: Workspace, images: Sequence[Image], truth: BlockTruth, truth_folder: Path) -> None:

@@ -98,34 +98,35 @@ Written by `adjust`: the bundle adjustment of the verified matches. One line per
 CRS: `image` (its name); `x`, `y`, `z` of the projection centre, metres; `omega_deg`, `phi_deg`, `kappa_deg`
 (photogrammetric, against the grid of the CRS); `sigma_x_m` to `sigma_kappa_deg`: standard deviations, empty where they
 are not known, too small in blocks of more than 1,500 images, where each is taken with the others as known; `camera`:
-camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary,
-standard deviations hold within the group), or `predicted` of an image that is not oriented: the position given, the
-attitude given or that of its strip, empty where nothing is known; `unit`: of all lengths of the line, `m`, or
-`arbitrary` in a frame of its own.
+camera_id; `frame`: `world`, or `own N` of a group that no position has placed (place, north and scale are arbitrary;
+standard deviations hold within the group, those of positions are empty), or `predicted` of an image that is not
+oriented: the position given, the attitude given or that of its strip, empty where nothing is known; `unit`: of all
+lengths of the line, `m`, or `arbitrary` in a frame of its own.
 
 ### orientation/residuals.csv
 
 Written by `adjust`: the adjusted block beside what was given, and how well its images fit their points. One line per
 adjusted image: `image` (its name); `dx_m`, `dy_m`, `dz_m`: adjusted less given position; `rotation_x_deg`,
 `rotation_y_deg`, `rotation_z_deg`: rotation vector about the axes of the world that turns the given attitude into the
-adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in standard deviations
-of what was given. All are empty where nothing was given, and in a frame of its own. `error_px`: mean reprojection
-error; `points`: of the image; `images_per_point`: how many images see them, mean.
+adjusted one; `dx_sigmas` to `dz_sigmas` and `rotation_x_sigmas` to `rotation_z_sigmas`: the same in the standard
+deviations that were stated, each axis in its own. All are empty where nothing was given, and in a frame of its own.
+`error_px`: mean reprojection error; `points`: of the image; `images_per_point`: how many images see them, mean.
 
 ### orientation/adjusted.json
 
 - `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
 - `facts`: `images`, `points`, `track_length` (images per point, mean), `held_by_pairs` (images with fewer than 20
   points that three images see), `reprojection_error_px` (mean), `ground_pixel_m` (what a pixel is on the ground,
-  median, in units of the largest group's frame), `reduced` (stored pixels in a pixel of the pictures that keypoints
-  were found in), `positions_given` (images),
-  `sigma_position_m` (median over the images whose frame has metres, else null), `sigma_angle_deg` (median), `groups`
-  (see below), `outside`
-  (image_id -> why it is not oriented), `cameras` (camera_id -> model, width, height, parameters), `remarks`,
-  `control` (errors at ground control points, or null), `residuals`: of `residuals.csv`, for each of `position_m`,
-  `position_sigmas`, `rotation_deg`, `rotation_sigmas` the root mean squares (`_rms`) and medians of absolute values
-  (`_median`) along x, y and z, and the image with the longest one (`_worst`: name, value), null where nothing was
-  given; `positions`, `rotations`: how many were compared; `error_px_median`, `error_px_worst`: of the images' means.
+  median, null in a frame without metres), `reduced` (stored pixels in a pixel of the pictures that keypoints were found
+  in), `positions_given` (images), `sigma_position_m` (median over the images whose frame has metres, else null),
+  `sigma_angle_deg` (median), `groups` (see below), `outside` (image_id -> why it is not oriented), `cameras` (camera_id
+  -> model, width, height, parameters as in a camera file: cx and cy from the corner of the first pixel), `remarks`,
+  `held_by` (parameter of cameras -> setting that holds it), `readout_not_tried` (why the read-out time of a rolling
+  shutter was no unknown, null where it was), `control` (errors at ground control points, or null, see below),
+  `residuals`: of `residuals.csv`, for each of `position_m`, `position_sigmas`, `rotation_deg`, `rotation_sigmas` the
+  root mean squares (`_rms`) and medians of absolute values (`_median`) along x, y and z, and the image with the longest
+  one (`_worst`: name, value), null where nothing was given; `positions`, `rotations`: how many were compared;
+  `error_px_median`, `error_px_worst`: of the images' means.
 - Each of `groups`: `kind`, `images`, `points`, `track_length`, `reprojection_error_px`, `registered` (image_ids that
   were tied to it by its points) and, where it was adjusted:
   - `sigma_px`: standard deviation of a coordinate of an image point, by residuals and redundancy.
@@ -141,14 +142,23 @@ error; `points`: of the image; `images_per_point`: how many images see them, mea
   - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
     projection centre to the antenna, in the camera's frame): value, standard deviation.
   - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
-    known before and its standard deviation; `correlations`: up to five pairs above 0.9: two names, correlation.
+    known before and its standard deviation, cx and cy from the corner of the first pixel; `correlations`: up to five
+    pairs above 0.9: two names, correlation.
   - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
     middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
-    both are of), `points`: x, y and standard deviation of points over the block. Of a group in a frame of its own in
-    units of it.
+    both are of), `pixel_m` (what a pixel is on the ground), `points`: x, y and standard deviation of points over the
+    block. In a frame of its own, whose units are arbitrary, the names are `sigma`, `bowl`, `tilt`, `reach`, `pixel`.
   - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `held_out` (`check points`, or `leave
     one out`), `held_out_rms_m` and `without_rms_m` (at these, with control and without), `kept` (whether control
     makes them better).
+- `control`: the block beside all surveyed points. `points`, `control`, `check` (counts), `not_measured_in_two_images`,
+  `rays_do_not_meet`, `doubtful` (names); `transformation` (the similarity onto the control points: `scale`,
+  `rotation_vector_deg`, `shift_m`; null with fewer than three of them) and after it `residuals` (name -> x, y, z,
+  metres), `control_rmse_m`, `check_rmse_m`, `check_kind`; `checks` (names); `offset_m` (before it, median; null in a
+  frame without metres); `point_sigmas_m` (name -> standard deviations of its residual, as stated of the survey and of
+  the image measurements, both together), `sigmas_m` (median of those of the check points, else of the control points);
+  `image_residuals_px` (name -> image_id -> x, y: measured less seen where the rays of the point meet),
+  `reprojection_error_px` (root mean square of their lengths); `ground_pixel_m` (at the points).
 
 ### orientation/adjusted.npz
 

@@ -97,10 +97,10 @@ def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
             continue
         place = [round(float(v), 4) for v in center_m + np.array(block.origin_m)]
         angles = ["", "", ""] if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
-        deviations = [float(f"{v:.3g}") for v in sigmas[:3]] + [
-            "" if rotation is None else float(f"{v:.3g}") for v in sigmas[3:]
-        ]
-        unit = "m" if block.metric and not frame.startswith("own") else "arbitrary"
+        metric = block.metric and not frame.startswith("own")
+        known_of = [metric] * 3 + [rotation is not None] * 3
+        deviations = [float(f"{v:.3g}") if known else "" for v, known in zip(sigmas, known_of, strict=True)]
+        unit = "m" if metric else "arbitrary"
         rows.append((image.name, *place, *angles, *deviations, image.camera_id, frame, unit))
     return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame", "unit"), rows)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.adjusting import Given, Outcome
 from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
 from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
@@ -22,9 +23,9 @@ _HEIGHTS = 150
 _CELLS = 12
 
 
-def adjustment_facts(outcome: Outcome, given: Given) -> dict[str, Any]:
-    """Of one group. given: what its images had. Keys are described in `formats` (adjusted.json); images, flights and
-    cameras are numbers, see `with_names`."""
+def adjustment_facts(outcome: Outcome, given: Given, *, metric: bool) -> dict[str, Any]:
+    """Of one group. given: what its images had. metric: whether lengths of its frame are metres. Keys are described in
+    `formats` (adjusted.json); images, flights and cameras are numbers, see `with_names`."""
     result = outcome.result
     network, state, found = result.network, result.state, result.found
     facts: dict[str, Any] = {
@@ -35,7 +36,7 @@ def adjustment_facts(outcome: Outcome, given: Given) -> dict[str, Any]:
         "calibration": {str(n): _calibration(outcome, k) for k, n in enumerate(outcome.cameras)},
     }
     if found is not None:
-        facts["heights"] = _heights(network, state, found)
+        facts["heights"] = _heights(network, state, found, "_m" if metric else "")
     return facts
 
 
@@ -136,16 +137,18 @@ def _mounts(outcome: Outcome) -> dict[str, Any]:
 
 
 def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
-    """By parameter: value, standard deviation (0 where it was held), prior and its standard deviation."""
+    """By parameter: value, standard deviation (0 where it was held), prior and its standard deviation. cx and cy count
+    from the corner of the first pixel, as in camera files."""
     network, state, found, stated = (
         outcome.result.network, outcome.result.state, outcome.result.found, outcome.result.stated
     )  # fmt: skip
     sigmas = np.zeros(len(LENS)) if found is None else found.lens_sigmas[row]
     free = network.lens_sigmas[row] > 0.0
+    corner_px = np.array([COLMAP_OFFSET_PX * (name in ("cx", "cy")) for name in LENS])
+    values, priors = state.lens[row] + corner_px, stated.lens_prior[row] + corner_px
     parameters = {
         name: [
-            float(state.lens[row, k]), float(sigmas[k]) if free[k] else 0.0, float(stated.lens_prior[row, k]),
-            float(stated.lens_sigmas[row, k]),
+            float(values[k]), float(sigmas[k]) if free[k] else 0.0, float(priors[k]), float(stated.lens_sigmas[row, k]),
         ]
         for k, name in enumerate(LENS)
         if name != "unused" and (name != "readout_s" or free[k])
@@ -162,12 +165,13 @@ def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
     }
 
 
-def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, Any]:
+def _heights(network: Network, state: Unknowns, found: Covariance, unit: str) -> dict[str, Any]:
     """Expected errors of the heights of points over the block.
 
-    sigma_m: median standard deviation; bowl_m, tilt_m: standard deviation of how much the middle of the block lies
-    above its border, and one side above the other, at the extent of the points. map: cells with their standard
-    deviation. reach_m: half that extent. Where place and scale are open (a free network) they are those of the shape.
+    sigma: median standard deviation; bowl, tilt: standard deviation of how much the middle of the block lies above its
+    border, and one side above the other, at the extent of the points. points: places with their standard deviation.
+    reach: half that extent. pixel: what one is on the ground. Where place and scale are open (a free network) they are
+    those of the shape. unit: behind the names of lengths, "" where they have none.
     """
     rows = _spread(network, state)
     if len(rows) < 6:
@@ -183,12 +187,21 @@ def _heights(network: Network, state: Unknowns, found: Covariance) -> dict[str, 
     heights_m = np.sqrt(np.maximum(np.diag(together), 0.0))
     cells = [[float(px), float(py), float(sigma)] for (px, py), sigma in zip(xy, heights_m, strict=True)]
     return {
-        "sigma_m": float(np.median(heights_m)),
-        "bowl_m": float(sigmas[3]),
-        "tilt_m": float(np.hypot(sigmas[1], sigmas[2])),
-        "reach_m": reach,
+        f"sigma{unit}": float(np.median(heights_m)),
+        f"bowl{unit}": float(sigmas[3]),
+        f"tilt{unit}": float(np.hypot(sigmas[1], sigmas[2])),
+        f"reach{unit}": reach,
+        f"pixel{unit}": _ground_pixel(network, state),
         "points": cells,
     }
+
+
+def _ground_pixel(network: Network, state: Unknowns) -> float:
+    """What a pixel is on the ground, in units of the frame: median over images of those of their points."""
+    away = state.points_m[network.point] - state.centers_m[network.image]
+    depths = np.einsum("mi,mi->m", away, state.rotations[network.image, 2])
+    pixels = depths / state.lens[network.camera[network.image], 0]
+    return float(np.median([np.median(pixels[network.image == image]) for image in np.unique(network.image)]))
 
 
 def _spread(network: Network, state: Unknowns) -> IntArray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
-from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.cameras import corner_params, focal_px
 
 # Images with fewer points of three images and more are held by their neighbours one by one.
 _FEW_POINTS = 20
@@ -33,7 +33,7 @@ def block_figures(
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
         "groups": [dict(one) for one in groups],
         "cameras": {
-            camera_id: [camera.model, camera.width_px, camera.height_px, list(camera.params)]
+            camera_id: [camera.model, camera.width_px, camera.height_px, list(corner_params(camera))]
             for camera_id, camera in sorted(adjusted.cameras.items())
         },
     }
@@ -48,14 +48,12 @@ def images_per_point(adjusted: AdjustedBlock) -> IntArray:
 
 
 def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> float | None:
-    """What a pixel is on the ground, in units of the largest frame: median over images of the distance of their points
-    over the focal length."""
-    frames = [adjusted.frames.get(image_id, 0) for image_id in adjusted.poses]
-    largest = max(set(frames), key=frames.count, default=0)
+    """What a pixel is on the ground: median over the images that positions have placed of the distance of their points
+    over the focal length; None without any."""
     sizes = []
     for image_id, pose in adjusted.poses.items():
         track = adjusted.tracks.get(image_id)
-        if track is not None and len(track) and adjusted.frames.get(image_id, 0) == largest:
+        if track is not None and len(track) and image_id not in adjusted.frames:
             depths: FloatArray = (adjusted.points_m[track[:, 1]] - pose.center_m) @ pose.rotation[2]
             sizes.append(float(np.median(depths)) / focal_px(adjusted.cameras[camera_ids[image_id]]))
     return _median(sizes)

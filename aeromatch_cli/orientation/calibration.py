@@ -100,3 +100,10 @@ def freed(prior: LensPrior, calibration: Calibration, switches: Mapping[str, boo
     for name, on in switches.items():
         free[LENS.index(name)] = on
     return np.where(free, prior.sigmas, 0.0)
+
+
+def held_by(calibration: Calibration, switches: Mapping[str, bool]) -> dict[str, str]:
+    """Name of a parameter -> the setting that holds it as it was stated; nothing of what the block may free."""
+    left = {"given": MODELS[BROWN], "focal": MODELS[BROWN][1:]}.get(calibration, ())
+    found = {name: f"adjust.calibration={calibration}" for name in left if name not in switches}
+    return found | {name: "adjust.hold" for name, free in switches.items() if not free}

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.cameras import BROWN, MODELS
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -106,8 +107,8 @@ class Quality:
 class Evidence:
     """What a block is judged by. images: of the block. adjust, orient: facts of these stages. components: sizes of the
     groups of images that verified pairs connect, the largest first. refined: whether tie points were measured by least
-    squares. reduced: stored pixels in a pixel of the pictures that keypoints were found in. metric: whether lengths of
-    the world frame are metres. names: of the files, by image_id."""
+    squares. reduced: stored pixels in a pixel of the pictures that keypoints were found in. names: of the files, by
+    image_id."""
 
     images: int
     adjust: Mapping[str, Any]
@@ -115,7 +116,6 @@ class Evidence:
     components: Sequence[int] = ()
     refined: bool = False
     reduced: float = 1.0
-    metric: bool = True
     names: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -272,7 +272,7 @@ def _positions(evidence: Evidence) -> _Found:
             for key in ("rms_sigmas", "rms_m", "stated_m")
         )
         words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
-        yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, remedy)
+        yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, _with_held(evidence, remedy))
 
 
 def _flights(evidence: Evidence) -> _Found:
@@ -373,9 +373,11 @@ def _control(evidence: Evidence) -> _Found:
     words = f"{len(unlike)} of {count} surveyed points contradict the others"
     remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
     yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
-    pixel_m = evidence.adjust.get("ground_pixel_m") or 0.0
-    # A point is known as its survey says, and found as it is measured: across, half a pixel; in height, twice that.
-    stated_m = np.hypot(control.get("sigmas_m") or [0.02, 0.02, 0.03], np.array([0.5, 0.5, 1.0]) * pixel_m)
+    if not control.get("sigmas_m"):
+        yield "control points: too few to check the block by them"
+        return
+    # A point is known as its survey says, and found as it is measured in its images.
+    stated_m = np.array(control["sigmas_m"])
     for one in inside:
         if not one.get("kept", True):
             yield _refused(one, stated_m)
@@ -423,7 +425,7 @@ def _errors(evidence: Evidence) -> _Found:
         "poses or cameras do not fit the matches: let the pictures find them (orient=global), and check --cameras and "
         "--poses"
     )
-    yield _finding("reprojection error", found_px, limits, words, remedy)
+    yield _finding("reprojection error", found_px, limits, words, _with_held(evidence, remedy))
 
 
 def _multiplicity(evidence: Evidence) -> _Found:
@@ -443,7 +445,7 @@ def _multiplicity(evidence: Evidence) -> _Found:
 
 def _calibration(evidence: Evidence) -> _Found:
     """The parameter of every camera that differs most from what is known of it."""
-    told = set[str]()
+    told, held = set[str](), evidence.adjust.get("held_by", {})
     for group in evidence.groups:
         for camera_id, camera in (group.get("calibration") or {}).items():
             if camera_id in told:  # a camera is one and the same for all groups
@@ -460,6 +462,7 @@ def _calibration(evidence: Evidence) -> _Found:
                 remedy = "no shutter needs as long, or backwards: check the times of the images"
                 readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
                 yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
+            changes = {name: change for name, change in changes.items() if name not in held}
             affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
             if affinity:
                 name = max(affinity, key=lambda key: affinity[key])
@@ -478,13 +481,32 @@ def _calibration(evidence: Evidence) -> _Found:
             levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
             name = max(changes, key=lambda key: (levels[key], changes[key]))
             words = _change(camera_id, name, parameters[name], changes[name])
+            words += f" ({_held_words(evidence)})" if held else ""
             remedy = (
                 "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
                 "as well, and heights with it"
             )
             yield _finding("calibration", changes[name], limits[name], words, remedy)
     if not told:
-        yield "calibration: it was not adjusted"
+        yield f"calibration: {_held_words(evidence) or 'it was not adjusted'}"
+
+
+def _held_words(evidence: Evidence) -> str:
+    """Which settings hold which parameters of the cameras, "" where none does."""
+    by_setting: dict[str, list[str]] = {}
+    for name, setting in evidence.adjust.get("held_by", {}).items():
+        by_setting.setdefault(setting, []).append(name)
+    whole = len(MODELS[BROWN])
+    return ", ".join(
+        f"{setting} holds {'all parameters' if len(names) == whole else ', '.join(names)}"
+        for setting, names in by_setting.items()
+    )
+
+
+def _with_held(evidence: Evidence, remedy: str) -> str:
+    """The remedy for what a wrong calibration may have done, with the settings that have held parameters of it."""
+    held = _held_words(evidence)
+    return f"{remedy}; {held} of cameras as stated, which may be wrong" if held else remedy
 
 
 def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:
@@ -505,24 +527,22 @@ def _stated(parameters: Mapping[str, Sequence[float]]) -> set[str]:
 
 def _deformation(evidence: Evidence) -> _Found:
     """Of the group that is worst in each respect."""
-    pixel_m = evidence.adjust.get("ground_pixel_m")
     known = [group for group in evidence.groups if group.get("heights")]
-    if not known or not pixel_m:
+    if not known:
         yield "expected deformation: the block was not adjusted, or has too few points"
         return
 
-    def length(value_m: float) -> str:
-        metres = f" ({plain(value_m)} m)" if evidence.metric else ""
-        return f"{value_m / pixel_m:.1f} ground pixels{metres}"
+    def length(group: Mapping[str, Any], what: str) -> str:
+        value_m = group["heights"].get(f"{what}_m")  # None in a frame without metres
+        return f"{_pixels(group, what):.1f} ground pixels" + ("" if value_m is None else f" ({plain(value_m)} m)")
 
     def part(group: Mapping[str, Any]) -> str:
         return "the block" if len(evidence.groups) == 1 else f"the part of {group['images']} images"
 
-    worst = max(known, key=lambda group: group["heights"]["bowl_m"])
-    bowl_m = worst["heights"]["bowl_m"]
-    words = f"the middle of {part(worst)} may lie {length(bowl_m)} above or below its border"
+    worst = max(known, key=lambda group: _pixels(group, "bowl"))
+    words = f"the middle of {part(worst)} may lie {length(worst, 'bowl')} above or below its border"
     remedy = f"straight views from one height do not determine it; {_STRIPS}"
-    yield _finding("bowl", bowl_m / pixel_m, _BOWL_PIXELS, words, remedy)
+    yield _finding("bowl", _pixels(worst, "bowl"), _BOWL_PIXELS, words, remedy)
     placed = [group for group in known if group["kind"] != "level"]
     if not placed:
         return
@@ -533,19 +553,25 @@ def _deformation(evidence: Evidence) -> _Found:
     yield _finding("tilt", angle, _TILT_DEG, words, remedy)
     placed = [group for group in placed if group.get("positions")]
     if placed:
-        worst = max(placed, key=lambda group: group["heights"]["sigma_m"])
-        sigma_m, stated_m = worst["heights"]["sigma_m"], worst["positions"]["stated_m"][2]
+        worst = max(placed, key=lambda group: _pixels(group, "sigma"))
+        stated_m = worst["positions"]["stated_m"][2]
         # As exact as positions are is as exact as can be asked for.
-        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / pixel_m)
-        words = f"heights of {part(worst)} are exact to {length(sigma_m)}, its positions to {plain(stated_m)} m"
+        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / worst["heights"]["pixel_m"])
+        words = f"heights of {part(worst)} are exact to {length(worst, 'sigma')}, its positions to {plain(stated_m)} m"
         remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
-        yield _finding("heights", sigma_m / pixel_m, (limit, None), words, remedy)
+        yield _finding("heights", _pixels(worst, "sigma"), (limit, None), words, remedy)
+
+
+def _pixels(group: Mapping[str, Any], what: str) -> float:
+    """A length of the heights of a part whose heights are known, in ground pixels."""
+    heights = without_units(group["heights"])
+    return float(heights[what] / heights["pixel"])
 
 
 def _tilt_deg(group: Mapping[str, Any]) -> float:
     """Expected error of a part's tilt; 0 where it is not known."""
-    heights = group.get("heights")
-    return float(np.rad2deg(np.arctan2(heights["tilt_m"], heights["reach_m"]))) if heights else 0.0
+    heights = without_units(group.get("heights") or {})
+    return float(np.rad2deg(np.arctan2(heights["tilt"], heights["reach"]))) if heights else 0.0
 
 
 def _kept_poses(evidence: Evidence) -> _Found:
@@ -565,6 +591,11 @@ def _rms(values: Any) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
+
+
+def without_units(lengths: Mapping[str, Any]) -> dict[str, Any]:
+    """The same by names without "_m", which those of a frame of arbitrary scale do not have."""
+    return {name.removesuffix("_m"): value for name, value in lengths.items()}
 
 
 def plain(value: float, digits: int = 2) -> str:

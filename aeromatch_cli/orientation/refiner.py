@@ -117,7 +117,9 @@ def refine(folder: Path) -> None:
         name = f"model{len(facts)}.npz"
         deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
         np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
-        known = {} if outcome is None else adjustment_facts(outcome, observed) | {"control": control}
+        metric, known = group["kind"] != "level", dict[str, Any]()
+        if outcome is not None:
+            known = adjustment_facts(outcome, observed, metric=metric) | {"control": control}
         facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
     (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
 

@@ -49,7 +49,7 @@ def _residual(
     position_m, position_sigmas, rotation_deg, rotation_sigmas = (_UNKNOWN,) * 4
     if given is not None:
         position_m = pose.center_m - given.center_m
-        position_sigmas = position_m / given.sigma_position_m
+        position_sigmas = position_m / given.axis_sigmas_m
         if given.world_rotation is not None:
             from scipy.spatial.transform import Rotation
 

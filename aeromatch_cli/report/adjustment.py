@@ -10,12 +10,16 @@ from typing import Any
 from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.residuals import read_residuals
+from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import control_words
 from aeromatch_cli.stages.stage_report import facts_on_file
+
+# Where cx and cy of cameras count from, on the page and in facts.
+PRINCIPAL_POINT = "cx, cy from the corner of the first pixel, as in COLMAP"
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> li
     names, adjusted = {row.image_id: row.name for row in images}, adjustment.facts
     found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
     control = adjusted.get("control")
-    if control and (control["control_rmse_m"] is None or control.get("rays_do_not_meet")):
+    if control and (not control.get("residuals") or control.get("rays_do_not_meet")):
         # What the section below cannot show.
         found.append(Notice("warn", "Note on the control points", ". ".join(control_words(control))))
     outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
@@ -102,9 +106,10 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
     sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
-    cameras = {k: Camera(model, w, h, tuple(params)) for k, (model, w, h, params) in facts.get("cameras", {}).items()}
+    stated = facts.get("cameras", {}).items()
+    cameras = {i: from_colmap(model, width, height, tuple(params)) for i, (model, width, height, params) in stated}
     if cameras:
-        found.append(("Cameras after the adjustment", camera_words(cameras)))
+        found.append((f"Cameras after the adjustment ({PRINCIPAL_POINT})", camera_words(cameras)))
     control = facts["control"]
     if control and control["control_rmse_m"]:
         found.append(("Control points", f"{control['control']}; {offset_words(control)}"))
@@ -114,21 +119,24 @@ def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
             found.append((f"{kind}, after it", f"RMSE {_metres(control['check_rmse_m'])}"))
         if control["doubtful"]:
             found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
+    elif control and control.get("residuals"):
+        counts, *words = control_words(control, [group.get("control") or {} for group in facts["groups"]])
+        found.append((counts.capitalize(), "; ".join(words)))
     return found
 
 
 def surveyed_rows(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels and standard deviations)."""
-    control = facts.get("control") or {}
-    stated, pixel_m, rows = control.get("point_sigmas_m", {}), facts.get("ground_pixel_m"), []
+    """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels, the largest of the three in
+    standard deviations, images, root mean square of its residuals there in pixels)."""
+    control, rows = facts.get("control") or {}, []
     for name, error_m in control.get("residuals", {}).items():
         metres = [f"{value:+.3f}" for value in error_m]
-        pixels = "" if not pixel_m else f"{math.hypot(*error_m) / pixel_m:.1f}"
-        sigmas = ""
-        if name in stated:
-            sigmas = f"{max(abs(e) / s for e, s in zip(error_m, stated[name], strict=True)):.1f}"
-        part = "check" if name in control.get("checks", ()) else "control"
-        rows.append((name, part, *metres, pixels, sigmas))
+        pixels = f"{math.hypot(*error_m) / control['ground_pixel_m']:.1f}"
+        sigmas = f"{max(abs(e) / s for e, s in zip(error_m, control['point_sigmas_m'][name], strict=True)):.1f}"
+        lengths_px = [math.hypot(*off_px) for off_px in control["image_residuals_px"][name].values()]
+        in_images = f"{math.hypot(*lengths_px) / math.sqrt(len(lengths_px)):.2f}" if lengths_px else ""
+        part = "check" if name in control["checks"] else "control"
+        rows.append((name, part, *metres, pixels, sigmas, f"{len(lengths_px)}", in_images))
     return rows
 
 
@@ -141,10 +149,10 @@ def counted(count: int, one: str, several: str) -> str:
 
 
 def camera_words(cameras: Mapping[str, Camera]) -> str:
-    """One camera a line: its model, size and parameters."""
+    """One camera a line: its model, size and parameters, as a camera file has them."""
     words = []
     for camera_id, camera in sorted(cameras.items()):
-        params = ", ".join(f"{value:g}" for value in camera.params)
+        params = ", ".join(f"{value:g}" for value in corner_params(camera))
         words.append(f"{camera_id}: {camera.model}, {camera.width_px} x {camera.height_px} px, {params}")
     more = [f"and {len(words) - 10} more"] if len(words) > 10 else []
     return "\n".join(words[:10] + more)

@@ -11,8 +11,10 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import normalise, project
+from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import camera_of
+from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.figures import (
     COLOURS,
     PlanSize,
@@ -80,11 +82,12 @@ def camera_sections(
             )
             words = f"{calibration['images']} images, {camera.model}, {camera.width_px} x {camera.height_px} px"
             shown = tuple(field for field in fields if field is not None)
-            sections[camera_id] = CameraSection(camera_id, words, tuple(_rows(calibration)), shown)
+            rows = tuple(_rows(calibration, facts.get("held_by", {})))
+            sections[camera_id] = CameraSection(camera_id, words, rows, shown)
     return [sections[camera_id] for camera_id in sorted(sections)]
 
 
-def _rows(calibration: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _rows(calibration: Mapping[str, Any], held_by: Mapping[str, str]) -> Iterator[tuple[str, ...]]:
     related: dict[str, list[str]] = {}
     for first, second, value in calibration["correlations"]:
         related.setdefault(first, []).append(f"{second} {value:+.2f}")
@@ -97,7 +100,7 @@ def _rows(calibration: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             _NAMES.get(name, name),
             _UNITS.get(name, ""),
             f"{value:.{digits}f}",
-            "held" if held else f"{sigma:.{digits}f}",
+            (f"held by {held_by[name]}" if name in held_by else "held") if held else f"{sigma:.{digits}f}",
             f"{prior:.{digits}f}",
             f"{prior_sigma:.{digits}f}" if prior_sigma > 0.0 else "",
             change,
@@ -114,6 +117,7 @@ def _grid(camera: Camera) -> tuple[int, int, float]:
 def _moved(parameters: Mapping[str, Sequence[float]], camera: Camera, camera_id: str) -> tuple[str, str] | None:
     """By how much the adjusted camera moves image points against the one known before."""
     lens = np.array([parameters[name][2] if name in parameters else 0.0 for name in LENS])
+    lens[[LENS.index("cx"), LENS.index("cy")]] -= COLMAP_OFFSET_PX
     before = camera_of(lens, camera)
     columns, rows, cell_px = _grid(camera)
     middles = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * cell_px
@@ -188,27 +192,27 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     return svg(axes.figure, title, "lens", {})
 
 
-def heights_section(facts: Mapping[str, Any], *, in_world: bool) -> HeightsSection | None:
+def heights_section(facts: Mapping[str, Any]) -> HeightsSection | None:
     """Of the largest group whose errors are known. facts: of the stage adjust."""
-    pixel_m = facts.get("ground_pixel_m")
-    heights = next((group["heights"] for group in facts.get("groups", ()) if group.get("heights")), None)
-    if not heights or not pixel_m:
+    stated = next((group["heights"] for group in facts.get("groups", ()) if group.get("heights")), None)
+    if not stated:
         return None
+    heights, in_world = without_units(stated), "pixel_m" in stated
     points = np.array(heights["points"], dtype=np.float64).reshape(-1, 3)
 
-    def length(value_m: float) -> str:
-        pixels = f"{value_m / pixel_m:.1f} ground pixels"
-        return f"{value_m:.3f} m ({pixels})" if in_world else pixels
+    def length(what: str) -> str:
+        pixels = f"{heights[what] / heights['pixel']:.1f} ground pixels"
+        return f"{heights[what]:.3f} m ({pixels})" if in_world else pixels
 
     words = (
         f"Standard deviations of the heights of {len(points)} points, as measurements and geometry let expect them; "
-        f"median {length(heights['sigma_m'])}. The middle of the block may lie {length(heights['bowl_m'])} above or "
-        f"below its border, one side {length(heights['tilt_m'])} above or below the middle."
+        f"median {length('sigma')}. The middle of the block may lie {length('bowl')} above or "
+        f"below its border, one side {length('tilt')} above or below the middle."
     )
-    return HeightsSection(_height_map(points, pixel_m, in_world=in_world), words)
+    return HeightsSection(_height_map(points, heights["pixel"], in_world=in_world), words)
 
 
-def _height_map(points: FloatArray, pixel_m: float, *, in_world: bool) -> str:
+def _height_map(points: FloatArray, pixel: float, *, in_world: bool) -> str:
     """(P, 3) x, y and standard deviation of points."""
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -216,7 +220,7 @@ def _height_map(points: FloatArray, pixel_m: float, *, in_world: bool) -> str:
     margin = 0.06 * float((high - low).max()) or 1.0
     axes = plan_axes(low - margin, high + margin, _MAP, in_world=in_world)
     scale = LinearSegmentedColormap.from_list("error", [COLOURS["k4"], COLOURS["k2"], COLOURS["k0"], COLOURS["bad"]])
-    values = points[:, 2] if in_world else points[:, 2] / pixel_m
+    values = points[:, 2] if in_world else points[:, 2] / pixel
     drawn = axes.scatter(*points[:, :2].T, 42.0, c=values, cmap=scale, linewidth=0)
     place = axes.get_position()
     beside = axes.figure.add_axes((place.x1 + 0.02, place.y0, 0.028, place.height))

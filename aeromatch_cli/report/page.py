@@ -22,6 +22,7 @@ from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.quality import Finding, Quality, plain
 from aeromatch_cli.report.adjustment import (
+    PRINCIPAL_POINT,
     Adjustment,
     Notice,
     adjustment_notices,
@@ -112,6 +113,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     drawn.write_beside(context.workspace.report.parent / "pairs")
     return _template().render(
         version=__version__,
+        principal_point=PRINCIPAL_POINT,
         colours=COLOURS,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
@@ -130,10 +132,13 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
             read_position_residuals(context, adjustment),
             {row.image_id: row.name for row in images},
             context.block.gsd_m,
+            adjustment.facts.get("groups", ()),
         ),
         cameras=_cameras(context, adjustment, adjusted),
-        heights=heights_section(adjustment.facts, in_world=adjustment.in_world),
+        readout_not_tried=adjustment.facts.get("readout_not_tried"),
+        heights=heights_section(adjustment.facts),
         residuals=surveyed_rows(adjustment.facts),
+        residuals_after_fit=bool((adjustment.facts.get("control") or {}).get("transformation")),
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
@@ -302,7 +307,7 @@ def _block_facts(context: Context, *, in_world: bool) -> list[tuple[str, str]]:
         ("World frame", frame if in_world else "the pictures' own: scale, north and place are arbitrary"),
         ("Ground", block.ground_source),
         ("Ground sampling distance", "unknown" if gsd_m is None else f"{gsd_m:.3g} m"),
-        ("Cameras", camera_words(block.cameras)),
+        (f"Cameras ({PRINCIPAL_POINT})", camera_words(block.cameras)),
         ("Images in", context.settings.block.images),
     ]
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,11 +31,15 @@ class ResidualSection:
 
 
 def residual_section(
-    adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual], names: Mapping[str, str], gsd_m: float | None
+    adjusted: AdjustedBlock,
+    residuals: Mapping[str, PoseResidual],
+    names: Mapping[str, str],
+    gsd_m: float | None,
+    groups: Sequence[Mapping[str, Any]] = (),
 ) -> ResidualSection | None:
     """Root mean squares of the position residuals and where they are, None where no position was given.
 
-    names: of the files, by image_id. gsd_m: metres per pixel on the ground.
+    names: of the files, by image_id. gsd_m: metres per pixel on the ground. groups: facts of the adjustment of each.
     """
     ids = [i for i, one in residuals.items() if np.isfinite(one.position_m).all() and i in adjusted.poses]
     if not ids:
@@ -44,12 +49,13 @@ def residual_section(
     rows = [("metres", *_errors(offsets_m, 3))]
     if gsd_m:
         rows.append(("pixels on the ground", *_errors(offsets_m / gsd_m, 2)))
-    rows.append(("standard deviations given", *_errors(in_sigmas, 2)[:3], "", ""))
+    rows.append(("stated standard deviations", *_errors(in_sigmas, 2)[:3], "", ""))
     if np.abs(offsets_m).max() < _NOTHING_M:
         return ResidualSection(tuple(rows), "", "Positions stay as they were given.")
     worst = int(np.argmax(np.linalg.norm(offsets_m, axis=1)))
     far = length_words(float(np.linalg.norm(offsets_m[worst])), 3, metric=True)
     words = f"Root mean squares of {len(ids):,} positions, adjusted less given. Farthest: {names[ids[worst]]}, {far}."
+    words += _weights(groups)
     centers_m = np.array([adjusted.poses[i].center_m for i in ids])
     if np.ptp(centers_m[:, :2], axis=0).max() <= 0.0:  # one camera, or all in one place: no plan
         return ResidualSection(tuple(rows), "", words)
@@ -57,6 +63,20 @@ def residual_section(
         f"{names[i]}: x {x:+.3f} m, y {y:+.3f} m, z {z:+.3f} m" for i, (x, y, z) in zip(ids, offsets_m, strict=True)
     ]
     return ResidualSection(tuple(rows), _plan(centers_m, offsets_m, titles), words)
+
+
+def _weights(groups: Sequence[Mapping[str, Any]]) -> str:
+    """How the adjustment weighs positions, and whether it explains some of their residuals; of the group with most."""
+    most = max(groups, key=lambda one: (one.get("positions") or {}).get("used", 0), default={})
+    if not most.get("positions"):
+        return ""
+    across, up = most["positions"]["factors"]
+    words = (
+        f" By what they are off the adjustment weighs them with {across:.1f} times the stated standard deviations "
+        f"horizontally and {up:.1f} times vertically."
+    )
+    explained = most["flights"] or any("lever_x" in mount for mount in most["mounts"].values())
+    return words + (" What was found of flights and antennas is part of the residuals here." if explained else "")
 
 
 def _errors(values: FloatArray, digits: int) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from aeromatch_cli.formats.reading import readable
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import VerifiedEntry, read_match_row, read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_csv, read_images, read_pairs, read_poses
+from aeromatch_cli.geometry.cameras import corner_params
 from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
@@ -171,8 +172,9 @@ def _workspace(work: _Work) -> Shown:
                 when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
                 lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
     written = set(stages.get("export", {}).get("facts", {}))
+    older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
     lines += [
-        f"export      {one}{'' if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
+        f"export      {one}{older if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
     ]
     if stale := _stale(work):
         lines.append(f"matches     of keypoints of {stale} that were found again since: run match, then filter")
@@ -206,7 +208,7 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
     workspace, image_id = work.workspace, image.image_id
     camera, pose = work.cameras[image.camera_id], work.poses.get(image_id)
     lines = [f"image       {image.name}, {image.width_px} x {image.height_px} px, id {image_id}"]
-    lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in camera.params)}")
+    lines.append(f"camera      {image.camera_id}: {camera.model} {' '.join(f'{v:.6g}' for v in corner_params(camera))}")
     world = read_json(workspace.block)
     origin_m, metric = world["origin_m"], world.get("metric", True)  # those of earlier versions do not say
     adjusted = work.adjusted.poses.get(image_id) if work.adjusted is not None else None

@@ -6,7 +6,7 @@ Poses, cameras and points go to the workspace's orientation folder, for the expo
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,9 +20,10 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, write_adjusted
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.residuals import residuals_text
-from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.cameras import BROWN, MODELS, focal_px
 from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.orientation.block_figures import block_figures
+from aeromatch_cli.orientation.calibration import held_by
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
@@ -167,9 +168,29 @@ def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[
         "positions_given": len(context.given.poses),
         "reduced": _reduced(context),
         "outside": _reasons(context, adjusted),
+        "held_by": _held_by(context),
+        "readout_not_tried": readout_not_tried(context, adjusted.poses),
         "control": control,
         "remarks": _remarks(context, adjusted, control),
     }
+
+
+def _held_by(context: Context) -> dict[str, str]:
+    """Parameters of cameras that a setting holds -> that setting."""
+    if isinstance(context.settings.orient, GivenPoses):
+        return dict.fromkeys(MODELS[BROWN], "orient=given")
+    return held_by(context.observed.calibration, context.observed.switches)
+
+
+def readout_not_tried(context: Context, oriented: Collection[str]) -> str | None:
+    """Why the read-out time of a rolling shutter was no unknown, None where it was tried. oriented: image_ids."""
+    if isinstance(context.settings.orient, GivenPoses):
+        return "orient=given"
+    if not context.settings.adjust.rolling_shutter:
+        return "adjust.rolling_shutter=false"
+    if any(np.any(velocity) for i, velocity in context.observed.velocities.items() if i in oriented):
+        return None
+    return "the velocity of the aircraft is not known; capture times of images with positions tell it, or DJI's XMP"
 
 
 def _reduced(context: Context) -> float:
@@ -229,7 +250,7 @@ def _control(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mappin
     beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
     placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
     points = [point for point in context.control if point.name not in left_out]
-    return control_figures(replace(adjusted, poses=placed), cameras, points)
+    return control_figures(replace(adjusted, poses=placed), cameras, points, metric=context.block.metric)
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:

@@ -29,7 +29,6 @@ def quality_of(facts: Mapping[str, Mapping[str, Any]], names: Mapping[str, str])
             components=final_links(facts)["components"],
             refined=(refined.get("measured") or 0) > _MEASURED * (refined.get("keypoints") or 1),
             reduced=facts["adjust"].get("reduced", 1.0),
-            metric=facts.get("orient", {}).get("frame") != "own",
             names=names,
         )
     )

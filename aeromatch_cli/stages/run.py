@@ -174,6 +174,8 @@ def _repairing(
                 Path(error.path).unlink(missing_ok=True)
 
 
+# Commands that end with a verdict on the block.
+_JUDGED = ("run", "adjust")
 # What each command makes again of what it finds damaged, besides the tables of the block and the orientation.
 _MAKES = {
     "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",),
@@ -343,8 +345,13 @@ def _result(
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {workspace.report}")
-    elif command == "run" and workspace.report.is_file() and _current_page(workspace, settings=False) is None:
+    elif command in _JUDGED and workspace.report.is_file() and _current_page(workspace, settings=False) is None:
         lines.append(f"report    {workspace.report} is of an earlier run: `aeromatch report` makes it anew")
+    if command not in ("run", "export") and workspace.export_is_older:
+        lines += [
+            f"export    {folder} is of an earlier adjustment: `aeromatch export` makes it anew"
+            for folder in workspace.exported()
+        ]
     if command in ("run", "export") and not part:
         written = next((report.facts for report in reports if report.stage == "export"), {})
         lines += [f"export    {workspace.export(e.name)}" for e in settings.export if e.name in written]
@@ -365,7 +372,7 @@ def _quality(
     command: str, workspace: Workspace, reports: Sequence[StageReport], names: Mapping[str, str], *, part: bool
 ) -> tuple[Quality | None, Mapping[str, Any]]:
     """The verdict on the block after `run` and `adjust`, and the facts by stage that it rests on."""
-    if command not in ("run", "adjust") or part:
+    if command not in _JUDGED or part:
         return None, {}
     facts = facts_told(workspace, reports)
     return quality_of(facts, names), facts

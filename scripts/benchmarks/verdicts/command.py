@@ -54,7 +54,9 @@ def evidence_of(task: Task) -> tuple[Evidence, Row]:
     else:
         residuals = residuals_of(adjusted, task.observed.poses, images, task.contents.keypoints_px)
         cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in images}
-        control = control_figures(adjusted, cameras, task.observed.control) if task.observed.control else None
+        metric = task.block.positions != "nothing"
+        surveyed = task.observed.control
+        control = control_figures(adjusted, cameras, surveyed, metric=metric) if surveyed else None
         facts = {
             **block_figures(adjusted, images, groups),
             "positions_given": len(task.observed.poses),
@@ -66,10 +68,7 @@ def evidence_of(task: Task) -> tuple[Evidence, Row]:
         one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
         whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
         errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
-    evidence = Evidence(
-        images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True,
-        metric=task.block.positions != "nothing",
-    )  # fmt: skip
+    evidence = Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
     return evidence, errors
 
 
