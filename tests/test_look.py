@@ -14,6 +14,7 @@ from PIL import Image
 
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.config.schema import FAMILIES
+from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.tiles import aligned
 
@@ -64,6 +65,20 @@ def test_show_says_what_a_workspace_an_image_and_a_pair_hold(done_site: Site) ->
     assert "steps" not in pair.stdout
     with Image.open(work / "p.png") as picture:
         assert picture.size == (320 + 8 + 320, 240)
+
+
+@pytest.mark.slow
+def test_figures_of_an_earlier_version_are_not_read(done_site: Site) -> None:
+    """Their names may mean something else by now: the verdict is made anew by the next run."""
+    path = done_site.work / "reports" / "adjust.json"
+    report = read_json(path)
+    write_json(path, {**report, "facts_version": 0})
+    shown = invoke("show", done_site.work)
+    assert shown.code == 0
+    assert "result      of an earlier version of aeromatch" in shown.stdout
+    assert done_site("adjust").code == 0
+    assert read_json(path)["facts_version"] == report["facts_version"]
+    assert "of an earlier version" not in invoke("show", done_site.work).stdout
 
 
 @pytest.mark.slow

@@ -376,8 +376,9 @@ def _control(evidence: Evidence) -> _Found:
     if not control.get("sigmas_m"):
         yield "control points: too few to check the block by them"
         return
-    # A point is known as its survey says, and found as it is measured in its images.
-    stated_m = np.array(control["sigmas_m"])
+    # A point is known as its survey says, and found as it is measured in its images, in a block that lies as exactly as
+    # its positions or the other points put it.
+    stated_m = np.hypot(control["sigmas_m"], evidence.adjust.get("sigma_position_m") or 0.0)
     for one in inside:
         if not one.get("kept", True):
             yield _refused(one, stated_m)
@@ -390,7 +391,10 @@ def _control(evidence: Evidence) -> _Found:
         return
     errors_m = max(errors, key=lambda error_m: float((np.array(error_m) / stated_m).max()))
     sigmas = float((np.array(errors_m) / stated_m).max())
-    words = f"points that took no part are met to {_axes(errors_m)} m, {sigmas:.1f} times what can be expected"
+    words = (
+        f"points that took no part are met to {_axes(errors_m)} m, {sigmas:.1f} times what can be expected "
+        f"({_axes(stated_m)})"
+    )
     remedy = "check their coordinates and measurements; more control points at the border of the block help"
     yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
 

@@ -36,6 +36,7 @@ from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
+from aeromatch_cli.stages.stage_report import facts_on_file
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Partners that are listed one by one.
@@ -186,6 +187,8 @@ def _workspace(work: _Work) -> Shown:
         lines += [f"result      {quality.verdict}: {first}", *(f"            {words}" for words in others)]
         lines += [f"            not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
         facts["quality"] = quality.as_facts()
+    elif "adjust" in stages and not facts_on_file(workspace, "adjust"):
+        lines.append("result      of an earlier version of aeromatch: run `aeromatch run` again for the verdict")
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")
     lines.append("one image: aeromatch show WORK IMAGE; a pair: aeromatch show WORK IMAGE IMAGE")

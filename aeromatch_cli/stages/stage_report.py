@@ -26,6 +26,8 @@ log = logging.getLogger("aeromatch")
 
 # Stages whose items are images or pairs; the others name files or exporters.
 ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
+# Of what facts are called and mean: those of another version are not read.
+_FACTS_VERSION = 1
 
 
 @dataclass
@@ -62,6 +64,7 @@ class StageReport:
             "skipped": self.skipped,
             "failed": len(self.failures),
             "fingerprint": self.fingerprint,
+            "facts_version": _FACTS_VERSION,
             "facts": self.facts,
             "failures": [list(failure) for failure in self.failures],
         }
@@ -80,14 +83,17 @@ class StageReport:
         # Without facts of its own the stage only counts what it makes: those on file still hold.
         self.facts = self.facts or old.get("facts", {})
         failures = [list(failure) for failure in self.failures]
-        known = [old.get(key) for key in ("failures", "fingerprint", "facts")]
-        return known == [failures, self.fingerprint, self.facts]
+        known = [old.get(key) for key in ("failures", "fingerprint", "facts_version", "facts")]
+        return known == [failures, self.fingerprint, _FACTS_VERSION, self.facts]
 
 
 def facts_on_file(workspace: Workspace, stage: str) -> dict[str, Any]:
-    """What a stage left in its report, nothing where there is none."""
+    """What a stage left in its report, nothing where there is none of this version."""
     path = workspace.stage_report(stage)
-    return dict(read_json(path)["facts"]) if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    report = read_json(path)
+    return dict(report["facts"]) if report.get("facts_version") == _FACTS_VERSION else {}
 
 
 def _shard_failed_since(path: Path) -> bool:
