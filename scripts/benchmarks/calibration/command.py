@@ -10,6 +10,7 @@ with the result, in ground pixels, after the best similarity to truth: medians o
 and within how many 95 % of the heights are (a bent block has large ones). Absolute: without similarity, where positions
 are exact. Of each line: the median over the scenes and seeds, in brackets the worst case. Focal length and principal
 point: errors of the median camera. Error / stated: of projection centres, over their stated standard deviations.
+Verdicts: how many blocks were called good, doubtful and bad.
 
 Peers: colmap: incremental mapping, SIMPLE_RADIAL, principal point in the middle; colmap-opencv: its model adjusted once
 more as OPENCV with a free principal point; colmap-priors: and so with the given positions as observations. Models are
@@ -34,11 +35,14 @@ import numpy as np
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.orientation.mapping import refine_block
+from aeromatch_cli.orientation.quality import LEVELS
+from aeromatch_cli.orientation.quality import judged as verdict
 from aeromatch_cli.stages import adjust, orient
 from benchmarks import options, stamps
 from benchmarks.calibration.accuracy import Found, judged
 from benchmarks.calibration.colmap import PEERS, WITH_POSITIONS, mapped_by_colmap
 from benchmarks.calibration.simulate import FLIGHTS, POSITIONS, mapped, perturbed, simulate
+from benchmarks.calibration.verdict import of_adjusted
 from benchmarks.processes import fresh_process, limit_threads
 from benchmarks.tables import Column, Row, code, grouped, number, table, values, write_rows
 
@@ -73,7 +77,10 @@ def _run(case: Case, method: str, path: Path) -> None:
     try:
         if method == _OURS:
             contents, groups = perturbed(block) if case.start == "perturbed" else mapped(block)
-            found: Found | None = Found.of(refine_block(contents, block.observed, groups, fixed=False)[0])
+            adjusted, facts = refine_block(contents, block.observed, groups, fixed=False)
+            found: Found | None = Found.of(adjusted)
+            evidence = of_adjusted(contents, block.observed, adjusted, facts, metric=case.positions != "nothing")
+            row["verdict"] = verdict(evidence).verdict
         else:
             found = mapped_by_colmap(block, method)
     except AeromatchError as error:
@@ -136,11 +143,21 @@ def _columns() -> list[Column[Sequence[Row]]]:
         ("focal length, %", "focal_percent", 3), ("principal point, px", "centre_px", 1),
         ("error / stated", "stated_ratio", 2), ("s", "seconds", 1),
     )  # fmt: skip
-    return [("images oriented", _oriented), *((title, _cell(field, digits)[1]) for title, field, digits in cells)]
+    return [
+        ("images oriented", _oriented),
+        ("verdicts", _verdicts),
+        *((title, _cell(field, digits)[1]) for title, field, digits in cells),
+    ]
 
 
 def _oriented(rows: Sequence[Row]) -> str:
     return f"{sum(row['oriented'] for row in rows)} of {sum(row['images'] for row in rows)}"
+
+
+def _verdicts(rows: Sequence[Row]) -> str:
+    """How many blocks were called good, doubtful and bad."""
+    called = [row["verdict"] for row in rows if row.get("verdict")]
+    return "/".join(str(called.count(level)) for level in LEVELS) if called else "-"
 
 
 def table_of(rows: Sequence[Row]) -> str:

@@ -22,16 +22,13 @@ from typing import Any
 
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.orientation.block_figures import block_figures
-from aeromatch_cli.orientation.control import control_figures
-from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.mapping import refine_block
 from aeromatch_cli.orientation.quality import Evidence, judged
-from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import adjust
 from benchmarks import options
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.accuracy import judged as by_truth
+from benchmarks.calibration.verdict import of_adjusted
 from benchmarks.processes import fresh_process, limit_threads
 from benchmarks.tables import Column, Row, number, table, write_rows
 from benchmarks.verdicts.blocks import FAULTS, GOOD, Task
@@ -43,33 +40,16 @@ _TOGETHER = 9
 
 def evidence_of(task: Task) -> tuple[Evidence, Row]:
     """What the adjustment makes of a task, and errors of that by truth."""
-    images = task.contents.block.images
-    tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in task.contents.pairs])
-    alone = len(images) - sum(map(len, tied))
     try:
         adjusted, groups = refine_block(task.contents, task.observed, task.groups, fixed=task.fixed)
     except AeromatchError as error:
         facts: dict[str, Any] = {"images": 0, "remarks": [str(error)]}
-        errors: Row = {}
-    else:
-        residuals = residuals_of(adjusted, task.observed.poses, images, task.contents.keypoints_px)
-        cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in images}
-        metric = task.block.positions != "nothing"
-        surveyed = task.observed.control
-        control = control_figures(adjusted, cameras, surveyed, metric=metric) if surveyed else None
-        facts = {
-            **block_figures(adjusted, images, groups),
-            "positions_given": len(task.observed.poses),
-            "outside": {i.image_id: "" for i in images if i.image_id not in adjusted.poses},
-            "control": control,
-            "residuals": residual_figures(residuals, {}),
-            "remarks": [] if adjusted.poses else ["no image could be oriented"],
-        }
-        one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
-        whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
-        errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
-    evidence = Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
-    return evidence, errors
+        return Evidence(images=len(task.contents.block.images), adjust=facts, refined=True), {}
+    one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
+    whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
+    errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
+    metric = task.block.positions != "nothing"
+    return of_adjusted(task.contents, task.observed, adjusted, groups, metric=metric), errors
 
 
 def _run(name: str, expected: str, path: Path, tie_points: int) -> None:

@@ -1,0 +1,41 @@
+"""What the verdict on a simulated block rests on: figures as stage `adjust` has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from aeromatch_cli.data import AdjustedBlock
+from aeromatch_cli.orientation.block_figures import block_figures
+from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.orientation.judgement import connected_groups
+from aeromatch_cli.orientation.mapping import Observed
+from aeromatch_cli.orientation.quality import Evidence
+from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.strategies.exporters.contents import ExportContents
+
+
+def of_adjusted(
+    contents: ExportContents,
+    observed: Observed,
+    adjusted: AdjustedBlock,
+    groups: Sequence[Mapping[str, Any]],
+    *,
+    metric: bool,
+) -> Evidence:
+    """groups: facts of `refine_block`. metric: whether the world frame's lengths are metres."""
+    images = contents.block.images
+    tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in contents.pairs])
+    alone = len(images) - sum(map(len, tied))
+    residuals = residuals_of(adjusted, observed.poses, images, contents.keypoints_px)
+    cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in images}
+    control = control_figures(adjusted, cameras, observed.control, metric=metric) if observed.control else None
+    facts = {
+        **block_figures(adjusted, images, groups),
+        "positions_given": len(observed.poses),
+        "outside": {i.image_id: "" for i in images if i.image_id not in adjusted.poses},
+        "control": control,
+        "residuals": residual_figures(residuals, {}),
+        "remarks": [] if adjusted.poses else ["no image could be oriented"],
+    }
+    return Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
