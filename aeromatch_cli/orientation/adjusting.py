@@ -56,8 +56,9 @@ _LENS_POINTS = 500
 _HOLDING = 3
 # A position that is so many standard deviations away is not that of the image.
 _WRONG_SIGMAS = 5.0
-# Positions beyond so many standard deviations are no observations of an adjustment in the making.
-_FAR_SIGMAS = 10.0
+# Positions beyond so many standard deviations, and this share of the flying height, are no observations of an
+# adjustment in the making.
+_FAR_SIGMAS, _NEAR_SHARE = 10.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +159,12 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     given, steps_m = _without_steps(model, given)
     positions_m, sigmas_m = given.positions_m[rows], given.mean_sigmas_m[rows]
     placement = _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
-    # A wrong focal length puts images far from positions that are right, however exact these are: the adjustment tells.
-    off_m = np.linalg.norm(centers_of(model, ids) - positions_m, axis=1)
-    counts = (placement.agreeing | (off_m <= _FAR_SIGMAS * sigmas_m)) & (placement.kind == "positions")
+    # A wrong lens puts images far from positions that are right, however exact these are: the adjustment tells.
+    centers_m = centers_of(model, ids)
+    off_m = np.linalg.norm(centers_m - positions_m, axis=1)
+    flying_m = abs(float(np.median(centers_m[:, 2]) - np.median(points_of(model)[:, 2])))
+    near = off_m <= np.maximum(_FAR_SIGMAS * sigmas_m, _NEAR_SHARE * flying_m)
+    counts = (placement.agreeing | near) & (placement.kind == "positions")
     levels = np.full((len(ids), 3), np.inf)
     if placement.kind == "positions" and np.isfinite(placement.level_sigma_deg):
         # What tilts or terrain say of the whole block, as observations of all images that together are as exact.

@@ -55,6 +55,9 @@ def with_names(
         named["positions"] = {**named["positions"], "wrong": wrong, "flights": means}
     if "flights" in named:
         named["flights"] = of_flights(named["flights"])
+    if "calibration" in named:
+        listed = named["calibration"].items()
+        named["calibration"] = {key: {**one, "flights": of_flights(one["flights"])} for key, one in listed}
     for key in ("mounts", "calibration"):
         if key in named:
             named[key] = {cameras[int(number) - 1]: one for number, one in named[key].items()}
@@ -162,6 +165,16 @@ def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
         "images": int((network.camera == row).sum()),
         "parameters": parameters,
         "correlations": strong[:_MOST_LISTED],
+        "flights": [
+            {
+                "flight": outcome.flights[one.flight],
+                "images": int(((network.camera == row) & (network.flight == one.flight)).sum()),
+                "change": {name: float(one.change[k]) for k, name in enumerate(LENS) if one.change[k] != 0.0},
+                "worth": one.worth,
+            }
+            for one in outcome.result.flight_lenses
+            if one.camera == row
+        ],
     }
 
 

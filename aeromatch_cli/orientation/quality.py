@@ -55,6 +55,8 @@ _HELD_BY_PAIRS: Limits = (0.1, 0.5)
 # A calibration that differs so much from what is known of the camera, in standard deviations of that: a camera file of
 # another camera, pictures of another size, or positions that force it.
 _LENS_SIGMAS: Limits = (3.0, 6.0)
+# What a lens of its own for a flight is worth, over what is asked for: beyond, the flights do not share a calibration.
+_FLIGHT_LENS: Limits = (1.0, None)
 # Expected deformations: how far the middle of the block may lie above its border, ground pixels; and by which angle it
 # may be tilted, degrees, which is what one strip has about its line.
 _BOWL_PIXELS: Limits = (5.0, None)
@@ -479,6 +481,7 @@ def _calibration(evidence: Evidence) -> _Found:
             if not changes:
                 continue
             told.add(camera_id)
+            yield from _flight_lenses(camera_id, camera)
             limits = dict.fromkeys(changes, _LENS_SIGMAS)
             if _tilt_deg(group) > _TILT_DEG[0]:  # what does not tell its tilt does not tell the principal point either
                 limits |= dict.fromkeys({"cx", "cy"} & changes.keys(), (_LENS_SIGMAS[0], None))
@@ -511,6 +514,22 @@ def _with_held(evidence: Evidence, remedy: str) -> str:
     """The remedy for what a wrong calibration may have done, with the settings that have held parameters of it."""
     held = _held_words(evidence)
     return f"{remedy}; {held} of cameras as stated, which may be wrong" if held else remedy
+
+
+def _flight_lenses(camera_id: str, camera: Mapping[str, Any]) -> Iterator[Finding]:
+    for one in camera.get("flights", ()):
+        shown = ", ".join(f"{name} by {one['change'].get(name, 0.0):+.1f} px" for name in ("f", "cx", "cy"))
+        words = (
+            f"camera {camera_id} has another calibration in {_flight(one['flight'])} ({one['images']} images) than in "
+            f"the largest of its flights: {shown}"
+        )
+        if _level(one["worth"], _FLIGHT_LENS) == "good":
+            words = f"camera {camera_id} has the same calibration in {_flight(one['flight'])} as in the largest"
+        remedy = (
+            "was it focused or zoomed in between? with the images of each flight in a folder of their own and "
+            "`--cameras folder` each flight has a camera of its own"
+        )
+        yield _finding("flights of a camera", one["worth"], _FLIGHT_LENS, words, remedy)
 
 
 def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:

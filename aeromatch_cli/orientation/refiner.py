@@ -49,6 +49,8 @@ _MAX_ROUNDS = 3
 # An adjustment ends when a step lowers the cost by a smaller share. With 1e-4 it takes a third of the time, and heights
 # of check points come out four times as bad.
 _COST_TOLERANCE = 1e-6
+# That of the first round, which only finds points for the next.
+_FIRST_TOLERANCE = 1e-4
 # Fewer images make no group.
 _FEWEST_IMAGES = 3
 # With fewer points of three images or more, those of two count as well.
@@ -209,10 +211,11 @@ def _refined(
         thin = thinned(model)
         moved = model if thin is None else thin
         before = state_errors(work, moved, given)
+        now = work if number else replace(work, options=replace(work.options, tolerance=_FIRST_TOLERANCE, final=False))
         if kind == "given":
-            outcome = adjust_in_place(work, moved, given, attitudes, held)
+            outcome = adjust_in_place(now, moved, given, attitudes, held)
         else:
-            outcome = adjusted(work, moved, given, held)
+            outcome = adjusted(now, moved, given, held)
         settled = state_errors(work, moved, given) > (1.0 - _WORTH_AGAIN) * before
         # The first points may be far off; after the last round nothing follows.
         settled = (settled and number > 0) or number == _MAX_ROUNDS - 1

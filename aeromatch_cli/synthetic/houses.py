@@ -116,7 +116,7 @@ def _wing(
 
 def _porch(rng: np.random.Generator, plan: Footprint, ground_m: float, look: _Look) -> list[Surface]:
     """A conservatory or a flat-roofed extension."""
-    width, depth = rng.uniform(2.5, 0.5 * plan.length_x_m), rng.uniform(1.8, 3.4)
+    width, depth = rng.uniform(2.5, max(2.5, 0.5 * plan.length_x_m)), rng.uniform(1.8, 3.4)
     x = rng.uniform(-0.5, 0.5) * (plan.length_x_m - width)
     at = plan.at(np.array([[x, -0.5 * (plan.length_y_m + depth) + 0.05]]))[0]
     part = Footprint(float(at[0]), float(at[1]), width, depth, plan.heading_deg)

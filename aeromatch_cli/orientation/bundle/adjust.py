@@ -19,6 +19,7 @@ from aeromatch_cli.orientation.bundle.covariance import Covariance, covariance
 from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import residuals_in_sigmas
 from aeromatch_cli.orientation.bundle.projection import project_with_derivatives
+from aeromatch_cli.orientation.bundle.shared import FlightLens, lenses_by_flight
 from aeromatch_cli.orientation.bundle.solve import solve
 
 # The standard deviation of image points is estimated again until it changes by less than this share.
@@ -71,7 +72,7 @@ class Options:
 class Adjusted:
     """network: with the weights and positions that were used in the end. sigma_px: of a coordinate of an image point.
     position_factors: (2,) by which positions are less exact than stated, horizontally and vertically. found: None
-    unless asked for. stated: the network as it was given."""
+    unless asked for. stated: the network as it was given. flight_lenses: of cameras in several flights, likewise."""
 
     network: Network
     state: Unknowns
@@ -79,6 +80,7 @@ class Adjusted:
     position_factors: FloatArray
     found: Covariance | None
     stated: Network
+    flight_lenses: tuple[FlightLens, ...] = ()
 
 
 def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
@@ -95,8 +97,11 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
         if explained is not network:
             network, state = _with_image_sigma(explained, state, options.tolerance)
     network, state, factors = _with_position_sigmas(network, state, options)
-    found = covariance(_with_common_errors(network, stated), state) if options.final else None
-    return Adjusted(network, state, network.tie_sigma_px, factors, found, stated)
+    if not options.final:
+        return Adjusted(network, state, network.tie_sigma_px, factors, None, stated)
+    found = covariance(_with_common_errors(network, stated), state)
+    lenses = tuple(lenses_by_flight(network, state, options.tolerance))
+    return Adjusted(network, state, network.tie_sigma_px, factors, found, stated, lenses)
 
 
 def _with_common_errors(network: Network, stated: Network) -> Network:

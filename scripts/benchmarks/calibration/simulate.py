@@ -19,7 +19,7 @@ from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS, FULL_FRAME_DIAGONAL_MM
 from aeromatch_cli.data import Block, BoolArray, Camera, FloatArray, Image, Pair, PairGeometry, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.angles import Angles
-from aeromatch_cli.geometry.cameras import focal_px, undistort
+from aeromatch_cli.geometry.cameras import BROWN, as_brown, focal_px, undistort
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.geometry.two_view import Sampling, estimate
 from aeromatch_cli.orientation.mapping import Group, Mapper, Observed, map_block
@@ -56,6 +56,8 @@ _SAMPLING = Sampling(threshold_px=8.0, max_iterations=500)
 # What poses of a first pass are off by, degrees and flying heights: neighbours, which matches tie, nearly alike; and so
 # much of it by themselves.
 _START_DEG, _START_SHARE, _START_OWN = 0.5, 0.01, 0.1
+# Of what EXIF does not say of a lens, what a first pass of reduced pictures does not find either.
+_START_LENS = 0.2
 _STREAM = 201
 
 
@@ -249,7 +251,8 @@ def _turned(rng: np.random.Generator, sigma_deg: float, count: int) -> Rotation:
 
 
 def perturbed(block: SimulatedBlock) -> tuple[ExportContents, list[Group]]:
-    """A start as a good first pass leaves it: exact poses made worse, in a frame of their own without positions."""
+    """A start as a good first pass leaves it: exact poses made worse, in a frame of their own without positions, and
+    lenses that are calibrated but for a share of what EXIF does not say of them."""
     rng = np.random.default_rng([block.seed, _STREAM, 9])
     centers_m = np.array([pose.center_m for pose in block.poses.values()])
     turns = Rotation.from_rotvec(np.deg2rad(_START_DEG) * _wave(centers_m, rng))
@@ -262,7 +265,15 @@ def perturbed(block: SimulatedBlock) -> tuple[ExportContents, list[Group]]:
         sigma_m = scale * _START_SHARE * block.flying_m
         poses[image_id] = Pose(center_m, turn.as_matrix() @ pose.world_rotation, sigma_m, _START_DEG)
     kind = "level" if block.positions == "nothing" else "positions"
-    return _started(block, block.contents.block.cameras, poses), [Group(kind, tuple(poses))]
+    cameras = {k: _between(exif_camera(camera), camera, _START_LENS) for k, camera in block.cameras.items()}
+    return _started(block, cameras, poses), [Group(kind, tuple(poses))]
+
+
+def _between(stated: Camera, true: Camera, share: float) -> Camera:
+    """The true camera with this share of its difference from the stated one."""
+    ends = zip(as_brown(true).params, as_brown(stated).params, strict=True)
+    params = tuple(value + share * (start - value) for value, start in ends)
+    return Camera(BROWN, true.width_px, true.height_px, params)
 
 
 def _wave(centers_m: FloatArray, rng: np.random.Generator) -> FloatArray:
