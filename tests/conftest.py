@@ -19,6 +19,7 @@ from typing import Any
 
 import cv2
 import pytest
+import typer.testing
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
@@ -83,6 +84,15 @@ def scenes_built_once() -> Iterator[Callable[[], None]]:
             patched.setattr(module, "build_scene", build)
             patched.setattr(module, "RayCaster", cast)
         yield forget
+
+
+@pytest.fixture(autouse=True, scope="session")
+def command_line_made_once() -> Iterator[None]:
+    """The runner would make all commands with their options anew for every command that it runs, 27 ms each time; a
+    process of a user's makes them once."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(typer.testing, "_get_command", lru_cache(typer.testing._get_command))
+        yield
 
 
 def invoke(*arguments: object) -> Outcome:
