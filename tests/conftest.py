@@ -15,14 +15,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import forked
 import pytest
 import typer.testing
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
+from aeromatch_cli.orientation import process
 from aeromatch_cli.synthetic import block, render_block, truth
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import build_scene
@@ -92,6 +95,14 @@ def command_line_made_once() -> Iterator[None]:
     process of a user's makes them once."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(typer.testing, "_get_command", lru_cache(typer.testing._get_command))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def mappers_forked() -> Iterator[None]:
+    """Mappers and refiners of commands that run in this process do not load their libraries each time."""
+    with forked.server(), pytest.MonkeyPatch.context() as patched:
+        patched.setattr(process, "subprocess", SimpleNamespace(run=forked.run))
         yield
 
 
