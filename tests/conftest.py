@@ -15,13 +15,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
+import forked
 import pytest
+import typer.testing
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
+from aeromatch_cli.orientation import process
 from aeromatch_cli.synthetic import block, render_block, truth
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import build_scene
@@ -83,6 +87,23 @@ def scenes_built_once() -> Iterator[Callable[[], None]]:
             patched.setattr(module, "build_scene", build)
             patched.setattr(module, "RayCaster", cast)
         yield forget
+
+
+@pytest.fixture(autouse=True, scope="session")
+def command_line_made_once() -> Iterator[None]:
+    """The runner would make all commands with their options anew for every command that it runs, 27 ms each time; a
+    process of a user's makes them once."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(typer.testing, "_get_command", lru_cache(typer.testing._get_command))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def mappers_forked() -> Iterator[None]:
+    """Mappers and refiners of commands that run in this process do not load their libraries each time."""
+    with forked.server(), pytest.MonkeyPatch.context() as patched:
+        patched.setattr(process, "subprocess", SimpleNamespace(run=forked.run))
+        yield
 
 
 def invoke(*arguments: object) -> Outcome:

@@ -8,6 +8,7 @@ image, two blocks for every lens, one for every mount and one for every flight (
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,6 +80,22 @@ class Equations:
     point_right: FloatArray
     held: BoolArray
 
+    @cached_property
+    def undamped(self) -> tuple[sparse.bsr_matrix, FloatArray, sparse.bsr_matrix]:
+        """What is the same whatever the damping, points not eliminated: matrix (6 B, 6 B), right (6 B,) and coupling
+        (6 B, 3 P)."""
+        from scipy import sparse
+
+        blocks, size = len(self.held), (2 * len(self.by_point), 3 * len(self.point_normals))
+        if self.held.all():  # points alone are unknown: all derivatives by others are zero
+            matrix = sparse.bsr_matrix((blocks, blocks), blocksize=(6, 6))
+            return matrix, np.zeros(blocks), sparse.bsr_matrix((blocks, size[1]), blocksize=(6, 3))
+        seen = (self.by_point, self.network.point, np.arange(len(self.by_point) + 1))
+        turned = [part.T for part in self.rows]
+        matrix = sum((t @ part for t, part in zip(turned[1:], self.rows[1:], strict=True)), turned[0] @ self.rows[0])
+        right = sum(t @ off for t, off in zip(turned, self.residuals, strict=True))
+        return matrix, right, turned[0] @ sparse.bsr_matrix(seen, shape=size)
+
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
@@ -99,7 +116,12 @@ class Reduced:
 
 def residuals_in_sigmas(network: Network, state: Unknowns) -> FloatArray:
     """(M,) distances of image points from where they were measured, in standard deviations."""
-    off = (project(network, state) - network.xy_px) / network.sigma_px[:, None]
+    return _apart(network, project(network, state))
+
+
+def _apart(network: Network, xy_px: FloatArray) -> FloatArray:
+    """The same of image points (M, 2) that are projected already."""
+    off = (xy_px - network.xy_px) / network.sigma_px[:, None]
     apart = np.sqrt((off**2).sum(axis=1))
     return np.where(np.isfinite(apart), apart, _BEHIND_SIGMAS)
 
@@ -117,7 +139,7 @@ def cost(network: Network, state: Unknowns) -> float:
 def equations(network: Network, state: Unknowns) -> Equations:
     layout = Layout.of(network)
     seen = project_with_derivatives(network, state)
-    apart = residuals_in_sigmas(network, state)
+    apart = _apart(network, seen.xy_px)
     weights = np.where(np.isfinite(seen.xy_px).all(axis=1), 1.0 / (1.0 + (apart / LOSS_SIGMAS) ** 2), 0.0)
     scale = (np.sqrt(weights) / network.sigma_px)[:, None]
     residuals = np.nan_to_num((seen.xy_px - network.xy_px) * scale)
@@ -134,10 +156,11 @@ def equations(network: Network, state: Unknowns) -> Equations:
         if len(found):
             rows.append(_rows(derivatives, layout))
             values.append(found.ravel())
-    for (found, sigmas), blocks in zip(_priors(network, state), _prior_blocks(layout), strict=True):
-        weight = np.where(sigmas > 0.0, 1.0 / np.where(sigmas > 0.0, sigmas, 1.0), 0.0).reshape(-1, 6)
-        rows.append(_rows([(blocks, weight[:, :, None] * np.eye(6))], layout))
-        values.append(found.ravel())
+    priors = _priors(network, state)
+    sigmas = np.concatenate([part.reshape(-1, 6) for _, part in priors])
+    weight = np.where(sigmas > 0.0, 1.0 / np.where(sigmas > 0.0, sigmas, 1.0), 0.0)
+    rows.append(_rows([(_prior_blocks(layout), weight[:, :, None] * np.eye(6))], layout))
+    values.append(np.concatenate([found.ravel() for found, _ in priors]))
     normals, right = _of_points(network, state, by_point, residuals)
     return Equations(network, rows, values, by_point, weights, normals, right, _held(network))
 
@@ -146,20 +169,17 @@ def reduced(found: Equations, damping: float = 0.0) -> Reduced:
     """damping: this share of the diagonal is added to it (Levenberg-Marquardt)."""
     from scipy import sparse
 
-    network, points = found.network, len(found.point_normals)
+    matrix, right, coupling = found.undamped
     diagonal = np.diagonal(found.point_normals, axis1=1, axis2=2)
     damped = found.point_normals + (damping * np.maximum(diagonal, 1e-12))[:, :, None] * np.eye(3)
     inverses = np.linalg.pinv(damped, hermitian=True)
-    seen = (found.by_point, network.point, np.arange(len(found.by_point) + 1))
-    coupling = found.rows[0].T @ sparse.bsr_matrix(seen, shape=(2 * len(found.by_point), 3 * points))
-    by_block = sparse.bsr_matrix((inverses, np.arange(points), np.arange(points + 1)), shape=(3 * points, 3 * points))
-    matrix = sum((part.T @ part for part in found.rows[1:]), start=found.rows[0].T @ found.rows[0])
-    own = matrix.diagonal()
-    matrix = matrix - (coupling @ by_block) @ coupling.T
-    matrix = matrix.tocsr() + sparse.diags(damping * own + np.where(found.held, 1.0, 0.0))
-    right = sum(part.T @ off for part, off in zip(found.rows, found.residuals, strict=True))
+    by_points = coupling.data @ inverses[coupling.indices], coupling.indices, coupling.indptr
+    eliminated = sparse.bsr_matrix(by_points, shape=coupling.shape) @ coupling.T
+    added = damping * matrix.diagonal() + np.where(found.held, 1.0, 0.0)
+    each = np.arange(len(added) + 1)
+    reduced = (matrix - eliminated).tocsr() + sparse.csr_matrix((added, each[:-1], each), shape=matrix.shape)
     right = right - coupling @ np.einsum("pij,pj->pi", inverses, found.point_right).ravel()
-    return Reduced(matrix, right, coupling, inverses, found.point_right, found.rows[1:], found.held)
+    return Reduced(reduced, right, coupling, inverses, found.point_right, found.rows[1:], found.held)
 
 
 def _of_points(
@@ -167,13 +187,19 @@ def _of_points(
 ) -> tuple[FloatArray, FloatArray]:
     """Normal equations of the points alone: (P, 3, 3) and (P, 3)."""
     points = len(state.points_m)
-    normals, right = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    np.add.at(normals, network.point, by_point.transpose(0, 2, 1) @ by_point)
-    np.add.at(right, network.point, np.einsum("mij,mi->mj", by_point, residuals))
+    normals = _summed(network.point, by_point.transpose(0, 2, 1) @ by_point, points)
+    right = _summed(network.point, np.einsum("mij,mi->mj", by_point, residuals), points)
     information = 1.0 / network.control_sigmas_m**2
     normals[network.control] += information[:, :, None] * np.eye(3)
     right[network.control] += information * (state.points_m[network.control] - network.control_m)
     return normals, right
+
+
+def _summed(rows: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """(count, ...) sums of values (M, ...) by their rows (M,)."""
+    shape = values.shape[1:]
+    parts = [np.bincount(rows, values[:, *place], count) for place in np.ndindex(*shape)]
+    return np.asarray(np.stack(parts, axis=1).reshape(count, *shape), dtype=np.float64)
 
 
 def _held(network: Network) -> BoolArray:
@@ -248,8 +274,9 @@ def _priors(network: Network, state: Unknowns) -> list[tuple[FloatArray, FloatAr
     return [(np.where(sigmas > 0.0, off / np.where(sigmas > 0.0, sigmas, 1.0), 0.0), sigmas) for off, sigmas in parts]
 
 
-def _prior_blocks(layout: Layout) -> list[IntArray]:
-    """Numbers of blocks (R,), in the order of `_priors`."""
+def _prior_blocks(layout: Layout) -> IntArray:
+    """(R,) numbers of blocks, in the order of `_priors`."""
     first = layout.lens(np.arange(layout.cameras))
     lens = np.stack([first, first + 1], axis=1).ravel()
-    return [lens, layout.mount(np.arange(layout.cameras)), layout.flight(np.arange(layout.flights))]
+    mounts, flights = layout.mount(np.arange(layout.cameras)), layout.flight(np.arange(layout.flights))
+    return np.concatenate([lens, mounts, flights])

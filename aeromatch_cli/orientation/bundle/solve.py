@@ -83,11 +83,12 @@ def _solution(normals: Reduced) -> FloatArray:
 
     scale = 1.0 / np.sqrt(np.maximum(normals.matrix.diagonal(), 1e-300))
     right = -normals.right * scale
-    scaled = sparse.diags(scale) @ normals.matrix @ sparse.diags(scale)
     try:
         if len(right) <= _FULL_SIZE:
-            factor = linalg.cho_factor(scaled.toarray(), lower=True, overwrite_a=True, check_finite=False)
+            full = scale[:, None] * normals.matrix.toarray() * scale
+            factor = linalg.cho_factor(full, lower=True, overwrite_a=True, check_finite=False)
             return np.asarray(scale * linalg.cho_solve(factor, right, check_finite=False))
+        scaled = sparse.diags(scale) @ normals.matrix @ sparse.diags(scale)
         return np.asarray(scale * factorised(scaled).solve(right))
     except (linalg.LinAlgError, RuntimeError):  # not positive definite, singular
         return np.full(len(right), np.nan)

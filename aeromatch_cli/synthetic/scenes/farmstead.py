@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.synthetic.fields import Rolling, turned, unturned
 from aeromatch_cli.synthetic.houses import house, roofed
 from aeromatch_cli.synthetic.scenes.parcels import (
@@ -43,9 +44,14 @@ class _Land:
 
     def world(self, u_m: float, v_m: float) -> tuple[float, float, float]:
         """x, y and the ground's height of a place in bent coordinates."""
-        plain = np.stack(unbent(np.array([u_m]), np.array([v_m]), self.seed), axis=1)
+        x, y, ground_m = self.worlds(np.array([[u_m, v_m]]))[0].tolist()
+        return x, y, ground_m
+
+    def worlds(self, uv_m: FloatArray) -> FloatArray:
+        """(N, 3) the same of many places (N, 2) at once."""
+        plain = np.stack(unbent(uv_m[:, 0], uv_m[:, 1], self.seed), axis=1)
         xy = unturned(plain, self.heading_deg)
-        return float(xy[0, 0]), float(xy[0, 1]), float(self.terrain.height_m(xy)[0])
+        return np.column_stack([xy, self.terrain.height_m(xy)])
 
 
 def farm_solids(seed: int, area: Area, terrain: Rolling, heading_deg: float) -> tuple[list[Surface], dict[str, int]]:
@@ -88,14 +94,17 @@ def _hedges(rng: np.random.Generator, land: _Land, column: int, row: int) -> _Fo
         lines.append((np.array([here.u0 + 3.0, here.v0]), np.array([here.u1 - 3.0, here.v0])))
     for start, end in lines:
         count = int(np.hypot(*(end - start)) / _SHRUB_EVERY_M)
+        drawn, places = [], []
         for t in (np.arange(count) + 0.5) / count:
             gap, tall = rng.random() < 0.10, rng.random() < 0.07
             radius = float(rng.uniform(0.9, 1.7))
-            u, v = (start + t * (end - start) + rng.uniform(-0.35, 0.35, 2)).tolist()
-            x, y, ground_m = land.world(u, v)
-            own = np.random.default_rng(int(rng.integers(2**31)))
+            places.append(start + t * (end - start) + rng.uniform(-0.35, 0.35, 2))
+            drawn.append((gap, tall, radius, int(rng.integers(2**31))))
+        worlds = land.worlds(np.array(places).reshape(-1, 2)).tolist()
+        for (gap, tall, radius, seed), (x, y, ground_m) in zip(drawn, worlds, strict=True):
             if gap or not land.area.contains(x, y):
                 continue
+            own = np.random.default_rng(seed)
             if tall:
                 yield "trees", tree(own, x, y, ground_m - 0.1, 2.0 * radius, 4.6 * radius, Species.BROADLEAF)
             else:
