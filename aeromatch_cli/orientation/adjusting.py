@@ -30,7 +30,7 @@ from aeromatch_cli.orientation.bundle.of_model import (
 from aeromatch_cli.orientation.bundle.projection import project
 from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.judgement import connected_groups
-from aeromatch_cli.orientation.placing import Placement, height_steps_m, place
+from aeromatch_cli.orientation.placing import Placement, delay_s, height_steps_m, place
 from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of, rotations_of
 
 # A focal length this many times longer or shorter than its prior is no lens: the images of that camera were misplaced.
@@ -158,6 +158,8 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     rows = np.array(ids, dtype=int) - 1
     given, steps_m = _without_steps(model, given)
     positions_m, sigmas_m = given.positions_m[rows], given.mean_sigmas_m[rows]
+    late_s = delay_s(centers_of(model, ids), positions_m, given.velocities_m_s[rows])
+    positions_m = positions_m - late_s * given.velocities_m_s[rows]
     placement = _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
     # A wrong lens puts images far from positions that are right, however exact these are: the adjustment tells.
     centers_m = centers_of(model, ids)

@@ -34,6 +34,9 @@ _DOUBTFUL = 5.0
 # A stated standard deviation counts as much as so many residuals, from which it is estimated once more.
 _STATED_RESIDUALS = 3.0
 _UNKNOWNS = 7  # of a similarity
+# Delays of positions that are tried, seconds, so many to either side; one is taken that leaves this share of what they
+# are off by.
+_MOST_DELAY_S, _DELAYS, _DELAY_BETTER = 2.0, 80, 0.3
 # How far from level the plane through most points of a terrain usually is, and from how many independent heights it
 # comes: a roof or a hillside lifts many points together.
 _LEVEL_SIGMA_DEG = 3.0
@@ -205,6 +208,26 @@ class _Measured:
         """(N, 3) residuals with that rotation, in standard deviations."""
         scale, translation_m = self.fit(rotation)
         return np.asarray((scale * self.centers @ rotation.T + translation_m - self.positions_m) / self.sigma_m)
+
+
+def delay_s(centers: FloatArray, positions_m: FloatArray, velocities_m_s: FloatArray) -> float:
+    """By how much positions lag behind the exposures, seconds; 0 where that does not make them fit far better.
+
+    Roughly, as a start: an adjustment finds it exactly. centers, positions_m: (N, 3) as of `place`; velocities_m_s:
+    (N, 3) of the aircraft, zero where they are not known.
+    """
+    known = np.isfinite(positions_m).all(axis=1) & (np.abs(velocities_m_s).sum(axis=1) > 0.0)
+    if known.sum() <= _UNKNOWNS:
+        return 0.0
+    own, given_m, moved_m_s = centers[known], positions_m[known], velocities_m_s[known]
+
+    def off_m(late_s: float) -> float:
+        places_m = given_m - late_s * moved_m_s
+        return float(np.median(_errors(similarity(own, places_m), own, places_m)))
+
+    tried = np.linspace(-_MOST_DELAY_S, _MOST_DELAY_S, 2 * _DELAYS + 1)
+    best = float(min(tried, key=off_m))
+    return best if off_m(best) < _DELAY_BETTER * off_m(0.0) else 0.0
 
 
 def _vertical(by_terrain: _Vertical, ups: FloatArray | None) -> _Vertical:
