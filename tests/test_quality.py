@@ -159,11 +159,11 @@ def test_the_step_between_two_flights_is_said_with_its_size() -> None:
 
 
 def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
-    for stated_m, level in ((0.02, "good"), (5.0, "doubtful")):
+    for stated_m in (0.02, 5.0):
         parts = [deepcopy(GROUP) | positions(stated_m=[stated_m] * 3, used=n, images=n) | {"images": n} for n in (8, 4)]
         quality = judged_with(adjust={"groups": parts})
         assert found(quality, "parts").value == pytest.approx(stated_m / 2.0 / 0.03)  # the smaller one has four images
-        assert quality.verdict == level
+        assert quality.verdict == "doubtful"
 
 
 @pytest.mark.parametrize(("name", "verdict"), [("cx", "doubtful"), ("f", "bad")])

@@ -10,7 +10,8 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
 from aeromatch_cli.geometry.cameras import corner_params, focal_px
 
-# Images with fewer points of three images and more are held by their neighbours one by one.
+# Images with fewer points of three images and more are held by their neighbours one by one; pairs that share fewer tie
+# no parts.
 _FEW_POINTS = 20
 
 
@@ -26,6 +27,7 @@ def block_figures(
         "points": len(adjusted.points_m),
         "track_length": round(adjusted.observations / max(1, len(adjusted.points_m)), 3),
         "held_by_pairs": sum(count < _FEW_POINTS for count in held),
+        "tied_parts": tied_parts(adjusted),
         "reprojection_error_px": round(float(np.mean(adjusted.errors_px)), 4) if len(adjusted.errors_px) else None,
         "ground_pixel_m": _ground_pixel_m(adjusted, {image.image_id: image.camera_id for image in images}),
         # No length is a metre in a frame of a group's own.
@@ -45,6 +47,23 @@ def images_per_point(adjusted: AdjustedBlock) -> IntArray:
     for track in adjusted.tracks.values():
         seen[np.unique(track[:, 1])] += 1
     return seen
+
+
+def tied_parts(adjusted: AdjustedBlock) -> list[int]:
+    """Sizes of the parts of the block within which images are connected by pairs that share 20 points, the largest
+    first."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    tracks = [np.unique(track[:, 1]) for track in adjusted.tracks.values()]
+    if not tracks:
+        return []
+    ends = np.cumsum([0, *map(len, tracks)])
+    seen = sparse.csr_matrix(
+        (np.ones(ends[-1]), np.concatenate(tracks), ends), shape=(len(tracks), len(adjusted.points_m))
+    )
+    _, part = csgraph.connected_components(seen @ seen.T >= _FEW_POINTS, directed=False)
+    return sorted(np.bincount(part).tolist(), reverse=True)
 
 
 def _ground_pixel_m(adjusted: AdjustedBlock, camera_ids: Mapping[str, str]) -> float | None:

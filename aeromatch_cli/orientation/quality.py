@@ -65,8 +65,12 @@ _TILT_DEG: Limits = (2.0, None)
 _HEIGHT_PIXELS, _HEIGHT_SIGMAS = 5.0, 3.0
 # Share of the images that are not oriented, or not in the largest part: none is as it should be.
 _LEFT_OUT: Limits = (0.0, 0.2)
-# Parts that share too few points lie to each other as exactly as positions put each of them, ground pixels.
-_PARTS_PIXELS: Limits = (5.0, None)
+# Parts of so many images and more that share too few points with the others to be tied by them.
+_PART_IMAGES = 3
+# Share of the verified matches that the adjusted block contradicts. Sound blocks have 1 to 16 %.
+_CONTRADICTED: Limits = (0.25, 0.6)
+# Share of the images of which it contradicts so many that these are no exceptions.
+_CONTRADICTING: Limits = (0.05, 0.5)
 # Share of the images whose matches kept poses (orient=given) do not explain.
 _UNEXPLAINED: Limits = (0.1, 0.5)
 # So many positions, or points, hold a block.
@@ -107,16 +111,22 @@ class Quality:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a block is judged by. images: of the block. adjust, orient: facts of these stages. components: sizes of the
-    groups of images that verified pairs connect, the largest first. refined: whether tie points were measured by least
-    squares. reduced: stored pixels in a pixel of the pictures that keypoints were found in. names: of the files, by
-    image_id."""
+    """What a block is judged by.
+
+    images: of the block. adjust, orient: facts of these stages. components: sizes of the groups of images that verified
+    pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted: share of
+    the verified matches that the adjusted block contradicts, None where it is not known; contradicting: ids of images
+    of which it contradicts most. reduced: stored pixels in a pixel of the pictures that keypoints were found in. names:
+    of the files, by image_id.
+    """
 
     images: int
     adjust: Mapping[str, Any]
     orient: Mapping[str, Any] = field(default_factory=dict)
     components: Sequence[int] = ()
     refined: bool = False
+    contradicted: float | None = None
+    contradicting: Sequence[str] = ()
     reduced: float = 1.0
     names: Mapping[str, str] = field(default_factory=dict)
 
@@ -134,8 +144,8 @@ def judged(evidence: Evidence) -> Quality:
     findings, unchecked = [*_connection(evidence)], list[str]()
     if evidence.adjust.get("images"):
         for criterion in (
-            _left_out, _frames, _positions, _flights, _mounts, _angles, _control, _errors, _multiplicity,
-            _calibration, _deformation, _kept_poses,
+            _left_out, _frames, _weak_ties, _contradicted, _positions, _flights, _mounts, _angles, _control, _errors,
+            _multiplicity, _calibration, _deformation, _kept_poses,
         ):  # fmt: skip
             for found in criterion(evidence):
                 if isinstance(found, Finding):
@@ -233,6 +243,34 @@ def _frames(evidence: Evidence) -> _Found:
         yield Finding("ground", None, None, "doubtful", words)
 
 
+def _weak_ties(evidence: Evidence) -> _Found:
+    """Parts of a block that is one by single points; several parts are judged by `_placed_parts`."""
+    parts = [size for size in evidence.adjust.get("tied_parts", ()) if size >= _PART_IMAGES]
+    if len(parts) > 1 and len(evidence.groups) == 1:
+        words = (
+            f"{_sizes(parts)} share fewer than 20 points: single points, or their positions, put them to each other; "
+            "more overlap between them helps"
+        )
+        yield Finding("weakly tied parts", float(len(parts)), 1.0, "doubtful", words)
+
+
+def _contradicted(evidence: Evidence) -> _Found:
+    """Matches that the block contradicts, and images of which it contradicts most."""
+    if evidence.contradicted is None:
+        return
+    remedy = (
+        "many of them are wrong, or poses and cameras are: `aeromatch show WORK IMAGE IMAGE --rejected` shows those of "
+        "a pair; repeated patterns, water and moving shadows need other settings or --masks"
+    )
+    words = f"the adjusted block contradicts {100.0 * evidence.contradicted:.0f} % of the verified matches"
+    yield _finding("contradicted matches", evidence.contradicted, _CONTRADICTED, words, remedy)
+    count = len(evidence.contradicting)
+    words = f"most matches of {count} of {evidence.images} images contradict the adjusted block"
+    if count:
+        words += f" ({evidence.named(evidence.contradicting)})"
+    yield _finding("contradicting images", count / max(evidence.images, 1), _CONTRADICTING, words, remedy)
+
+
 def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
     placed = [group for group in evidence.groups if group["kind"] == "positions" and group.get("positions")]
     pixel_m = evidence.adjust.get("ground_pixel_m")
@@ -240,13 +278,18 @@ def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
         return
     # Of a part of N images by the square root of N better; that of the smallest counts.
     exact_m = max(_rms(one["positions"]["stated_m"]) / np.sqrt(max(one["positions"]["used"], 1)) for one in placed)
-    sizes = ", ".join(str(group["images"]) for group in placed[:5]) + (", ..." if len(placed) > 5 else "")
+    sizes = _sizes([group["images"] for group in placed])
     words = (
-        f"{len(placed)} parts ({sizes} images) share too few points and lie to each other as their positions put them, "
-        f"to {plain(exact_m)} m ({exact_m / pixel_m:.1f} ground pixels)"
+        f"{sizes} share too few points and lie to each other as their positions put them, to {plain(exact_m)} m "
+        f"({exact_m / pixel_m:.1f} ground pixels): more overlap between them, better positions, or control points in "
+        "each tie them"
     )
-    remedy = "more overlap between them, better positions, or control points in each tie them"
-    yield _finding("parts", exact_m / pixel_m, _PARTS_PIXELS, words, remedy)
+    yield Finding("parts", float(exact_m / pixel_m), None, "doubtful", words)
+
+
+def _sizes(parts: Sequence[int]) -> str:
+    shown = ", ".join(map(str, parts[:5])) + (", ..." if len(parts) > 5 else "")
+    return f"{len(parts)} parts ({shown} images)"
 
 
 def _positions(evidence: Evidence) -> _Found:

@@ -27,11 +27,19 @@ def quality_of(facts: Mapping[str, Mapping[str, Any]], names: Mapping[str, str])
             adjust=facts["adjust"],
             orient=facts.get("orient", {}),
             components=final_links(facts)["components"],
+            contradicted=_contradicted(facts.get("consistency", {})),
+            contradicting=facts.get("consistency", {}).get("doubtful", ()),
             refined=(refined.get("measured") or 0) > _MEASURED * (refined.get("keypoints") or 1),
             reduced=facts["adjust"].get("reduced", 1.0),
             names=names,
         )
     )
+
+
+def _contradicted(consistency: Mapping[str, Any]) -> float | None:
+    """Share of the verified matches that the stage has dropped."""
+    dropped, left = consistency.get("dropped_matches", 0), consistency.get("verified_matches", 0)
+    return dropped / (dropped + left) if dropped + left and "points_left" in consistency else None
 
 
 def facts_told(workspace: Workspace, reports: Sequence[StageReport]) -> dict[str, Mapping[str, Any]]:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from aeromatch_cli.data import AdjustedBlock
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, Camera
 from aeromatch_cli.orientation.block_figures import block_figures
+from aeromatch_cli.orientation.contradictions import Contradictions, Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.orientation.quality import Evidence
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
 
@@ -38,4 +43,22 @@ def of_adjusted(
         "residuals": residual_figures(residuals, {}),
         "remarks": [] if adjusted.poses else ["no image could be oriented"],
     }
-    return Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
+    evidence = Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
+    if not adjusted.poses or not contents.pairs:
+        return evidence
+    found = _contradictions(contents, adjusted, cameras)
+    share = float(np.concatenate(found.masks).mean())
+    return replace(evidence, contradicted=share, contradicting=found.doubtful)
+
+
+def _contradictions(contents: ExportContents, adjusted: AdjustedBlock, cameras: Mapping[str, Camera]) -> Contradictions:
+    """Of the stage `consistency` as it is set by default."""
+    recipe = BlockConsistency()
+    pairs = [
+        MatchedKeypoints(p.pair.image_id0, p.pair.image_id1, p.verified, np.zeros(len(p.verified)))
+        for p in contents.pairs
+    ]
+    limits = Limits(
+        recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches
+    )
+    return contradicting(adjusted, cameras, contents.keypoints_px, pairs, limits)
