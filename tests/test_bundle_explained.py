@@ -7,21 +7,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from make_networks import cross_strips, disturbed, flight, lens, mount, simulated, strips, with_positions
+from make_networks import (
+    cross_strips,
+    disturbed,
+    flight,
+    lens,
+    mount,
+    simulated,
+    strips,
+    values_of,
+    with_lens_prior,
+    with_positions,
+)
 
 from aeromatch_cli.orientation.bundle.adjust import Adjusted, Options, adjust
-from aeromatch_cli.orientation.bundle.network import READOUT, Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
+from aeromatch_cli.orientation.bundle.projection import project
 
 RTK_M = 0.02
 FINAL = Options(1e-6, final=True)
 SEEDS = pytest.mark.parametrize("seed", range(3))
 
 
-def flown(seed: int, *, noise_m: float = RTK_M, **planted: Any) -> tuple[Network, Unknowns]:
+def flown(seed: int, *, noise_m: float = RTK_M, points: int = 150, **planted: Any) -> tuple[Network, Unknowns]:
     """Three strips, and two across them in a second flight, with positions to 2 cm."""
     crossing = cross_strips(3, 5)
     plan = strips(3, 5).and_then(replace(crossing, flights=crossing.flights + 1))
-    network, truth = simulated(plan, seed=seed, points=150, noise_px=0.5, **planted)
+    network, truth = simulated(plan, seed=seed, points=points, noise_px=0.5, **planted)
     return with_positions(network, truth, np.random.default_rng(seed + 50), RTK_M, noise_m=noise_m), truth
 
 
@@ -110,3 +122,36 @@ def test_a_read_out_is_not_tried_where_the_shutter_does_not_roll() -> None:
     start = disturbed(network, truth, np.random.default_rng(1))
     found = adjust(network, start, replace(FINAL, readout=False))
     assert "readout" not in explained(found)
+
+
+def in_two_flights(seed: int, focal: float, centre_px: float) -> Adjusted:
+    """A camera whose lens is another one in its second flight, by this factor and these pixels."""
+    network, truth = flown(seed, points=600)
+    network = with_lens_prior(network, truth.lens[0], f=100.0, cx=20.0, cy=20.0, k1=0.1)
+    other = truth.lens * values_of(LENS, f=focal - 1.0) + truth.lens + values_of(LENS, cx=centre_px)
+    moved_px = project(network, replace(truth, lens=other)) - project(network, truth)
+    second = network.flight[network.image] == 1
+    return adjusted(replace(network, xy_px=network.xy_px + moved_px * second[:, None]), truth, seed)
+
+
+@SEEDS
+def test_flights_of_one_lens_share_a_calibration(seed: int) -> None:
+    [one] = in_two_flights(seed, 1.0, 0.0).flight_lenses
+    assert (one.camera, one.flight) == (0, 1)
+    assert one.worth < 0.3
+
+
+@SEEDS
+def test_a_lens_that_was_focused_anew_is_another_one(seed: int) -> None:
+    found = in_two_flights(seed, 1.01, 8.0)
+    [one] = found.flight_lenses
+    assert one.worth > 1.0
+    assert one.change[LENS.index("f")] == pytest.approx(0.01 * found.state.lens[0, 0], rel=0.2)
+    assert one.change[LENS.index("cx")] == pytest.approx(8.0, abs=1.5)
+
+
+def test_a_flight_that_tells_nothing_of_its_lens_is_not_compared() -> None:
+    network, truth = flown(0)
+    network = with_lens_prior(network, truth.lens[0], f=100.0)
+    few = replace(network, flight=(np.arange(network.images) >= network.images - 3).astype(int))
+    assert adjusted(few, truth, 0).flight_lenses == ()

@@ -20,6 +20,7 @@ from aeromatch_cli.orientation.placing import (
     _terrain,
     _Vertical,
     _vertical,
+    delay_s,
     place,
     similarity,
 )
@@ -187,3 +188,15 @@ def test_headings_are_wrong_as_far_as_positions_tell_north(turned_deg: float, si
     found = believed_tilts(pycolmap, model, known)
     assert np.isfinite(found).all() == believed
     assert not believed or np.array_equal(found, ups)
+
+
+@pytest.mark.parametrize("late_s", [-0.4, 0.0, 0.5, 1.2])
+def test_a_delay_of_positions_is_found_roughly(late_s: float) -> None:
+    """Strips to and fro at 12 m/s: what a delay moves is no similarity."""
+    rng = np.random.default_rng(1)
+    centers_m = np.array([[20.0 * k, 30.0 * row, 100.0] for row in range(3) for k in range(6)])
+    velocities_m_s = np.array([[12.0 * (-1.0) ** row, 0.0, 0.0] for row in range(3) for _ in range(6)])
+    positions_m = centers_m + late_s * velocities_m_s + rng.normal(0.0, 0.02, centers_m.shape)
+    found_s = delay_s(in_model(centers_m), positions_m, velocities_m_s)
+    assert found_s == pytest.approx(late_s, abs=0.026)
+    assert delay_s(in_model(centers_m), positions_m, np.zeros_like(velocities_m_s)) == 0.0

@@ -257,3 +257,30 @@ def test_what_json_gets_is_plain() -> None:
         "views from one height do not determine it; two strips across, images from another height, or three control "
         "points determine it",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.16, "good"), (0.3, "doubtful"), (0.7, "bad")])
+def test_matches_that_the_block_contradicts_count(share: float, verdict: str) -> None:
+    quality = judged_with(contradicted=share)
+    assert quality.verdict == verdict
+    assert found(quality, "contradicted matches").value == share
+
+
+def test_images_of_which_most_matches_contradict_the_block_are_named() -> None:
+    quality = judged_with(contradicted=0.0, contradicting=["a", "b"])
+    assert quality.verdict == "doubtful"
+    assert "of 2 of 12 images contradict the adjusted block (a, b)" in quality.faults[0].sentence
+
+
+@pytest.mark.parametrize(("parts", "verdict"), [([12], "good"), ([10, 2], "good"), ([6, 6], "doubtful")])
+def test_parts_that_single_points_tie_are_doubtful(parts: list[int], verdict: str) -> None:
+    assert judged_with(adjust={"tied_parts": parts}).verdict == verdict
+
+
+def test_flights_of_a_camera_with_calibrations_of_their_own_are_named() -> None:
+    flights = [{"flight": "B", "images": 6, "change": {"f": 12.04, "cx": -3.0}, "worth": 4.0}]
+    calibration = {"calibration": {"1": {**CALIBRATED, "flights": flights}}}
+    [fault] = judged_with(group=calibration).faults
+    assert fault.level == "doubtful"
+    assert "has another calibration in flight B (6 images)" in fault.sentence
+    assert "f by +12.0 px, cx by -3.0 px, cy by +0.0 px" in fault.sentence

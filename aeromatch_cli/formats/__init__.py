@@ -116,7 +116,8 @@ deviations that were stated, each axis in its own. All are empty where nothing w
 
 - `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
 - `facts`: `images`, `points`, `track_length` (images per point, mean), `held_by_pairs` (images with fewer than 20
-  points that three images see), `reprojection_error_px` (mean), `ground_pixel_m` (what a pixel is on the ground,
+  points that three images see), `tied_parts` (sizes of the parts within which pairs of images that share 20 points
+  connect them), `reprojection_error_px` (mean), `ground_pixel_m` (what a pixel is on the ground,
   median, null in a frame without metres), `reduced` (stored pixels in a pixel of the pictures that keypoints were found
   in), `positions_given` (images), `sigma_position_m` (median over the images whose frame has metres, else null),
   `sigma_angle_deg` (median), `groups` (see below), `outside` (image_id -> why it is not oriented), `cameras` (camera_id
@@ -143,7 +144,9 @@ deviations that were stated, each axis in its own. All are empty where nothing w
     projection centre to the antenna, in the camera's frame): value, standard deviation.
   - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
     known before and its standard deviation, cx and cy from the corner of the first pixel; `correlations`: up to five
-    pairs above 0.9: two names, correlation.
+    pairs above 0.9: two names, correlation; `flights`: of its flights but the largest that tell of a lens, `flight`,
+    `images`, `change` (name -> by how much a lens of its own differs) and `worth` (by how much that lowers the sum of
+    squares over what is asked for: above 1 the flights do not share a calibration).
   - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
     middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
     both are of), `pixel_m` (what a pixel is on the ground), `points`: x, y and standard deviation of points over the
@@ -284,7 +287,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 ### reports/<stage>.json, <stage>.i-of-n.json
 
-- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`.
+- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`, `facts_version` (facts of
+  another version are not read).
 - `failures`: [[item, reason], ...].
 - `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `pairs_sha256`.
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,

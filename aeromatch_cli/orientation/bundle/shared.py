@@ -42,7 +42,7 @@ def lenses_by_flight(network: Network, state: Unknowns, tolerance: float) -> lis
         solved = solve(split, start, tolerance, near=True)
         gain = 2.0 * (cost(network, state) - solved.cost)
         asked = _WORTH_SQUARES * np.count_nonzero(split.lens_sigmas[-1])
-        found.append(FlightLens(camera, flight, solved.state.lens[-1] - solved.state.lens[camera], gain / asked))
+        found.append(FlightLens(camera, flight, solved.state.lens[-1] - solved.state.lens[camera], float(gain / asked)))
     return found
 
 
