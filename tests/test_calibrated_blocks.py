@@ -186,7 +186,7 @@ def test_a_real_lens_of_which_exif_tells_the_focal_length_alone_is_calibrated() 
 
 
 def test_images_of_a_long_lens_stay_whose_distortion_has_a_parameter_beyond_one() -> None:
-    """COLMAP leaves out such cameras by default: k3 of 1.6 moves the corner of this picture by 1.5 % of its distance."""
+    """COLMAP leaves out such cameras by default. This k3 moves the corner of the picture by 1.5 % of its distance."""
     plain = real_lens(np.random.default_rng(SEED), WIDTH_PX, HEIGHT_PX)
     f, cx, cy = 1.5 * plain.params[0], *plain.params[1:3]
     lens = Camera(plain.model, WIDTH_PX, HEIGHT_PX, (f, cx, cy, 0.0, 0.0, 1.6, 0.0, 0.0, 0.0, 0.0))

@@ -138,8 +138,9 @@ deviations that were stated, each axis in its own. All are empty where nothing w
     `flights` (`flight`, `images`, `mean_m` and `scatter_m`: mean and standard deviation of the differences of each).
   - `flights`: those of which something was found: `flight` (its name, empty of images of none), `images`, `step_m` (of
     its heights above those of the flight of most images, taken out before), and of `shift_x`, `shift_y`, `shift_z`
-    (metres) and `lag_s` (seconds by which positions lag behind exposures) those that were unknowns: value, standard
-    deviation.
+    (metres), `lag_s` (seconds by which positions lag behind exposures), `slope_x` and `slope_y` (by how much heights of
+    positions rise to the east and north, metres per metre) those that were unknowns, slopes where they are clear:
+    value, standard deviation.
   - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
     projection centre to the antenna, in the camera's frame): value, standard deviation.
   - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
@@ -287,8 +288,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 ### reports/<stage>.json, <stage>.i-of-n.json
 
-- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`, `facts_version` (facts of
-  another version are not read).
+- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`,
+  `facts_version` (facts of another version are not read).
 - `failures`: [[item, reason], ...].
 - `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `pairs_sha256`.
 - `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,

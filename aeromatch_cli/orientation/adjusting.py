@@ -17,7 +17,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.orientation.bundle.adjust import Adjusted, Options, adjust
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, SLOPES, UNCORRECTED_M, Network, Unknowns
 from aeromatch_cli.orientation.bundle.of_model import (
     Lenses,
     image_numbers,
@@ -172,7 +172,8 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
         # What tilts or terrain say of the whole block, as observations of all images that together are as exact.
         levels[:, :2] = np.deg2rad(placement.level_sigma_deg) * np.sqrt(len(ids))
     now = rotations_of(model, ids)
-    outcome = _adjust(work, model, ids, given, counts, now, levels, np.zeros(6), held)
+    drifting = placement.by_tilts
+    outcome = _adjust(work, model, ids, given, counts, now, levels, np.zeros(6), held, drifting=drifting)
     if placement.kind == "level":  # its scale and place are those of an adjusted flying height
         _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
     return replace(outcome, placement=placement, steps_m=steps_m)
@@ -209,7 +210,8 @@ def adjust_in_place(
     if known.any():  # their mean is no better than what they have in common
         mount[:3] = np.deg2rad(min(_COMMON_DEG, float(np.median(given.sigmas_deg[rows][known]))))
     levels = np.repeat(sigmas[:, None], 3, axis=1)
-    return _adjust(work, model, ids, given, counts, given.rotations[rows], levels, mount, held)
+    attitudes = given.rotations[rows]
+    return _adjust(work, model, ids, given, counts, attitudes, levels, mount, held, drifting=bool(known.any()))
 
 
 def _adjust(
@@ -222,8 +224,11 @@ def _adjust(
     attitude_sigmas: FloatArray,
     mount_sigmas: FloatArray,
     held: Collection[int],
+    *,
+    drifting: bool,
 ) -> Outcome:
-    """counts: (N,) which positions are observations; attitudes (N, 3, 3) with standard deviations (N, 3), radians."""
+    """counts: (N,) which positions are observations; attitudes (N, 3, 3) with standard deviations (N, 3), radians.
+    drifting: whether heights of positions may have a slope in common."""
     rows = np.array(ids, dtype=int) - 1
     network, start, points, numbers = _network(work, model, given)
     count = len(numbers)
@@ -238,10 +243,25 @@ def _adjust(
         mount_sigmas=np.repeat(mount_sigmas[None], count, axis=0),
         held=np.zeros(len(ids), dtype=bool),
     )
+    if drifting:
+        network = _with_drifts(network)
     start = replace(start, lens=np.where(network.lens_sigmas > 0.0, start.lens, network.lens_prior))
     result = adjust(network, start, work.options)
     _take(work, model, ids, points, numbers, result.state)
     return Outcome(result, ids, points, numbers, np.unique(given.flights[rows]).tolist())
+
+
+def _with_drifts(network: Network) -> Network:
+    """The network with unknown slopes of the heights of flights whose receivers had no corrections: they drift by what
+    was stated from one side of the block to the other, and would tilt it against all measured angles."""
+    drifts = network.flight_sigmas.copy()
+    arms_m = np.linalg.norm(network.arms_m, axis=1)
+    for flight in range(network.flights):
+        own = network.located & (network.flight == flight)
+        sigma_m = float(np.median(network.position_sigmas_m[own, 2])) if own.any() else 0.0
+        if sigma_m > UNCORRECTED_M and arms_m[own].any():
+            drifts[flight, SLOPES] = sigma_m / (2.0 * arms_m[own].max())
+    return replace(network, flight_sigmas=drifts)
 
 
 def _free_sigmas(work: Work, network: Network, numbers: Sequence[int], held: Collection[int]) -> FloatArray:

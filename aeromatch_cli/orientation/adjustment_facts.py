@@ -13,12 +13,14 @@ from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.adjusting import Given, Outcome
 from aeromatch_cli.orientation.bundle.adjust import position_residuals_m
 from aeromatch_cli.orientation.bundle.covariance import Covariance, lens_correlations
-from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, SLOPES, Network, Unknowns
 
 # Correlations that are stated, and how many of them.
 _STRONG, _MOST_LISTED = 0.9, 5
 # Points whose heights stand for those of the whole block: so many, spread over it.
 _HEIGHTS = 150
+# Slopes of the heights of a flight are said that are so many of their standard deviations.
+_SIGNIFICANT = 3.0
 # Cells along the longer side of the map of expected errors of height.
 _CELLS = 12
 
@@ -115,9 +117,10 @@ def _flights(outcome: Outcome) -> list[dict[str, Any]]:
         images = [i for i, flight in zip(outcome.images, network.flight, strict=True) if flight == row]
         step_m = 0.0 if outcome.steps_m is None else float(outcome.steps_m[images[0] - 1])
         free = network.flight_sigmas[row] > 0.0
+        sigmas = np.zeros(6) if found is None else np.sqrt(np.maximum(np.diag(found.flight[row]), 0.0))
+        free[SLOPES] &= np.abs(state.flight[row, SLOPES]) > _SIGNIFICANT * sigmas[SLOPES]
         if not free.any() and step_m == 0.0:
             continue
-        sigmas = np.zeros(6) if found is None else np.sqrt(np.maximum(np.diag(found.flight[row]), 0.0))
         values = {FLIGHT[k]: [float(state.flight[row, k]), float(sigmas[k])] for k in np.flatnonzero(free)}
         listed.append({"flight": number, "images": len(images), "step_m": step_m, **values})
     return listed

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.orientation.bundle.network import UNCORRECTED_M
 
 # Without positions the median flying height becomes this many units.
 LOCAL_FLYING_HEIGHT = 100.0
@@ -66,7 +67,7 @@ class Placement:
     contradiction: why given positions were not used: "mirrored" (they fit only with the ground above the cameras),
     "scattered" (they do not fit), else "". level_sigma_deg: how exactly tilts or terrain say where up is. sigma_factor:
     standard deviations of the positions, as the pictures show them, over those stated. north_sigma_deg: how exactly
-    positions say where north is.
+    positions say where north is. by_tilts: whether measured tilts say where up is, not the terrain.
     """
 
     scale: float
@@ -78,6 +79,7 @@ class Placement:
     contradiction: str = ""
     level_sigma_deg: float = np.inf
     sigma_factor: float = 1.0
+    by_tilts: bool = False
     north_sigma_deg: float = np.inf
 
     def points(self, points: FloatArray) -> FloatArray:
@@ -120,10 +122,14 @@ def place(
     stated_m = float(np.median(sigmas_m[agreeing]))
     sigma_m = _sigma_m(found, found.points(centers[agreeing]) - used_m, used_m, stated_m)
     found = replace(found, sigma_factor=sigma_m / max(stated_m, 1e-9))
+    arms_m = np.linalg.norm(used_m[:, :2] - used_m[:, :2].mean(axis=0), axis=1)
     measured = _Measured(centers[agreeing], used_m, max(sigma_m, 1e-9))
-    if vertical is not by_terrain and _off_level(found, measured, by_terrain, vertical):
-        vertical = by_terrain
-    return _levelled(found, measured, vertical)[0]
+    # Against the terrain alone positions are as exact as they agree with each other.
+    drift = stated_m / (2.0 * arms_m.max()) if stated_m > UNCORRECTED_M and arms_m.any() else 0.0
+    drifting = replace(measured, drift=drift)
+    if vertical is by_terrain or _off_level(found, drifting, by_terrain, vertical):
+        return _levelled(found, measured, by_terrain)[0]
+    return _levelled(replace(found, by_tilts=True), drifting, vertical)[0]
 
 
 def height_steps_m(
@@ -191,11 +197,13 @@ class _Vertical:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Centres in the model (N, 3), their positions in the world (N, 3), and the standard deviation of these."""
+    """Centres in the model (N, 3), their positions in the world (N, 3), and the standard deviation of these; drift: of
+    the slope of their heights that receivers without corrections have in common, metres per metre."""
 
     centers: FloatArray
     positions_m: FloatArray
     sigma_m: float
+    drift: float = 0.0
 
     def fit(self, rotation: FloatArray) -> tuple[float, FloatArray]:
         """Scale and translation (3,) that go best with a rotation."""
@@ -364,30 +372,35 @@ def _off_level(found: Placement, measured: _Measured, by_terrain: _Vertical, by_
 def _levelled(found: Placement, measured: _Measured, vertical: _Vertical) -> tuple[Placement, FloatArray]:
     """The most probable attitude of the block, and the covariance (3, 3) of a small turn of it, square radian.
 
-    Positions, and tilts or terrain, which say where up is with their own standard deviation, are weighed against each
-    other by least squares. Positions along one line say nothing of the turn about it: what they fit best is chance
-    there, and no place to start from. So the search starts level, too.
+    Positions, whose heights may have a slope in common, and tilts or terrain, which say where up is with their own
+    standard deviation, are weighed against each other by least squares. Positions along one line say nothing of the
+    turn about it: what they fit best is chance there, and no place to start from. So the search starts level, too.
     """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    def off(turn: FloatArray, start: FloatArray) -> FloatArray:
+    arms_m = measured.positions_m[:, :2] - measured.positions_m[:, :2].mean(axis=0)
+
+    def off(unknowns: FloatArray, start: FloatArray) -> FloatArray:
+        turn, slopes = unknowns[:3], unknowns[3:]
         rotation = Rotation.from_rotvec(turn).as_matrix() @ start
+        positions = measured.off(rotation)
+        positions[:, 2] += measured.drift * (arms_m @ slopes) / measured.sigma_m
         up = rotation @ vertical.up
         away = np.cross(up, [0.0, 0.0, 1.0])[:2]
         if up[2] < 0.0:  # beyond a right angle the sine falls again
             away = away / max(float(np.linalg.norm(away)), 1e-9) * (1.0 - up[2])
-        return np.concatenate([measured.off(rotation).ravel(), away / np.deg2rad(vertical.sigma_deg)])
+        return np.concatenate([positions.ravel(), away / np.deg2rad(vertical.sigma_deg), slopes])
 
     best = np.inf, found.rotation
     for start in (_level_start(measured, vertical.up), found.rotation):
-        solved = least_squares(off, np.zeros(3), x_scale=0.1, args=(start,))
-        rotation = Rotation.from_rotvec(solved.x).as_matrix() @ start
+        solved = least_squares(off, np.zeros(5), x_scale=[0.1, 0.1, 0.1, 1.0, 1.0], args=(start,))
+        rotation = Rotation.from_rotvec(solved.x[:3]).as_matrix() @ start
         if solved.cost < best[0] and measured.fit(rotation)[0] > 0.0:  # a negative scale is a reflection
             best = solved.cost, rotation
     rotation = best[1]
-    slopes = least_squares(off, np.zeros(3), max_nfev=1, args=(rotation,)).jac  # of small turns from here
-    covariance = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(3))
+    small = least_squares(off, np.append(np.zeros(3), solved.x[3:]), max_nfev=1, args=(rotation,)).jac
+    covariance = np.linalg.inv(small.T @ small + 1e-9 * np.eye(5))[:3, :3]
     scale, translation_m = measured.fit(rotation)
     placed = replace(
         found, scale=scale, rotation=rotation, translation_m=translation_m, level_sigma_deg=vertical.sigma_deg,

@@ -16,8 +16,8 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.orientation.bundle.covariance import Covariance, covariance
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.normal_equations import residuals_in_sigmas
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, UNCORRECTED_M, Network, Unknowns
+from aeromatch_cli.orientation.bundle.normal_equations import off_by_flight_m, residuals_in_sigmas
 from aeromatch_cli.orientation.bundle.projection import project_with_derivatives
 from aeromatch_cli.orientation.bundle.shared import FlightLens, lenses_by_flight
 from aeromatch_cli.orientation.bundle.solve import solve
@@ -48,9 +48,6 @@ _SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS = 3.0, 0.5, 0.5
 # Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
 # their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
 _UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
-# Errors of a receiver without corrections are the same for minutes: where less exact positions than this were stated,
-# metres, what all of a flight have in common is no better than one of them.
-_UNCORRECTED_M = 0.5
 # Standard deviations of what may explain residuals, before the block is asked: shifts of a flight's positions, metres;
 # their delay, seconds; the lever arm, metres; the read-out of a shutter, seconds.
 _SHIFT_M, _LAG_S, _LEVER_M, _READOUT_S = 20.0, 1.0, 0.5, 0.03
@@ -109,7 +106,7 @@ def _with_common_errors(network: Network, stated: Network) -> Network:
     common = network.flight_sigmas.copy()
     for flight in range(network.flights):
         sigmas_m = stated.position_sigmas_m[network.located & (network.flight == flight)]
-        if len(sigmas_m) and np.median(sigmas_m) > _UNCORRECTED_M:
+        if len(sigmas_m) and np.median(sigmas_m) > UNCORRECTED_M:
             common[flight, :3] = np.maximum(common[flight, :3], np.median(sigmas_m, axis=0))
     return replace(network, flight_sigmas=common)
 
@@ -296,8 +293,8 @@ def position_residuals_m(network: Network, state: Unknowns) -> FloatArray:
     """(N, 3) measured minus adjusted positions, of the antenna and with what was found of the flight; NaN where there
     is none."""
     lever = np.einsum("nji,nj->ni", state.rotations, state.mount[network.camera, 3:])
-    flight = state.flight[network.flight]
-    expected = state.centers_m + lever + flight[:, :3] + network.velocities_m_s * flight[:, 3:4]
+    off_m = off_by_flight_m(state.flight[network.flight], network.velocities_m_s, network.arms_m)
+    expected = state.centers_m + lever + off_m
     return np.where(network.located[:, None], network.positions_m - expected, np.nan)
 
 

@@ -19,9 +19,15 @@ READOUT = LENS.index("readout_s")
 # Unknowns of what is mounted on a camera: the boresight, small angles in radians about the camera's axes by which
 # measured attitudes are off, and the lever arm, metres in the camera's frame from the projection centre to the antenna.
 MOUNT = ("boresight_x", "boresight_y", "boresight_z", "lever_x", "lever_y", "lever_z")
-# Unknowns of a flight: by how much its positions are off, metres in the world, and the time by which they lag behind
-# the exposures, seconds.
-FLIGHT = ("shift_x", "shift_y", "shift_z", "lag_s", "unused", "unused")
+# Unknowns of a flight: by how much its positions are off, metres in the world, the time by which they lag behind the
+# exposures, seconds, and how steeply their heights rise to the east and north against the true ones: the drift of a
+# receiver without corrections, metres per metre.
+FLIGHT = ("shift_x", "shift_y", "shift_z", "lag_s", "slope_x", "slope_y")
+SLOPES = slice(FLIGHT.index("slope_x"), FLIGHT.index("slope_y") + 1)
+
+# Errors of a receiver without corrections are the same for minutes and drift from one side of a block to the other by
+# what was stated: where less exact positions than this were, metres.
+UNCORRECTED_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +95,16 @@ class Network:
     def located(self) -> BoolArray:
         """(N,) whether an image has a position that counts."""
         return np.asarray(np.isfinite(self.positions_m).all(axis=1) & np.isfinite(self.position_sigmas_m).any(axis=1))
+
+    @property
+    def arms_m(self) -> FloatArray:
+        """(N, 2) from the middle of the positions of its flight to that of an image, east and north; 0 without one."""
+        arms_m = np.zeros((self.images, 2))
+        for flight in range(self.flights):
+            own = self.located & (self.flight == flight)
+            if own.any():
+                arms_m[own] = self.positions_m[own, :2] - self.positions_m[own, :2].mean(axis=0)
+        return arms_m
 
     @property
     def levelled(self) -> BoolArray:

@@ -15,7 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.geometry.rotations import cross_matrices
-from aeromatch_cli.orientation.bundle.network import Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import SLOPES, Network, Unknowns
 from aeromatch_cli.orientation.bundle.projection import project, project_with_derivatives
 
 if TYPE_CHECKING:
@@ -228,7 +228,8 @@ def _positions(network: Network, state: Unknowns, layout: Layout | None = None) 
     rotations, velocities = state.rotations[rows], network.velocities_m_s[rows]
     lever = state.mount[camera, 3:]
     antennas = state.centers_m[rows] + np.einsum("nji,nj->ni", rotations, lever)
-    off = antennas + state.flight[flight, :3] + velocities * state.flight[flight, 3:4] - network.positions_m[rows]
+    arms_m = network.arms_m[rows]
+    off = antennas + off_by_flight_m(state.flight[flight], velocities, arms_m) - network.positions_m[rows]
     scale = 1.0 / network.position_sigmas_m[rows]
     if layout is None:
         return off * scale, []
@@ -236,12 +237,21 @@ def _positions(network: Network, state: Unknowns, layout: Layout | None = None) 
     unit = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
     by_pose = np.concatenate([turned @ cross_matrices(lever), unit], axis=2) * ~network.held[rows, None, None]
     by_mount = np.concatenate([np.zeros_like(turned), turned], axis=2)
-    by_flight = np.concatenate([unit, velocities[:, :, None], np.zeros((len(rows), 3, 2))], axis=2)
+    rising = np.zeros((len(rows), 3, 2))
+    rising[:, 2] = arms_m
+    by_flight = np.concatenate([unit, velocities[:, :, None], rising], axis=2)
     by_mount = by_mount * (network.mount_sigmas[camera] > 0.0)[:, None, :]
     by_flight = by_flight * (network.flight_sigmas[flight] > 0.0)[:, None, :]
     numbers = rows, layout.mount(camera), layout.flight(flight)
     parts = by_pose, by_mount, by_flight
     return off * scale, [(n, part * scale[:, :, None]) for n, part in zip(numbers, parts, strict=True)]
+
+
+def off_by_flight_m(flight: FloatArray, velocities_m_s: FloatArray, arms_m: FloatArray) -> FloatArray:
+    """(R, 3) by how much positions are off by what was found of their flights (R, 6). arms_m: (R, 2), `arms_m`."""
+    off_m = flight[:, :3] + velocities_m_s * flight[:, 3:4]
+    off_m[:, 2] += (arms_m * flight[:, SLOPES]).sum(axis=1)
+    return off_m
 
 
 def _attitudes(network: Network, state: Unknowns, layout: Layout | None = None) -> tuple[FloatArray, _Derivatives]:
