@@ -61,13 +61,16 @@ class AdjustedPose:
     """A pose as a bundle adjustment leaves it.
 
     center_m: (3,) in the world frame; rotation: (3, 3) cam_from_world. sigmas_m, sigmas_deg: (3,) standard deviations
-    of x, y, z and of omega, phi, kappa; NaN where they are not known.
+    of x, y, z and of omega, phi, kappa; NaN where they are not known. sweep_m: (3,) by how much the centre moves in the
+    world between the exposures of the first row and the last, zero of a shutter that exposes all at once; center_m is
+    that of the middle row.
     """
 
     center_m: FloatArray
     rotation: FloatArray
     sigmas_m: FloatArray
     sigmas_deg: FloatArray
+    sweep_m: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)

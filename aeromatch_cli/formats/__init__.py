@@ -169,7 +169,8 @@ deviations that were stated, each axis in its own. All are empty where nothing w
 N images, P points, O observations, C cameras.
 
 - `images` (N,) str: image_id. `frames` (N,) int32: number of its group's own frame, 0 in the world. `rotations`
-  (N, 3, 3), `centers_m` (N, 3), `sigmas_m` (N, 3), `sigmas_deg` (N, 3: omega, phi, kappa): float64.
+  (N, 3, 3), `centers_m` (N, 3), `sigmas_m` (N, 3), `sigmas_deg` (N, 3: omega, phi, kappa), `sweeps_m` (N, 3: by how
+  much the centre moves while a rolling shutter reads the picture, first row to last): float64.
 - `points_m` (P, 3), `errors_px` (P,) float64: triangulated points and their mean reprojection errors.
 - `track_images`, `track_keypoints`, `track_points` (O,) int32: row of `images`, keypoint of that image, row of
   `points_m`.

@@ -13,7 +13,7 @@ from aeromatch_cli.formats.archives import load_arrays, save_arrays
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 
-_POSES = ("rotations", "centers_m", "sigmas_m", "sigmas_deg")
+_POSES = ("rotations", "centers_m", "sigmas_m", "sigmas_deg", "sweeps_m")
 _REST = (
     "images",
     "frames",
@@ -42,6 +42,7 @@ def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
         centers_m=_rows([p.center_m for p in poses]),
         sigmas_m=_rows([p.sigmas_m for p in poses]),
         sigmas_deg=_rows([p.sigmas_deg for p in poses]),
+        sweeps_m=_rows([p.sweep_m for p in poses]),
         frames=np.array([adjusted.frames.get(i, 0) for i in ids], dtype=np.int32),
         points_m=adjusted.points_m,
         errors_px=adjusted.errors_px,
@@ -63,8 +64,8 @@ def read_adjusted(path: Path) -> AdjustedBlock:
         cameras[str(name)] = Camera(model, int(width), int(height), tuple(map(float, str(params).split())))
     parts = zip(*(arrays[name] for name in _POSES), strict=True)
     poses = {
-        name: AdjustedPose(center_m, rotation, sigmas_m, sigmas_deg)
-        for name, (rotation, center_m, sigmas_m, sigmas_deg) in zip(ids, parts, strict=True)
+        name: AdjustedPose(center_m, rotation, sigmas_m, sigmas_deg, sweep_m)
+        for name, (rotation, center_m, sigmas_m, sigmas_deg, sweep_m) in zip(ids, parts, strict=True)
     }
     both = np.column_stack([arrays["track_keypoints"], arrays["track_points"]]).astype(np.int32)
     ends = np.searchsorted(arrays["track_images"], np.arange(len(ids) + 1))  # written image by image

@@ -152,7 +152,7 @@ def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: 
             frame = 1 + max(frames.values(), default=0)
             frames |= {image_ids[number - 1]: frame for number in arrays["images"]}
         of_image = rows_by_number(arrays["track_images"])
-        parts = (arrays[name] for name in ("images", "centers_m", "rotations", "sigmas_m", "sigmas_deg"))
+        parts = (arrays[name] for name in ("images", "centers_m", "rotations", "sigmas_m", "sigmas_deg", "sweeps_m"))
         for number, *pose in zip(*parts, strict=True):
             own = of_image.get(int(number), np.zeros(0, dtype=np.int64))
             keypoints, points = arrays["track_keypoints"][own], arrays["track_points"][own] + first

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -36,6 +36,7 @@ from aeromatch_cli.orientation.adjusting import (
 from aeromatch_cli.orientation.adjustment_facts import adjustment_facts
 from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
+from aeromatch_cli.orientation.bundle.network import READOUT
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
 from aeromatch_cli.orientation.control_adjustment import Surveyed, with_control
 from aeromatch_cli.orientation.joining import Part, joined
@@ -118,7 +119,8 @@ def refine(folder: Path) -> None:
         held |= lenses.keys()
         name = f"model{len(facts)}.npz"
         deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
-        np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations)
+        sweeps_m = _sweeps_m(model, given, lenses)
+        np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations, sweeps_m=sweeps_m)
         metric, known = group["kind"] != "level", dict[str, Any]()
         if outcome is not None:
             known = adjustment_facts(outcome, observed, metric=metric) | {"control": control}
@@ -148,6 +150,13 @@ def _deviations(model: Any, given: Given, outcome: Outcome | None) -> dict[str, 
         "sigmas_m": np.array([sigmas_m[row[i]] if i in row else unknown for i in ids]),
         "sigmas_deg": np.array([sigmas_deg[row[i]] if i in row else unknown for i in ids]),
     }
+
+
+def _sweeps_m(model: Any, given: Given, lenses: Mapping[int, FloatArray]) -> FloatArray:
+    """(N, 3) by how much projection centres move while a picture is read."""
+    ids = image_numbers(model)
+    seconds = np.array([lenses[int(model.images[i].camera_id)][READOUT] for i in ids])
+    return np.asarray(seconds[:, None] * given.velocities_m_s[np.array(ids) - 1])
 
 
 def _joined_groups(work: Work, folder: Path, groups: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

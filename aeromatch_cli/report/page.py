@@ -21,6 +21,7 @@ from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.orientation.quality import Finding, Quality, plain
+from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,
     Adjustment,
@@ -205,7 +206,10 @@ def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock |
     def keypoints_px(image_id: str) -> FloatArray:
         return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
-    return camera_sections(adjustment.facts, adjusted, context.block.images, keypoints_px)
+    lenses = {**context.block.cameras, **adjusted.cameras}
+    cameras = {image.image_id: lenses[image.camera_id] for image in context.block.images}
+    seen_px = at_once(adjusted, cameras, keypoints_px)
+    return camera_sections(adjustment.facts, adjusted, context.block.images, seen_px)
 
 
 def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:

@@ -140,7 +140,7 @@ def _remove(context: Context) -> None:
 
 
 def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResidual]:
-    keypoints_px = contents_of(context).keypoints_px
+    keypoints_px = contents_of(context, adjusted).keypoints_px
     return residuals_of(adjusted, context.observed.poses, context.block.images, keypoints_px)
 
 

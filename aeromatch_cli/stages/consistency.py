@@ -72,7 +72,7 @@ def run(context: Context) -> StageReport:
         of_ids = {**context.block.cameras, **adjusted.cameras}
         cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
-        keypoints_px = contents_of(context).keypoints_px
+        keypoints_px = contents_of(context, adjusted).keypoints_px
         pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]
         limits = Limits(
             recipe.epipolar_px, recipe.medians, recipe.third_image_px, recipe.min_probability, recipe.min_matches

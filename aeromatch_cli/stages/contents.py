@@ -13,6 +13,7 @@ from aeromatch_cli.errors import BrokenFileError, InputError
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
+from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
@@ -43,7 +44,8 @@ def contents_of(
 ) -> ExportContents:
     """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time.
 
-    verified: where the verified matches come from.
+    adjusted: keypoints are those that its poses see, without what a rolling shutter has moved. verified: where the
+    verified matches come from.
     """
 
     def keypoints_px(image_id: str) -> FloatArray:
@@ -74,6 +76,9 @@ def _contents(
         return np.column_stack([geographic_from_grid(block.crs, places_m[:, :2]), places_m[:, 2]])
 
     known = None if block.crs == LOCAL else geographic
+    if adjusted is not None:
+        lenses = {**block.cameras, **adjusted.cameras}
+        keypoints_px = at_once(adjusted, {i.image_id: lenses[i.camera_id] for i in block.images}, keypoints_px)
     path = context.workspace.residuals
     residuals = read_residuals(path, block.images) if adjusted is not None and path.is_file() else {}
     return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals)
