@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +16,8 @@ from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, project
 from aeromatch_cli.orientation.calibration import lens_of
 from aeromatch_cli.orientation.mapping import Group, refine_block
+from aeromatch_cli.orientation.residuals import residuals_of
+from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 from aeromatch_cli.synthetic.lenses import real_lens
 
@@ -87,6 +90,12 @@ def rolled(block: SimulatedBlock, readout_s: float, speed_m_s: float) -> Simulat
     )
 
 
+def residual_px(block: SimulatedBlock, found: AdjustedBlock, keypoints_px: Callable[[str], FloatArray]) -> float:
+    """Median over images of mean reprojection errors."""
+    rows = residuals_of(found, {}, block.contents.block.images, keypoints_px)
+    return float(np.median([row.error_px for row in rows.values()]))
+
+
 def surveyed(
     block: SimulatedBlock, count: int, off_m: dict[int, FloatArray]
 ) -> tuple[tuple[ControlPoint, ...], list[int]]:
@@ -142,14 +151,18 @@ def test_every_third_image_of_a_block_is_met_as_well() -> None:
 
 @pytest.mark.parametrize(("readout_ms", "speed_m_s"), [(0.0, 8.0), (20.0, 10.0), (30.0, 8.0)])
 def test_the_read_out_of_a_rolling_shutter_is_found_where_there_is_one(readout_ms: float, speed_m_s: float) -> None:
-    block = simulate(SCENE, "cross", 12, "rtk2cm", SEED, tie_points=400)
-    _, facts = adjusted(rolled(block, readout_ms / 1000.0, speed_m_s))
+    """And what the shutter has moved is taken from the keypoints: residuals are those of the measurement (0.3 px)."""
+    block = rolled(simulate(SCENE, "cross", 12, "rtk2cm", SEED, tie_points=400), readout_ms / 1000.0, speed_m_s)
+    result, facts = adjusted(block)
     [calibration] = facts["calibration"].values()
     found = calibration["parameters"].get("readout_s")
     if readout_ms == 0.0:
         assert found is None
     else:
         assert found[0] == pytest.approx(readout_ms / 1000.0, rel=0.1)
+        assert residual_px(block, result, block.contents.keypoints_px) > 0.8
+    cameras = {image_id: result.cameras[block.camera_of[image_id]] for image_id in result.poses}
+    assert residual_px(block, result, at_once(result, cameras, block.contents.keypoints_px)) < 0.4
 
 
 def test_control_points_place_a_block_and_a_wrong_one_is_named() -> None:
