@@ -175,7 +175,9 @@ def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -
     drifting = placement.by_tilts
     outcome = _adjust(work, model, ids, given, counts, now, levels, np.zeros(6), held, drifting=drifting)
     if placement.kind == "level":  # its scale and place are those of an adjusted flying height
-        _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
+        again = _placed(work.pycolmap, model, ids, positions_m, sigmas_m, given.ups[rows])
+        if again.kind == "positions":  # which only the lenses had hidden, as they were before
+            return adjusted(work, model, given, held)
     return replace(outcome, placement=placement, steps_m=steps_m)
 
 
@@ -252,15 +254,15 @@ def _adjust(
 
 
 def _with_drifts(network: Network) -> Network:
-    """The network with unknown slopes of the heights of flights whose receivers had no corrections: they drift by what
-    was stated from one side of the block to the other, and would tilt it against all measured angles."""
+    """The network with unknown slopes of the heights of flights whose receivers had no corrections: errors at two ends
+    of the block are as large as stated and have little in common, and would tilt it against all measured angles."""
     drifts = network.flight_sigmas.copy()
     arms_m = np.linalg.norm(network.arms_m, axis=1)
     for flight in range(network.flights):
         own = network.located & (network.flight == flight)
         sigma_m = float(np.median(network.position_sigmas_m[own, 2])) if own.any() else 0.0
         if sigma_m > UNCORRECTED_M and arms_m[own].any():
-            drifts[flight, SLOPES] = sigma_m / (2.0 * arms_m[own].max())
+            drifts[flight, SLOPES] = sigma_m / (np.sqrt(2.0) * arms_m[own].max())
     return replace(network, flight_sigmas=drifts)
 
 

@@ -125,9 +125,11 @@ def place(
     arms_m = np.linalg.norm(used_m[:, :2] - used_m[:, :2].mean(axis=0), axis=1)
     measured = _Measured(centers[agreeing], used_m, max(sigma_m, 1e-9))
     # Against the terrain alone positions are as exact as they agree with each other.
-    drift = stated_m / (2.0 * arms_m.max()) if stated_m > UNCORRECTED_M and arms_m.any() else 0.0
+    drift = stated_m / (np.sqrt(2.0) * arms_m.max()) if stated_m > UNCORRECTED_M and arms_m.any() else 0.0
     drifting = replace(measured, drift=drift)
-    if vertical is by_terrain or _off_level(found, drifting, by_terrain, vertical):
+    # Tilts that the terrain agrees with are no error of the mounting, however steeply such positions rise.
+    confirmed = drift > 0.0 and _agree(by_terrain, vertical)
+    if vertical is by_terrain or (not confirmed and _off_level(found, drifting, by_terrain, vertical)):
         return _levelled(found, measured, by_terrain)[0]
     return _levelled(replace(found, by_tilts=True), drifting, vertical)[0]
 
@@ -358,6 +360,11 @@ def _common(errors_m: FloatArray, places_m: FloatArray) -> float:
     others = np.where(near[:, 0] == np.arange(len(near)), near[:, 1], near[:, 0])  # two may lie in one place
     nearest = errors_m[others]
     return float((errors_m * nearest).sum() / max((errors_m**2).sum(), 1e-12))
+
+
+def _agree(first: _Vertical, second: _Vertical) -> bool:
+    apart_deg = np.rad2deg(np.arccos(np.clip(first.up @ second.up, -1.0, 1.0)))
+    return bool(apart_deg <= _AGREE_SIGMAS * np.hypot(first.sigma_deg, second.sigma_deg))
 
 
 def _off_level(found: Placement, measured: _Measured, by_terrain: _Vertical, by_tilts: _Vertical) -> bool:

@@ -25,8 +25,8 @@ MOUNT = ("boresight_x", "boresight_y", "boresight_z", "lever_x", "lever_y", "lev
 FLIGHT = ("shift_x", "shift_y", "shift_z", "lag_s", "slope_x", "slope_y")
 SLOPES = slice(FLIGHT.index("slope_x"), FLIGHT.index("slope_y") + 1)
 
-# Errors of a receiver without corrections are the same for minutes and drift from one side of a block to the other by
-# what was stated: where less exact positions than this were, metres.
+# Errors of a receiver without corrections are the same for seconds and drift within minutes: where less exact positions
+# than this were stated, metres.
 UNCORRECTED_M = 0.5
 
 
