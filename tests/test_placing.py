@@ -202,16 +202,19 @@ def test_a_delay_of_positions_is_found_roughly(late_s: float) -> None:
     assert delay_s(in_model(centers_m), positions_m, np.zeros_like(velocities_m_s)) == 0.0
 
 
-@pytest.mark.parametrize(("stated_m", "most_deg", "least_deg"), [(5.0, 1.5, 0.0), (0.05, 7.0, 5.0)])
+@pytest.mark.parametrize(
+    ("stated_m", "rise_deg", "least_deg", "most_deg"),
+    [(5.0, 6.0, 0.0, 1.5), (5.0, 17.0, 0.0, 3.0), (0.05, 6.0, 5.0, 7.0)],
+)
 def test_measured_tilts_outweigh_the_drift_of_a_receiver_without_corrections(
-    stated_m: float, most_deg: float, least_deg: float
+    stated_m: float, rise_deg: float, least_deg: float, most_deg: float
 ) -> None:
-    """Heights that rise by 6 degrees to the north; with corrections they do not drift, and count."""
+    """Heights that rise to the north over flat ground; with corrections they do not drift, and count."""
     rng = np.random.default_rng(2)
     centers_m = np.array([[20.0 * k, 25.0 * row, 100.0] for row in range(4) for k in range(4)])
     ground_m = np.column_stack([rng.uniform(-30, 90, 200), rng.uniform(-30, 100, 200), rng.normal(0.0, 1.0, 200)])
     positions_m = centers_m + rng.normal(0.0, 0.02, centers_m.shape)
-    positions_m[:, 2] += np.tan(np.deg2rad(6.0)) * centers_m[:, 1]
+    positions_m[:, 2] += np.tan(np.deg2rad(rise_deg)) * centers_m[:, 1]
     turns = Rotation.from_rotvec(rng.normal(0.0, 1.0, (16, 3)), degrees=True).as_matrix()
     ups = turns[:, :, 2] @ MODEL_FROM_WORLD.T
     found = place(in_model(centers_m), in_model(ground_m), positions_m, np.full(16, stated_m), ups)
