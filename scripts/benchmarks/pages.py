@@ -58,6 +58,7 @@ PAGES: Mapping[str, str] = {
     "bench_lightglue_speed": "lightglue.md",
     "bench_lightglue_speed_float32": "lightglue.md",
     "bench_calibration": "calibration.md",
+    "bench_calibration_peers": "calibration.md",
     "bench_quality": "quality.md",
     "bench_orient": "orient.md",
     "bench_orient_thinned": "orient.md",
