@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_bands, write_image
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import IFDRational
 
 from aeromatch_cli.blocks.exif import exif_or_reason, read_exif
@@ -251,3 +255,127 @@ def test_serial_number_offset_of_the_clock_and_speed(tmp_path: Path) -> None:
     assert (facts.serial, facts.camera_serial, facts.lens) == ("", "", "24 mm f/2.8 77")
     facts = read_exif(write_image(tmp_path / "a.jpg"))
     assert (facts.serial, facts.utc_offset, facts.speed_m_s) == ("", "", None)
+
+
+_GIMBAL = DJI_XMP.format(yaw="10", pitch="-89", roll="1", relative="40")
+_GIMBAL_ANGLES = CameraAngles(10.0, -89.0, 1.0, "gimbal")
+_USED = "XMP block is malformed: what can be read of it is used"
+
+
+def write_segments(path: Path, *segments: bytes) -> Path:
+    """A JPEG with these APP1 segments, in this order."""
+    data = write_image(path).read_bytes()
+    parts = b"".join(b"\xff\xe1" + struct.pack(">H", len(one) + 2) + one for one in segments)
+    path.write_bytes(data[:2] + parts + data[2:])
+    return path
+
+
+def exif_segment(main: dict[int, object], gps: dict[int, object] | None = None) -> bytes:
+    tags = Image.Exif()
+    tags.update(main)
+    tags.get_ifd(0x8825).update(gps or {})
+    return tags.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("drone-dji:Rel", 'drone-dji:SelfData="A&B" drone-dji:Rel'),
+        ("drone-dji:Rel", 'drone-dji:CameraSerialNumber="1ZN\1" drone-dji:Rel'),
+        ("drone-dji:Rel", 'crs:Version="7.0" drone-dji:Rel'),
+        ("</rdf:RDF>", "<broken></rdf:RDF>"),
+        ("</rdf:RDF></x:xmpmeta>", ""),
+        (' xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"', ""),
+        ("<x:xmpmeta", '<?xml version="1.0" encoding="UTF-8"?><x:xmpmeta crs:a="b&c"'),
+    ],
+)
+def test_what_can_be_read_of_malformed_xmp_counts(tmp_path: Path, old: str, new: str) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_GIMBAL.replace(old, new)))
+    assert facts.angles == _GIMBAL_ANGLES
+    assert facts.relative_altitude_m == 40.0
+    assert facts.notes == (_USED,)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("drone-dji:", "dji:"),
+        ("http://www.dji.com/drone-dji/1.0/", "http://ns.dji.com/drone-dji/2.0"),
+        ("http://www.dji.com/drone-dji/1.0/", "http://www.autelrobotics.com/flight/1.0/"),
+        ('drone-dji:GimbalYawDegree="10"', "drone-dji:GimbalYawDegree='10'"),
+    ],
+)
+def test_other_prefixes_and_namespaces(tmp_path: Path, old: str, new: str) -> None:
+    xmp = _GIMBAL.replace("xmlns:drone-dji", "xmlns:dji") if old == "drone-dji:" else _GIMBAL
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp.replace(old, new)))
+    assert (facts.angles, facts.relative_altitude_m, facts.notes) == (_GIMBAL_ANGLES, 40.0, ())
+
+
+@pytest.mark.parametrize("code", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig", "latin-1"])
+def test_encodings_of_packets(tmp_path: Path, code: str) -> None:
+    packet = _GIMBAL.replace("drone-dji:Rel", 'drone-dji:Place="M\u00fcnchen" drone-dji:Rel').encode(code)
+    facts = read_exif(write_segments(tmp_path / "a.jpg", b"http://ns.adobe.com/xap/1.0/\0" + packet))
+    assert facts.angles == _GIMBAL_ANGLES
+    text = PngInfo()
+    text.add(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + packet)
+    Image.new("L", (40, 30)).save(tmp_path / "a.png", pnginfo=text)
+    assert read_exif(tmp_path / "a.png").angles == _GIMBAL_ANGLES
+
+
+def test_properties_of_all_packets_count(tmp_path: Path) -> None:
+    head = b"http://ns.adobe.com/xap/1.0/\0"
+    other = _RDF.format(spaces='xmlns:xmp="http://ns.adobe.com/xap/1.0/"', body="<xmp:Rating>3</xmp:Rating>").encode()
+    for packets in ((_GIMBAL.encode(), other), (other, _GIMBAL.encode())):
+        facts = read_exif(write_segments(tmp_path / "a.jpg", *(head + packet for packet in packets)))
+        assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())
+
+
+def test_extended_xmp_is_put_together(tmp_path: Path) -> None:
+    packet, guid = _GIMBAL.encode(), b"A" * 32
+    head = b"http://ns.adobe.com/xmp/extension/\0" + guid + struct.pack(">I", len(packet))
+    cut = len(packet) // 2
+    parts = [head + struct.pack(">I", start) + packet[start:end] for start, end in ((cut, None), (0, cut))]
+    facts = read_exif(write_segments(tmp_path / "a.jpg", *parts))
+    assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())
+
+
+def test_several_segments_of_exif(tmp_path: Path) -> None:
+    first, second = (
+        exif_segment({272: "First"}),
+        exif_segment({272: "Second", 271: "Maker"}, gps_tags(46.0, 7.0, 500.0)),
+    )
+    facts = read_exif(write_segments(tmp_path / "a.jpg", first, second))
+    assert (facts.model, facts.make, facts.latitude_deg, facts.altitude_m) == ("First", "Maker", 46.0, 500.0)
+    cut = len(second) // 2
+    facts = read_exif(write_segments(tmp_path / "b.jpg", second[:cut], b"Exif\0\0" + second[cut:]))
+    assert (facts.model, facts.latitude_deg, facts.notes) == ("Second", 46.0, ())
+    facts = read_exif(write_segments(tmp_path / "c.jpg", b"exif\0\0" + second[6:]))
+    assert (facts.model, facts.latitude_deg) == ("Second", 46.0)
+
+
+def test_tags_of_a_png_in_every_form(tmp_path: Path) -> None:
+    exif = exif_segment({272: "Model"}, gps_tags(46.0, 7.0, 500.0))
+    path = tmp_path / "a.png"
+
+    def profile(name: str, data: bytes) -> bytes:
+        digits = data.hex().encode()
+        lines = b"\n".join(digits[start : start + 72] for start in range(0, len(digits), 72))
+        return (
+            f"Raw profile type {name}".encode()
+            + b"\0\0"
+            + zlib.compress(b"\n%s\n%8d\n" % (name.encode(), len(data)) + lines)
+        )
+
+    packed = b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(_GIMBAL.encode())
+    in_app1 = b"http://ns.adobe.com/xap/1.0/\0" + _GIMBAL.encode()
+    for own, chunks in (
+        (exif, ((b"iTXt", packed),)),
+        (None, ((b"zTXt", profile("exif", exif)), (b"zTXt", profile("xmp", _GIMBAL.encode())))),
+        (None, ((b"zTXt", profile("APP1", exif)), (b"zTXt", profile("APP1", in_app1)))),
+    ):
+        text = PngInfo()
+        for kind, data in chunks:
+            text.add(kind, data)
+        Image.new("L", (40, 30)).save(path, pnginfo=text, exif=own)
+        facts = read_exif(path)
+        assert (facts.model, facts.latitude_deg, facts.angles, facts.notes) == ("Model", 46.0, _GIMBAL_ANGLES, ())

@@ -14,7 +14,7 @@ from PIL import Image as Picture
 from PIL.PngImagePlugin import PngImageFile, PngInfo
 
 from aeromatch_cli.blocks.exif import exif_or_reason
-from aeromatch_cli.blocks.png import late_chunks
+from aeromatch_cli.blocks.packets import png_packets
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import normalise
@@ -357,7 +357,7 @@ def test_tags_behind_the_pixels_of_a_png_are_read_without_decoding(
     facts = exif_or_reason(path)
     assert not isinstance(facts, str)
     assert facts.model == "Model X"
-    assert late_chunks(path)["xmp"].startswith(b"<x:xmpmeta")
+    assert png_packets(path).xmp[0].startswith(b"<x:xmpmeta")
     plain = exif_or_reason(_claiming(tmp_path / "plain.png", 20_000, 20_000))
     assert not isinstance(plain, str)
     assert (plain.width_px, plain.model) == (20_000, "")

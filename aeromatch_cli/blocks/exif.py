@@ -17,7 +17,7 @@ from typing import Any
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
-from aeromatch_cli.blocks.png import late_chunks
+from aeromatch_cli.blocks.packets import Packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     ALTITUDES,
     LATITUDES,
@@ -97,13 +97,13 @@ class ExifFacts:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: the packet, if any."""
+    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: packets."""
 
     size_px: tuple[int, int]
     main: Mapping[int, Any]
     exif: Mapping[int, Any]
     gps: Mapping[int, Any]
-    xmp: Any
+    xmp: tuple[Any, ...]
 
 
 def read_exif(path: Path) -> ExifFacts:
@@ -119,7 +119,7 @@ def read_exif(path: Path) -> ExifFacts:
     tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
-    orientation = tag_number(tags.get(_ORIENTATION)) or 1.0
+    orientation = tag_number(tags.get(_ORIENTATION)) or tag_number(xmp.get("tiff:Orientation")) or 1.0
     body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
     return ExifFacts(
         width_px=width_px,
@@ -168,22 +168,16 @@ def _header(path: Path, notes: list[str]) -> _Header:
     try:
         with Image.open(path) as image:
             if image.format == "PNG":
-                image.info |= {name: value for name, value in late_chunks(path).items() if name not in image.info}
-
-            def table() -> Image.Exif:
-                # A PNG's own method decodes all pixels in search of what may stand behind them.
-                return Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
-
-            readers: tuple[Callable[[], Mapping[int, Any]], ...] = (
-                lambda: dict(table()),
-                lambda: dict(table().get_ifd(_EXIF_IFD)),
-                lambda: dict(table().get_ifd(_GPS_IFD)),
-            )
-            main, exif, gps = _tables(readers, notes)
-            # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
-            size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
-            packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or main.get(_XMP_PACKET)
-            return _Header(size_px, main, exif, gps, packet)
+                packets = png_packets(path)
+            elif image.format in ("JPEG", "MPO"):
+                packets = jpeg_packets(getattr(image, "applist", ()))
+            else:
+                main, exif, gps = _tables(_readers(image.getexif), notes)
+                # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
+                size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
+                return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET),))
+            main, exif, gps = _tables_of(packets, notes)
+            return _Header(image.size, main, exif, gps, tuple(packets.xmp))
     except UnidentifiedImageError as error:
         if path.suffix.lower() not in gdal.SUFFIXES:
             raise _unreadable(path) from error
@@ -204,7 +198,7 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
     except ItemError as error:
         raise _unreadable(path) from error
     if path.suffix.lower() not in gdal.TIFF:
-        return _Header(size_px, {}, {}, {}, None)
+        return _Header(size_px, {}, {}, {}, ())
     with path.open("rb") as stream:
         magic = stream.read(16)
         magic = magic if magic[2:3] == b"+" else magic[:8]  # BigTIFF is version 43, and its offsets have 8 bytes
@@ -218,11 +212,16 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
             return dict(directory)
 
         main, exif, gps = _tables([partial(table, pointer) for pointer in (None, _EXIF_IFD, _GPS_IFD)], notes)
-    return _Header(size_px, main, exif, gps, main.get(_XMP_PACKET))
+    return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET),))
 
 
 def _unreadable(path: Path) -> ItemError:
     return ItemError(f"{path.name}: not a readable image (damaged header or another format)")
+
+
+def _readers(table: Callable[[], Any]) -> tuple[Callable[[], Mapping[int, Any]], ...]:
+    """Of main, EXIF and GPS tags. table: makes Pillow's, which reads what it is asked for."""
+    return lambda: dict(table()), lambda: dict(table().get_ifd(_EXIF_IFD)), lambda: dict(table().get_ifd(_GPS_IFD))
 
 
 def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]) -> list[Mapping[int, Any]]:
@@ -234,6 +233,22 @@ def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]
         except _BROKEN:
             tables.append({})
             notes.append(f"{label} tags are damaged")
+    return tables
+
+
+def _tables_of(packets: Packets, notes: list[str]) -> list[Mapping[int, Any]]:
+    """The same of blocks of Exif: of a tag that several state the first block counts."""
+    from PIL import Image
+
+    tables: list[Mapping[int, Any]] = [{}, {}, {}]
+    for block in packets.exif:
+        exif = Image.Exif()
+
+        def table(exif: Image.Exif = exif, block: bytes = block) -> Image.Exif:
+            exif.load(block)  # once: what it has loaded it knows
+            return exif
+
+        tables = [{**later, **first} for first, later in zip(tables, _tables(_readers(table), notes), strict=True)]
     return tables
 
 
