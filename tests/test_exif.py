@@ -119,7 +119,7 @@ def test_png_without_tags(tmp_path: Path) -> None:
     ("change", "note"),
     [
         ({2: (IFDRational(46, 0), IFDRational(0, 0), IFDRational(0, 0))}, "incomplete"),
-        ({1: ""}, "incomplete"),
+        ({1: "X"}, "incomplete"),
         ({2: (95.0, 0.0, 0.0)}, "incomplete"),
         ({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)}, "(0, 0)"),
     ],
@@ -129,6 +129,29 @@ def test_garbage_positions_are_dropped_and_noted(tmp_path: Path, change: dict[in
     assert facts.latitude_deg is None
     assert facts.altitude_m is None
     assert note in facts.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("letter", "degrees", "latitude", "note"),
+    [
+        ("", 46, 46.5, "without hemisphere (GPSLatitudeRef, GPSLongitudeRef): it counts as north and east"),
+        ("", -46, -46.5, "without hemisphere"),
+        ("S", -46, -46.5, ""),
+        ("South", 46, -46.5, ""),
+        ("N", -46, None, "incomplete or out of range"),
+    ],
+)
+def test_hemispheres(tmp_path: Path, letter: str, degrees: int, latitude: float | None, note: str) -> None:
+    path = write_image(tmp_path / "a.jpg", gps=gps_tags(46.5, 7.0, 500.0) | {1: letter})
+    data = path.read_bytes()
+    if degrees < 0:  # signed rationals, which Pillow does not write
+        data = data.replace(struct.pack(">HHI", 2, 5, 3), struct.pack(">HHI", 2, 10, 3))
+        assert data.count(struct.pack(">2I", 46, 1)) == 1
+        data = data.replace(struct.pack(">2I", 46, 1), struct.pack(">2i", -46, 1))
+    path.write_bytes(data)
+    facts = read_exif(path)
+    assert facts.latitude_deg == latitude
+    assert (note in facts.notes[0]) if note else not facts.notes
 
 
 def test_absent_seconds_and_zero_denominators_elsewhere(tmp_path: Path) -> None:
@@ -379,3 +402,42 @@ def test_tags_of_a_png_in_every_form(tmp_path: Path) -> None:
         Image.new("L", (40, 30)).save(path, pnginfo=text, exif=own)
         facts = read_exif(path)
         assert (facts.model, facts.latitude_deg, facts.angles, facts.notes) == ("Model", 46.0, _GIMBAL_ANGLES, ())
+
+
+_PLACED = _GIMBAL.replace("drone-dji:Rel", 'drone-dji:GpsLatitude="-46.5" drone-dji:GpsLongitude="7.25" drone-dji:Rel')
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "note"),
+    [
+        ({1: "", 3: ""}, (-46.5, 7.25, 500.0), "GPS position without hemisphere (GPSLatitudeRef, GPSLongitudeRef)"),
+        ({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)}, (-46.5, 7.25, 500.0), "GPS position is (0, 0): no fix"),
+        ({2: (IFDRational(46, 0),) * 3}, (-46.5, 7.25, 500.0), "GPS position is incomplete or out of range"),
+        ({6: 0.0}, (46.0, 7.0, 198.31), "GPSAltitude is 0"),
+        ({6: 4294967.0}, (46.0, 7.0, 198.31), "GPSAltitude is out of range"),
+        (
+            {5: b"\1", 6: 198.3},
+            (46.0, 7.0, 198.31),
+            "GPSAltitude and the altitude of XMP have opposite signs (GPSAltitudeRef)",
+        ),
+        ({6: IFDRational(5, 0)}, (46.0, 7.0, 198.31), ""),
+        ({}, (46.0, 7.0, 500.0), ""),
+    ],
+)
+def test_a_sound_position_of_xmp_counts_where_that_of_exif_is_broken(
+    tmp_path: Path, change: dict[int, object], place: tuple[float, float, float], note: str
+) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(46.0, 7.0, 500.0) | change, xmp=_PLACED))
+    assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == pytest.approx(place)
+    assert facts.notes == ((f"{note}: that of XMP is used",) if note else ())
+
+
+def test_adobes_positions_in_xmp(tmp_path: Path) -> None:
+    space = 'xmlns:exif="http://ns.adobe.com/exif/1.0/"'
+    for latitude, longitude in (("46,30.0S", "7,15.0E"), ("46,30,0S", "7,15,0E")):
+        body = (
+            f"<exif:GPSLatitude>{latitude}</exif:GPSLatitude><exif:GPSLongitude>{longitude}</exif:GPSLongitude>"
+            "<exif:GPSAltitude>1205/10</exif:GPSAltitude><exif:GPSAltitudeRef>1</exif:GPSAltitudeRef>"
+        )
+        facts = read_exif(write_image(tmp_path / "a.tif", xmp=_RDF.format(spaces=space, body=body)))
+        assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (-46.5, 7.25, -120.5)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -19,13 +19,11 @@ from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
 from aeromatch_cli.blocks.packets import Packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
-    ALTITUDES,
-    LATITUDES,
-    LONGITUDES,
     CameraAngles,
     tag_number,
     xmp_angles,
     xmp_band,
+    xmp_position,
     xmp_properties,
     xmp_serial,
     xmp_speed_m_s,
@@ -46,6 +44,9 @@ _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
 _XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
+_NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
+_TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
 
@@ -58,9 +59,9 @@ class ExifFacts:
     focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
     speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
     latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the
-    position to the east, to the north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg:
-    of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
+    xmp_position: the same three as XMP states them. relative_altitude_m: above the take-off point. calibrated: the
+    camera by XMP. sigmas_m: standard deviations of the position to the east, to the north and of the height, by an RTK
+    receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
     that of the aircraft. lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as
     "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
     georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
@@ -80,6 +81,7 @@ class ExifFacts:
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     altitude_m: float | None = None
+    xmp_position: tuple[float | None, float | None, float | None] = (None, None, None)
     relative_altitude_m: float | None = None
     angles: CameraAngles | None = None
     calibrated: Camera | None = None
@@ -117,7 +119,8 @@ def read_exif(path: Path) -> ExifFacts:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
     check_pixels(path, width_px, height_px)
     tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
-    latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
+    in_xmp = xmp_position(xmp)
+    latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
     orientation = tag_number(tags.get(_ORIENTATION)) or tag_number(xmp.get("tiff:Orientation")) or 1.0
     body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
@@ -135,6 +138,7 @@ def read_exif(path: Path) -> ExifFacts:
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
+        xmp_position=in_xmp,
         relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
         angles=xmp_angles(xmp),
         calibrated=calibrated_camera(xmp, width_px, height_px),
@@ -253,46 +257,73 @@ def _tables_of(packets: Packets, notes: list[str]) -> list[Mapping[int, Any]]:
 
 
 def _position(
-    gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
+    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], notes: list[str]
 ) -> tuple[float | None, float | None, float | None]:
-    latitude = _sexagesimal(gps.get(2), _text(gps.get(1)), "NS", 90.0)
-    longitude = _sexagesimal(gps.get(4), _text(gps.get(3)), "EW", 180.0)
+    """Latitude, longitude and altitude: of EXIF, else of XMP."""
+    latitude, longitude = _exif_position(gps, in_xmp, notes)
     if latitude is None or longitude is None:
-        if gps.get(2) is not None or gps.get(4) is not None:
-            notes.append("GPS position is incomplete or out of range")
-        latitude, longitude = (_first(xmp, names) for names in (LATITUDES, LONGITUDES))
-    if latitude is None or longitude is None or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        latitude, longitude = in_xmp[:2]
+    if latitude is None or longitude is None:
         return None, None, None
-    if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
-        notes.append("GPS position is (0, 0): no fix")
-        return None, None, None
-    return latitude, longitude, _altitude(gps, xmp)
+    return latitude, longitude, _altitude(gps, in_xmp[2], notes)
 
 
-def _first(xmp: Mapping[str, str], names: Sequence[str]) -> float | None:
-    return next((tag_number(xmp[name]) for name in names if name in xmp), None)
+def _exif_position(
+    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], notes: list[str]
+) -> tuple[float | None, float | None]:
+    """Both, or None and a note where they cannot be used."""
+    if gps.get(2) is None and gps.get(4) is None:
+        return None, None
+    letters = _text(gps.get(1)), _text(gps.get(3))
+    bare = not all(letters)
+    latitude = _sexagesimal(gps.get(2), letters[0], "NS", 90.0)
+    longitude = _sexagesimal(gps.get(4), letters[1], "EW", 180.0)
+    instead = ": that of XMP is used" if in_xmp[0] is not None else ""
+    if latitude is None or longitude is None:
+        notes.append(f"GPS position is incomplete or out of range{instead}")
+        return None, None
+    if abs(latitude) < _NO_FIX_DEG and abs(longitude) < _NO_FIX_DEG:
+        notes.append(f"GPS position is (0, 0): no fix{instead}")
+        return None, None
+    if bare:
+        notes.append(f"GPS position without hemisphere (GPSLatitudeRef, GPSLongitudeRef){instead or _TAKEN_NORTH_EAST}")
+        return (None, None) if instead else (latitude, longitude)
+    return latitude, longitude
 
 
-def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> float | None:
+def _altitude(gps: Mapping[int, Any], in_xmp: float | None, notes: list[str]) -> float | None:
     altitude = tag_number(gps.get(6))
     if altitude is None:
-        return _first(xmp, ALTITUDES)
+        return in_xmp
     reference = gps.get(5)
     code = reference[0] if isinstance(reference, bytes) and reference else tag_number(reference)
     # 1: below sea level; 3: below the ellipsoid (Exif 3.0). Some writers store the character instead of the number.
-    return -abs(altitude) if code in (1, 3, 49, 51) else altitude
+    altitude = -abs(altitude) if code in (1, 3, 49, 51) else altitude
+    instead = ": that of XMP is used" if in_xmp is not None else ""
+    if abs(altitude) > _HIGHEST_M:
+        notes.append(f"GPSAltitude is out of range{instead}")
+        return in_xmp
+    if in_xmp is not None and altitude == 0.0 and abs(in_xmp) > _ALTITUDE_ROUNDING_M:
+        notes.append(f"GPSAltitude is 0{instead}")
+        return in_xmp
+    if in_xmp is not None and altitude * in_xmp < 0.0 and abs(altitude + in_xmp) < _ALTITUDE_ROUNDING_M:
+        notes.append(f"GPSAltitude and the altitude of XMP have opposite signs (GPSAltitudeRef){instead}")
+        return in_xmp
+    return altitude
 
 
 def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> float | None:
-    """Signed degrees of (degrees, minutes, seconds); None where a part or the hemisphere is missing or absurd."""
+    """Signed degrees of (degrees, minutes, seconds); None where a part is missing or absurd. Without a hemisphere the
+    first letter counts, unless degrees have a sign, which must not contradict it."""
     parts = value if isinstance(value, tuple | list) else (value,)
-    sign = {letters[0]: 1.0, letters[1]: -1.0}.get(reference[:1].upper())
+    letter = reference[:1].upper()
+    sign = {"": 1.0, letters[0]: 1.0, letters[1]: -1.0}.get(letter)
     if sign is None or not parts or len(parts) > 3:
         return None
     degrees = tag_number(parts[0])
-    if degrees is None or degrees < 0:
+    if degrees is None or (degrees < 0.0 and letter == letters[0]):
         return None
-    total = degrees
+    sign, total = (-1.0 if degrees < 0.0 else sign), abs(degrees)
     for part, scale in zip(parts[1:], (60.0, 3600.0), strict=False):
         number = tag_number(part)
         if number is None and getattr(part, "numerator", None) == 0:

@@ -26,6 +26,7 @@ from aeromatch_cli.blocks.cameras import (
 )
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
 from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.exif_and_xmp import settled
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
@@ -152,6 +153,8 @@ def block_inputs(
         raise InputError(_nothing_left(images_dir, failures))
 
     warnings += _rasters(facts)
+    facts, remarks = settled(facts)
+    warnings += remarks if lists.poses == EXIF else []
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file

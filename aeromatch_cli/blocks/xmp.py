@@ -17,12 +17,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-LATITUDES = ("drone-dji:GpsLatitude", "drone-dji:Latitude", "drone-skydio:Latitude")
+_LATITUDES = ("drone-dji:GpsLatitude", "drone-dji:Latitude", "drone-skydio:Latitude", "exif:GPSLatitude")
 # DJI's firmware spelt the tag "GpsLongtitude" for years.
-LONGITUDES = (
+_LONGITUDES = (
     "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude", "drone-dji:Longitude", "drone-skydio:Longitude",
+    "exif:GPSLongitude",
 )  # fmt: skip
-ALTITUDES = ("drone-dji:AbsoluteAltitude", "drone-skydio:AbsoluteAltitude")
+_ALTITUDES = ("drone-dji:AbsoluteAltitude", "drone-skydio:AbsoluteAltitude")
 _SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber")
 _PREFIXES = ("drone-dji", "drone-skydio", "drone-parrot")
 # Of the standard, by a part of their namespaces; that of aux holds exif, too.
@@ -47,6 +48,7 @@ _ANGLES = (
 _WIDE = {
     b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be",
 }  # fmt: skip
+_ADOBE_DEGREES = re.compile(r"(\d+),(\d+(?:\.\d+)?)(?:,(\d+(?:\.\d+)?))?([NSEW])")
 _MALFORMED = "XMP block is malformed: what can be read of it is used"
 _DECLARATION = re.compile(r"<\?xml\s[^>]*\?>")
 _NO_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
@@ -165,6 +167,30 @@ def _prefix(namespace: str, local: str) -> str:
         return "Camera"
     standard = next((prefix for prefix in _STANDARD if f"/{prefix}/" in lowered), "")
     return standard or ("drone-dji" if local in _COPIED else "")
+
+
+def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, float | None]:
+    """Latitude and longitude, both or neither, and altitude. A position of (0, 0) is none."""
+    latitude, longitude = _first_degrees(xmp, _LATITUDES, 90.0), _first_degrees(xmp, _LONGITUDES, 180.0)
+    altitude = next((number for name in _ALTITUDES if (number := tag_number(xmp.get(name))) is not None), None)
+    if altitude is None and (altitude := tag_number(xmp.get("exif:GPSAltitude"))) is not None:
+        altitude = -abs(altitude) if xmp.get("exif:GPSAltitudeRef") == "1" else altitude
+    if latitude is None or longitude is None or latitude == longitude == 0.0:
+        return None, None, altitude
+    return latitude, longitude, altitude
+
+
+def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float) -> float | None:
+    """Degrees as a number, or in Adobe's way: "52,30.5712N", "52,30,34.27N"."""
+    for name in names:
+        text = xmp.get(name, "")
+        number = tag_number(text)
+        if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
+            number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
+            number = -number if parts[4] in "SW" else number
+        if number is not None and abs(number) <= largest:
+            return number
+    return None
 
 
 def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
