@@ -441,3 +441,35 @@ def test_adobes_positions_in_xmp(tmp_path: Path) -> None:
         )
         facts = read_exif(write_image(tmp_path / "a.tif", xmp=_RDF.format(spaces=space, body=body)))
         assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (-46.5, 7.25, -120.5)
+
+
+def test_angles_that_are_none_give_way_to_those_of_another_maker(tmp_path: Path) -> None:
+    spaces = 'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" xmlns:Camera="http://pix4d.com/camera/1.0/"'
+    camera = "<Camera:Yaw>10</Camera:Yaw><Camera:Pitch>2</Camera:Pitch><Camera:Roll>-1</Camera:Roll>"
+
+    def angles(*gimbal: str) -> CameraAngles | None:
+        tags = "".join(
+            f"<drone-dji:Gimbal{name}Degree>{value}</drone-dji:Gimbal{name}Degree>"
+            for name, value in zip(("Yaw", "Pitch", "Roll"), gimbal, strict=True)
+        )
+        return read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=spaces, body=tags + camera))).angles
+
+    assert angles("5", "-90", "0") == CameraAngles(5.0, -90.0, 0.0, "gimbal")
+    for broken in (("0", "0", "0"), ("nan", "-90", "0"), ("5", "", "0"), ("5", "-1e30", "0")):
+        assert angles(*broken) == CameraAngles(10.0, 2.0, -1.0, "nadir")
+
+
+def test_focal_lengths_and_digital_zoom(tmp_path: Path) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={37386: 0.0, 41989: 0, 41988: 0.0}))
+    assert (facts.focal_mm, facts.focal_35mm_mm, facts.digital_zoom) == (None, None, 1.0)
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={37386: 4.3, 41989: 24, 41988: IFDRational(2, 0)}))
+    assert (facts.focal_mm, facts.focal_35mm_mm, facts.digital_zoom) == (pytest.approx(4.3), 24.0, 1.0)
+    more = 'drone-dji:CalibratedFocalLength="30" drone-dji:Rel'
+    xmp = _GIMBAL.replace("drone-dji:Rel", more)
+    assert read_exif(write_image(tmp_path / "a.jpg", xmp=xmp)).calibrated is not None
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={41988: 2.5}, xmp=xmp))
+    assert (facts.digital_zoom, facts.calibrated) == (2.5, None)
+    body = "<exif:FocalLength>88/10</exif:FocalLength><exif:FocalLengthIn35mmFilm>24</exif:FocalLengthIn35mmFilm>"
+    space = 'xmlns:exif="http://ns.adobe.com/exif/1.0/"'
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
+    assert (facts.focal_mm, facts.focal_35mm_mm) == (8.8, 24.0)

@@ -37,7 +37,7 @@ _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
 _DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL = 36867, 37520, 37521, 36881
 _BODY_SERIAL, _CAMERA_SERIAL, _LENS_MODEL, _LENS_SERIAL = 42033, 50735, 42036, 42037
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM = 37386, 41989, 41988
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
@@ -56,16 +56,16 @@ class ExifFacts:
     """The header of one image; None or "" where a fact is absent or unusable.
 
     width_px, height_px: the stored raster, whatever `orientation` (1-8) says. focal_35mm_mm: 35-mm equivalent.
-    focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
-    speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
-    latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    xmp_position: the same three as XMP states them. relative_altitude_m: above the take-off point. calibrated: the
-    camera by XMP. sigmas_m: standard deviations of the position to the east, to the north and of the height, by an RTK
-    receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
-    that of the aircraft. lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as
-    "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
-    georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
-    be used.
+    digital_zoom: how many times a part of the sensor was enlarged. focal_plane_px_per_mm: horizontal, for the stored
+    raster; focal_plane_confirmed: EXIF names the raster that the tag speaks of, so that resizing is allowed for. time:
+    ISO text with fraction of a second. latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file
+    states it, whatever its datum. xmp_position: the same three as XMP states them. relative_altitude_m: above the
+    take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the position to the east, to the
+    north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial:
+    number of the aircraft, else that of the camera. camera_serial: of the camera's body, else that of the aircraft.
+    lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as "+02:00".
+    speed_m_s: of the aircraft, to true north, to the east and down. georeferenced: the file says where its pixels lie
+    on the map, as orthophotos do. notes: what was found and could not be used.
     """
 
     width_px: int
@@ -75,6 +75,7 @@ class ExifFacts:
     model: str = ""
     focal_mm: float | None = None
     focal_35mm_mm: float | None = None
+    digital_zoom: float = 1.0
     focal_plane_px_per_mm: float | None = None
     focal_plane_confirmed: bool = False
     time: str = ""
@@ -122,6 +123,8 @@ def read_exif(path: Path) -> ExifFacts:
     in_xmp = xmp_position(xmp)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
+    # 0 says that there is none; pictures are enlarged by it and not reduced.
+    zoom = max(_positive(exif.get(_DIGITAL_ZOOM)) or _positive(xmp.get("exif:DigitalZoomRatio")) or 1.0, 1.0)
     orientation = tag_number(tags.get(_ORIENTATION)) or tag_number(xmp.get("tiff:Orientation")) or 1.0
     body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
     return ExifFacts(
@@ -130,8 +133,9 @@ def read_exif(path: Path) -> ExifFacts:
         orientation=int(orientation) if 1 <= orientation <= 8 else 1,
         make=_text(tags.get(_MAKE)) or xmp.get("tiff:Make", ""),
         model=_text(tags.get(_MODEL)) or xmp.get("tiff:Model", ""),
-        focal_mm=_positive(exif.get(_FOCAL_LENGTH)),
-        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)),
+        focal_mm=_positive(exif.get(_FOCAL_LENGTH)) or _positive(xmp.get("exif:FocalLength")),
+        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)) or _positive(xmp.get("exif:FocalLengthIn35mmFilm")),
+        digital_zoom=zoom,
         focal_plane_px_per_mm=focal_plane,
         focal_plane_confirmed=confirmed,
         time=_time(tags, exif),
@@ -141,7 +145,7 @@ def read_exif(path: Path) -> ExifFacts:
         xmp_position=in_xmp,
         relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
         angles=xmp_angles(xmp),
-        calibrated=calibrated_camera(xmp, width_px, height_px),
+        calibrated=calibrated_camera(xmp, width_px, height_px) if zoom == 1.0 else None,
         sigmas_m=_sigmas_m(header.gps, xmp, notes),
         sigma_angle_deg=angle_sigma_deg(xmp),
         georeferenced=bool(_GEOTIFF & tags.keys()),

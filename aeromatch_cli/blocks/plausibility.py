@@ -126,8 +126,9 @@ def _height_warnings(block: Block, names: Names, centers: FloatArray, elsewhere:
     elif block.crs != "local" and ground_altitude < _LOW_GROUND_M and altitudes.max() >= 0.0:
         found.append(
             f"the ground lies at {ground_altitude:.0f} m: do the altitudes ({altitudes.min():.0f} to "
-            f"{altitudes.max():.0f} m) count from the take-off point, or from the ellipsoid? Fine within this block, but "
-            "a DEM or another flight that counts from sea level will not fit; give absolute altitudes if that matters"
+            f"{altitudes.max():.0f} m) count from the take-off point, or from the ellipsoid? Fine within this block, "
+            "but a DEM or another flight that counts from sea level will not fit; give absolute altitudes if that "
+            "matters"
         )
     odd = ~below & ~elsewhere & ((heights < _LOWEST_HEIGHT_M) | (heights > _HIGHEST_HEIGHT_M))
     if odd.any():

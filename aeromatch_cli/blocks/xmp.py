@@ -49,6 +49,7 @@ _WIDE = {
     b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be",
 }  # fmt: skip
 _ADOBE_DEGREES = re.compile(r"(\d+),(\d+(?:\.\d+)?)(?:,(\d+(?:\.\d+)?))?([NSEW])")
+_LARGEST_ANGLE_DEG = 360.0
 _MALFORMED = "XMP block is malformed: what can be read of it is used"
 _DECLARATION = re.compile(r"<\?xml\s[^>]*\?>")
 _NO_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
@@ -194,13 +195,14 @@ def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float)
 
 
 def xmp_angles(xmp: Mapping[str, str]) -> CameraAngles | None:
-    """Of the first maker whose three tags are numbers."""
+    """Of the first maker whose three tags are angles; three zeros, of a gimbal that was not measured, come last."""
+    found = []
     for names, convention in _ANGLES:
-        values = [tag_number(xmp.get(name)) for name in names]
-        if None not in values:
-            yaw, pitch, roll = (float(value) for value in values if value is not None)
-            return CameraAngles(yaw, pitch, roll, convention)
-    return None
+        values = [number for name in names if (number := tag_number(xmp.get(name))) is not None]
+        if len(values) == len(names) and max(map(abs, values)) <= _LARGEST_ANGLE_DEG:
+            found.append(CameraAngles(values[0], values[1], values[2], convention))
+    measured = [one for one in found if (one.yaw_deg, one.pitch_deg, one.roll_deg) != (0.0, 0.0, 0.0)]
+    return next(iter([*measured, *found]), None)
 
 
 def xmp_speed_m_s(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
