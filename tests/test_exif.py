@@ -473,3 +473,19 @@ def test_focal_lengths_and_digital_zoom(tmp_path: Path) -> None:
     space = 'xmlns:exif="http://ns.adobe.com/exif/1.0/"'
     facts = read_exif(write_image(tmp_path / "a.jpg", xmp=_RDF.format(spaces=space, body=body)))
     assert (facts.focal_mm, facts.focal_35mm_mm) == (8.8, 24.0)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_angles_of_djis_maker_notes_where_xmp_is_lost(tmp_path: Path, order: str) -> None:
+    values = {6: 1.0, 7: 2.0, 8: 3.0, 9: -89.9, 10: 45.5, 11: 0.25}  # of the aircraft, then of the camera
+    entries = [struct.pack(f"{order}HHI4s", 1, 2, 4, b"DJI\0")]
+    entries += [struct.pack(f"{order}HHIf", tag, 11, 1, value) for tag, value in values.items()]
+    note = struct.pack(f"{order}H", len(entries)) + b"".join(entries) + b"\0\0\0\0"
+    path = write_image(tmp_path / "a.jpg", main={271: "DJI"}, exif={37500: note})
+    facts = read_exif(path)
+    assert facts.angles == CameraAngles(45.5, -89.9, 0.25, "gimbal")
+    assert facts.notes == ("no angles in XMP: those of DJI's maker notes are used",)
+    facts = read_exif(write_image(path, main={271: "DJI"}, exif={37500: note[:40]}))
+    assert (facts.angles, facts.notes) == (None, ())
+    facts = read_exif(write_image(path, main={271: "DJI"}, exif={37500: note}, xmp=_GIMBAL))
+    assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())

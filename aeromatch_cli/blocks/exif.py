@@ -17,6 +17,7 @@ from typing import Any
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
+from aeromatch_cli.blocks.maker_notes import dji_camera_angles
 from aeromatch_cli.blocks.packets import Packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     CameraAngles,
@@ -38,6 +39,7 @@ _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257
 _DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL = 36867, 37520, 37521, 36881
 _BODY_SERIAL, _CAMERA_SERIAL, _LENS_MODEL, _LENS_SERIAL = 42033, 50735, 42036, 42037
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM = 37386, 41989, 41988
+_MAKER_NOTE = 37500
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
@@ -120,6 +122,10 @@ def read_exif(path: Path) -> ExifFacts:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
     check_pixels(path, width_px, height_px)
     tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
+    angles = xmp_angles(xmp)
+    if angles is None and _text(tags.get(_MAKE)) == "DJI":
+        angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
+        notes += ["no angles in XMP: those of DJI's maker notes are used"] if angles is not None else []
     in_xmp = xmp_position(xmp)
     latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
@@ -144,7 +150,7 @@ def read_exif(path: Path) -> ExifFacts:
         altitude_m=altitude_m,
         xmp_position=in_xmp,
         relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
-        angles=xmp_angles(xmp),
+        angles=angles,
         calibrated=calibrated_camera(xmp, width_px, height_px) if zoom == 1.0 else None,
         sigmas_m=_sigmas_m(header.gps, xmp, notes),
         sigma_angle_deg=angle_sigma_deg(xmp),
