@@ -191,6 +191,13 @@ def test_mask_names(tmp_path: Path) -> None:
     assert mask_path(masks, "a/2.jpg") == tmp_path / "a/2.png"
     assert mask_path(masks, "1.jpg") is None
     assert mask_path("", "a/1.jpg") is None
+    for name in ("c/3.JPG", "c/3_mask.JPG", "c/4.jpg", "c/4.png", "c/5.jpg", "c/5.jpg.mask.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert mask_path(masks, "c/3.JPG") == tmp_path / "c/3_mask.JPG"
+    assert mask_path(masks, "c/4.jpg") is None  # images and masks share a folder: c/4.png is another image
+    assert mask_path(masks, "c/4.png") is None
+    assert mask_path(masks, "c/5.jpg") == tmp_path / "c/5.jpg.mask.png"
     one = str(tmp_path / "a/2.png")
     assert mask_path(one, "a/1.jpg") == mask_path(one, "z.tif") == tmp_path / "a/2.png"
 

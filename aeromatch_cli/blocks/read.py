@@ -150,7 +150,7 @@ def block_inputs(
     failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
     facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
     if not facts:
-        raise InputError(_nothing_left(images_dir, failures))
+        raise InputError(_nothing_left(images_dir, failures, warnings))
 
     warnings += _rasters(facts)
     facts, remarks = settled(facts)
@@ -229,9 +229,9 @@ def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[
     return [f"passed over {len(items)}: {listed(items)}: {reason}" for reason, items in passed.items()], failures
 
 
-def _nothing_left(images_dir: str, failures: list[ReadFailure]) -> str:
+def _nothing_left(images_dir: str, failures: list[ReadFailure], passed_over: list[str]) -> str:
     if not failures:
-        return f"no image ({KINDS}) in {images_dir}: check --images"
+        return "; ".join([f"no image ({KINDS}) in {images_dir}: check --images", *passed_over])
     return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
 
 

@@ -88,9 +88,10 @@ def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
 
     Raises InputError where the folder holds no image.
     """
-    names, _ = scan_images(images, [])
+    names, passed_over = scan_images(images, [])
     if not names:
-        raise InputError(f"no image ({KINDS}) in {images}: check --images")
+        said = f": {passed_over[0].name}: {passed_over[0].reason}" if passed_over else ": check --images"
+        raise InputError(f"no image ({KINDS}) in {images}{said}")
     looked = [exif_or_reason(images / name) for name in names[:: max(1, len(names) // _LOOKED_AT)][:_LOOKED_AT]]
     facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
     found = [f"{len(names)} images", *_seen(facts)]
