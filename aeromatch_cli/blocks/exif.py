@@ -24,6 +24,7 @@ from aeromatch_cli.blocks.xmp import (
     tag_number,
     xmp_angles,
     xmp_band,
+    xmp_panel,
     xmp_position,
     xmp_properties,
     xmp_serial,
@@ -65,7 +66,8 @@ class ExifFacts:
     take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the position to the east, to the
     north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial:
     number of the aircraft, else that of the camera. camera_serial: of the camera's body, else that of the aircraft.
-    lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as "+02:00".
+    lens: model and serial number. band: of a multispectral camera. panel: shows a
+    panel of known reflectance. utc_offset: of `time`, such as "+02:00".
     speed_m_s: of the aircraft, to true north, to the east and down. georeferenced: the file says where its pixels lie
     on the map, as orthophotos do. notes: what was found and could not be used.
     """
@@ -95,6 +97,7 @@ class ExifFacts:
     camera_serial: str = ""
     lens: str = ""
     band: str = ""
+    panel: bool = False
     utc_offset: str = ""
     speed_m_s: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
@@ -159,6 +162,7 @@ def read_exif(path: Path) -> ExifFacts:
         camera_serial=body or xmp_serial(xmp),
         lens=" ".join(part for part in (_text(exif.get(_LENS_MODEL)), _serial(exif.get(_LENS_SERIAL))) if part),
         band=xmp_band(xmp),
+        panel=xmp_panel(xmp),
         utc_offset=_utc_offset(exif),
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),

@@ -27,6 +27,7 @@ from aeromatch_cli.blocks.cameras import (
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled
+from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
@@ -128,19 +129,24 @@ def block_inputs(
     sigma_position_m: float,
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
+    drop_ground_shots: bool = False,
 ) -> BlockInputs:
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
     why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
     "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move.
+    that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
     warnings, failures = _report_scan(passed_over)
     failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
+    shots = ground_shots(facts)
+    warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
+    if drop_ground_shots:
+        facts = {name: fact for name, fact in facts.items() if name not in shots}
     rows: dict[str, PoseRow] = {}
     if lists.pose_list is not None:
         rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}")

@@ -28,11 +28,14 @@ _SERIALS = ("drone-dji:DroneSerialNumber", "drone-parrot:SerialNumber")
 _PREFIXES = ("drone-dji", "drone-skydio", "drone-parrot")
 # Of the standard, by a part of their namespaces; that of aux holds exif, too.
 _STANDARD = ("tiff", "aux", "exif")
-# Names that other makers have taken from DJI, under namespaces of their own.
-_COPIED = frozenset({
-    "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree", "AbsoluteAltitude", "RelativeAltitude", "GpsLatitude",
-    "GpsLongitude",
-})  # fmt: skip
+# Names that several makers have, under namespaces of their own, and the prefix under which they count.
+_COPIED = {
+    **dict.fromkeys((
+        "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree", "AbsoluteAltitude", "RelativeAltitude",
+        "GpsLatitude", "GpsLongitude",
+    ), "drone-dji"),
+    **dict.fromkeys(("CalibrationPicture", "Albedo", "ReflectArea", "PanelSerial"), "Camera"),
+}  # fmt: skip
 _BAND = "BandName"
 # Structures whose members carry the names of others.
 _LISTS = ("}Seq", "}Bag", "}Alt")
@@ -159,7 +162,7 @@ def _mended(text: str) -> str:
 
 
 def _prefix(namespace: str, local: str) -> str:
-    """The usual prefix of a namespace, "" for one that does not count; names that others took from DJI tell, too."""
+    """The usual prefix of a namespace, "" for one that does not count; some names tell it, too."""
     lowered = namespace.lower() + "/"
     known = next((prefix for prefix in _PREFIXES if prefix in lowered), "")
     if known:
@@ -167,7 +170,7 @@ def _prefix(namespace: str, local: str) -> str:
     if "/camera/" in lowered and "adobe" not in lowered:
         return "Camera"
     standard = next((prefix for prefix in _STANDARD if f"/{prefix}/" in lowered), "")
-    return standard or ("drone-dji" if local in _COPIED else "")
+    return standard or _COPIED.get(local, "")
 
 
 def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, float | None]:
@@ -215,6 +218,12 @@ def xmp_band(xmp: Mapping[str, str]) -> str:
     """Name of the band of a multispectral camera, "" where XMP states none, or several: those of a colour picture."""
     band = xmp.get(f"Camera:{_BAND}", "") or xmp.get(f"drone-dji:{_BAND}", "")
     return "" if "," in band else band
+
+
+def xmp_panel(xmp: Mapping[str, str]) -> bool:
+    """Whether a picture shows a panel of known reflectance, as MicaSense and Sequoia state it."""
+    marked = (tag_number(xmp.get("Camera:CalibrationPicture")) or 0.0) >= 1.0
+    return marked or any(f"Camera:{name}" in xmp for name in ("Albedo", "ReflectArea", "PanelSerial"))
 
 
 def xmp_serial(xmp: Mapping[str, str]) -> str:

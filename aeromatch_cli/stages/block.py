@@ -15,6 +15,7 @@ from typing import Any
 
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
+from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.other_files import MASK
@@ -203,7 +204,10 @@ def _read_inputs(
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
+        drop_ground_shots=given.ground_shots == "drop",
     )
+    twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
+    inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, len(inputs.images))))
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     return inputs, {image.image_id: prints[image.name] for image in inputs.images}, remote
 
