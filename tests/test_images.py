@@ -15,10 +15,12 @@ from PIL.PngImagePlugin import PngImageFile, PngInfo
 
 from aeromatch_cli.blocks.exif import exif_or_reason
 from aeromatch_cli.blocks.packets import png_packets
+from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import normalise
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.images import heif
 from aeromatch_cli.images.files import read_mask, read_pixels, write_png
 from aeromatch_cli.images.masks import below_horizon, mask_path, sees_sky
 from aeromatch_cli.images.scaling import shrink, shrink_camera
@@ -176,6 +178,37 @@ def test_png_round_trip(tmp_path: Path, pixels: NDArray[np.generic]) -> None:
     with (tmp_path / "a.png").open("wb") as stream:
         write_png(stream, pixels)
     np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=True), pixels)
+
+
+def test_heic_by_pillow_heif(tmp_path: Path) -> None:
+    """Pixels, tags and XMP; without the package the message says what to install."""
+    pytest.importorskip("pillow_heif")
+    assert heif.readable()
+    tags = Picture.Exif()
+    tags[272], tags[274] = "Model", 1
+    colours = np.zeros((48, 64, 3), np.uint8)
+    colours[:, :32], colours[:, 32:] = (200, 30, 10), (10, 30, 200)
+    space = 'xmlns:d="http://www.dji.com/drone-dji/1.0/"'
+    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a {space} d:RelativeAltitude="40"/></x:xmpmeta>'
+    path = tmp_path / "a.HEIC"
+    Picture.fromarray(colours).save(path, format="HEIF", exif=tags.tobytes(), xmp=xmp.encode(), quality=95)
+    pixels = read_pixels(path, colour=True)
+    assert np.abs(pixels.astype(int) - colours).mean() < 3.0
+    assert read_pixels(path, colour=False).shape == (48, 64)
+    facts = exif_or_reason(path)
+    assert not isinstance(facts, str)
+    assert (facts.width_px, facts.height_px, facts.model, facts.relative_altitude_m) == (64, 48, "Model", 40.0)
+    assert scan_images(tmp_path) == (["a.HEIC"], [])
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ItemError, match=r"a\.HEIC"):
+        read_pixels(path, colour=True)
+
+
+def test_heic_without_pillow_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heif, "readable", lambda: False)
+    (tmp_path / "a.heic").write_bytes(b"x")
+    with pytest.raises(ItemError, match=r"pip install 'aeromatch\[heif\]' reads it"):
+        read_pixels(tmp_path / "a.heic", colour=True)
 
 
 # --- masks ----------------------------------------------------------------------------------------------------------

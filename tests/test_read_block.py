@@ -433,11 +433,15 @@ def test_masks_beside_the_images_are_no_images(tmp_path: Path, names: tuple[str,
     ("file", "words"),
     [
         ("DJI_0001.DNG", "raw pictures are not read: develop them to JPEG or TIFF"),
-        ("IMG_1.HEIC", "HEIC is not read: convert to JPEG or TIFF"),
+        ("IMG_1.HEIC", "HEIC is read where pillow-heif is installed"),
+        ("IMG_1.webp", "WEBP is not read: convert to JPEG or TIFF"),
         ("DJI_0001.MP4", "videos are not read: extract pictures"),
     ],
 )
-def test_pictures_that_are_not_read_are_named(tmp_path: Path, file: str, words: str) -> None:
+def test_pictures_that_are_not_read_are_named(
+    tmp_path: Path, file: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aeromatch_cli.images.heif.readable", lambda: False)
     (tmp_path / file).write_bytes(b"x")
     with pytest.raises(
         InputError, match=rf"^no image \(jpg, .*\) in .*: check --images; passed over 1: {file}: {words}"

@@ -32,7 +32,7 @@ from aeromatch_cli.blocks.xmp import (
 )
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import gdal
+from aeromatch_cli.images import gdal, heif
 from aeromatch_cli.images.gdal import check_pixels
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
@@ -183,6 +183,8 @@ def _header(path: Path, notes: list[str]) -> _Header:
 
     # A mapping camera's frame is larger than Pillow's guard against hostile files; nothing is decoded here.
     Image.MAX_IMAGE_PIXELS = None
+    if path.suffix.lower() in heif.SUFFIXES:
+        heif.readable()
     try:
         with Image.open(path) as image:
             if image.format == "PNG":
@@ -193,7 +195,7 @@ def _header(path: Path, notes: list[str]) -> _Header:
                 main, exif, gps = _tables(_readers(image.getexif), notes)
                 # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
                 size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
-                return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET),))
+                return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET), image.info.get("xmp")))
             main, exif, gps = _tables_of(packets, notes)
             return _Header(image.size, main, exif, gps, tuple(packets.xmp))
     except UnidentifiedImageError as error:

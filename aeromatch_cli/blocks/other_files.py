@@ -6,7 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
+from aeromatch_cli.images import heif
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
+KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
 MASK = "masks of images by their names, not images: give the folder with --masks to use them"
 
 # Metashape and ODM (a_mask.png, a_mask.jpg), RealityCapture (a.jpg.mask.png).
@@ -16,8 +19,13 @@ _RAW = (
     *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
     *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw"),
 )
-_OTHER_PICTURES = (".heic", ".heif", ".hif", ".avif", ".webp", ".jxl", ".bmp", ".gif")
+_OTHER_PICTURES = (".avif", ".webp", ".jxl", ".bmp", ".gif")
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".insv", ".lrv")
+
+
+def image_suffixes() -> tuple[str, ...]:
+    """Of what is read here: HEIC only where pillow-heif is installed."""
+    return (*_SUFFIXES, *heif.SUFFIXES) if heif.readable() else _SUFFIXES
 
 
 def masks_among(names: Iterable[str]) -> set[str]:
@@ -36,7 +44,7 @@ def masks_among(names: Iterable[str]) -> set[str]:
         elif masked:
             is_mask = (place.parent, masked) in beside
         else:  # COLMAP's: a.jpg.png beside a.jpg
-            is_mask = own.endswith(SUFFIXES) and (place.parent, own) in beside
+            is_mask = own.endswith(image_suffixes()) and (place.parent, own) in beside
         if is_mask:
             masks.add(name)
     return masks
@@ -47,6 +55,11 @@ def unread_kind(name: str) -> str:
     suffix = PurePosixPath(name).suffix.lower()
     if suffix in _RAW:
         return "raw pictures are not read: develop them to JPEG or TIFF in full size, without correction of the lens"
+    if suffix in heif.SUFFIXES:
+        return (
+            "HEIC is read where pillow-heif is installed (pip install 'aeromatch[heif]'); else convert to JPEG or TIFF "
+            "in full size, with the metadata"
+        )
     if suffix in _OTHER_PICTURES:
         return f"{suffix[1:].upper()} is not read: convert to JPEG or TIFF in full size, with the metadata"
     if suffix in _VIDEOS:

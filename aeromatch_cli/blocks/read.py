@@ -38,8 +38,9 @@ from aeromatch_cli.blocks.observations import (
     observation_of_row,
     oriented,
 )
+from aeromatch_cli.blocks.other_files import KINDS
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.blocks.scan import KINDS, ScanFailure, image_ids
+from aeromatch_cli.blocks.scan import ScanFailure, image_ids
 from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
 from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError

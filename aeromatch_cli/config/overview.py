@@ -12,8 +12,9 @@ from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.control_files import read_survey
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.image_names import matched_names, matched_rows
+from aeromatch_cli.blocks.other_files import KINDS
 from aeromatch_cli.blocks.pose_files import read_pose_file
-from aeromatch_cli.blocks.scan import KINDS, scan_images
+from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.config.faults import nearest
 from aeromatch_cli.config.load import differences_of_preset, load, preset_names
 from aeromatch_cli.config.schema import FAMILIES, Settings
