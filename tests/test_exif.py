@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_bands, write_image
+from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_bands, write_image, write_jpeg_2000
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from PIL.TiffImagePlugin import IFDRational
@@ -489,3 +489,52 @@ def test_angles_of_djis_maker_notes_where_xmp_is_lost(tmp_path: Path, order: str
     assert (facts.angles, facts.notes) == (None, ())
     facts = read_exif(write_image(path, main={271: "DJI"}, exif={37500: note}, xmp=_GIMBAL))
     assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())
+
+
+@pytest.mark.parametrize("bands", [1, 3, 5])
+def test_boxes_of_jpeg_2000(tmp_path: Path, bands: int) -> None:
+    path = write_jpeg_2000(tmp_path / "a.jp2", np.ones((bands, 30, 40), np.uint8))
+    plain = path.read_bytes()
+    assert read_exif(path).angles is None
+    exif = exif_segment({272: "Model"}, gps_tags(46.0, 7.0, 500.0))
+    xmp = bytes.fromhex("be7acfcb97a942e89c71999491e3afac") + _GIMBAL.encode()
+    for name, data in (
+        (b"JpgTiffExif->JP2", exif[6:]),
+        (b"JpgTiffExif->JP2", exif),
+        (bytes.fromhex("0537cdab9d0c4431a72afa561f2a113e"), exif[6:]),
+    ):
+        boxes = b"".join(struct.pack(">I", len(one) + 8) + b"uuid" + one for one in (name + data, xmp))
+        # Behind the signature and the type of the file, before the code stream.
+        end = 12 + int.from_bytes(plain[12:16], "big")
+        path.write_bytes(plain[:end] + boxes + plain[end:])
+        facts = read_exif(path)
+        assert (facts.width_px, facts.height_px, facts.model, facts.latitude_deg) == (40, 30, "Model", 46.0)
+        assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())
+
+
+def test_pictures_of_two_cameras_in_one_file(tmp_path: Path) -> None:
+    """MPO: of the first picture."""
+    tags = Image.Exif()
+    tags[272] = "Model"
+    path, picture = tmp_path / "a.JPG", Image.new("RGB", (40, 30))
+    picture.save(path, format="MPO", exif=tags, xmp=_GIMBAL.encode(), save_all=True, append_images=[picture])
+    facts = read_exif(path)
+    assert (facts.width_px, facts.model, facts.angles) == (40, "Model", _GIMBAL_ANGLES)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "time"),
+    [
+        ("2016:11:22 16:32:34", "2016-11-22T16:32:34"),
+        ("2016-11-22T16:32:34.25", "2016-11-22T16:32:34.250000"),
+        ("2016/11/22 16:32:34", "2016-11-22T16:32:34"),
+        ("0000:00:00 00:00:00", "2020-01-02T03:04:05"),
+        ("    :  :     :  :  ", "2020-01-02T03:04:05"),
+        ("2016:13:22 16:32:34", "2020-01-02T03:04:05"),
+    ],
+)
+def test_capture_times(tmp_path: Path, stamp: str, time: str) -> None:
+    space = 'xmlns:exif="http://ns.adobe.com/exif/1.0/"'
+    xmp = _RDF.format(spaces=space, body="<exif:DateTimeOriginal>2020-01-02T03:04:05+02:00</exif:DateTimeOriginal>")
+    facts = read_exif(write_image(tmp_path / "a.jpg", exif={36867: stamp}, xmp=xmp))
+    assert facts.time == time

@@ -18,7 +18,7 @@ from typing import Any
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
 from aeromatch_cli.blocks.maker_notes import dji_camera_angles
-from aeromatch_cli.blocks.packets import Packets, jpeg_packets, png_packets
+from aeromatch_cli.blocks.packets import Packets, jp2_packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
     CameraAngles,
     tag_number,
@@ -47,6 +47,7 @@ _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
 _XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_TIME = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?", re.ASCII)
 # Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
 _NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
@@ -147,7 +148,7 @@ def read_exif(path: Path) -> ExifFacts:
         digital_zoom=zoom,
         focal_plane_px_per_mm=focal_plane,
         focal_plane_confirmed=confirmed,
-        time=_time(tags, exif),
+        time=_time(tags, exif, xmp),
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
@@ -189,6 +190,8 @@ def _header(path: Path, notes: list[str]) -> _Header:
         with Image.open(path) as image:
             if image.format == "PNG":
                 packets = png_packets(path)
+            elif image.format == "JPEG2000":
+                packets = jp2_packets(path)
             elif image.format in ("JPEG", "MPO"):
                 packets = jpeg_packets(getattr(image, "applist", ()))
             else:
@@ -218,7 +221,9 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
     except ItemError as error:
         raise _unreadable(path) from error
     if path.suffix.lower() not in gdal.TIFF:
-        return _Header(size_px, {}, {}, {}, ())
+        packets = jp2_packets(path)
+        main, exif, gps = _tables_of(packets, notes)
+        return _Header(size_px, main, exif, gps, tuple(packets.xmp))
     with path.open("rb") as stream:
         magic = stream.read(16)
         magic = magic if magic[2:3] == b"+" else magic[:8]  # BigTIFF is version 43, and its offsets have 8 bytes
@@ -362,16 +367,21 @@ def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tupl
     return resolution / unit_mm, False
 
 
-def _time(tags: Mapping[int, Any], exif: Mapping[int, Any]) -> str:
+def _time(tags: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str]) -> str:
     for stamp, subsec in (
         (exif.get(_DATE_TIME_ORIGINAL), exif.get(_SUBSEC_ORIGINAL)),
+        (xmp.get("exif:DateTimeOriginal"), None),
         (tags.get(_DATE_TIME), exif.get(_SUBSEC)),
     ):
+        # Exif separates dates by colons, XMP and some cameras in other ways.
+        parts = _TIME.match(_text(stamp))
         try:
-            time = datetime.strptime(_text(stamp), "%Y:%m:%d %H:%M:%S")
+            time = datetime.strptime(" ".join(parts.groups()[:6]), "%Y %m %d %H %M %S") if parts else None
         except ValueError:
             continue
-        digits = _text(subsec)
+        if time is None or parts is None:
+            continue
+        digits = _text(subsec) or parts[7] or ""
         fraction = digits[:6].ljust(6, "0") if digits.isascii() and digits.isdigit() else "0"
         return time.replace(microsecond=int(fraction)).isoformat()
     return ""

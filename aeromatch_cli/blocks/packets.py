@@ -1,7 +1,8 @@
 """Exif blocks and XMP packets of a file as they stand in it: writers split them, repeat them, and put them anywhere.
 
-Sources: Exif 3.0, 4.7.2 (APP1); XMP specification part 3, 1.1.3 (JPEG, with extended XMP); PNG specification, third
-edition, 11.3.3.3 (zTXt), 11.3.3.4 (iTXt), 11.3.3.6 (eXIf); ExifTool's JPEG and PNG modules for what is found besides.
+Sources: Exif 3.0, 4.7.2 (APP1); XMP specification part 3, 1.1.3 (JPEG, with extended XMP, and JPEG 2000); PNG
+specification, third edition, 11.3.3.3 (zTXt), 11.3.3.4 (iTXt), 11.3.3.6 (eXIf); ExifTool's modules for what is found
+besides.
 """
 
 from __future__ import annotations
@@ -22,7 +23,11 @@ _XMP = b"http://ns.adobe.com/xap/1.0/\0"
 _EXTENSION = b"http://ns.adobe.com/xmp/extension/\0"
 _GUID_BYTES, _NUMBER_BYTES = 32, 4
 _XMP_BEGINS = re.compile(rb"<\?xpacket|<x:xmpmeta|<\w+:xmpmeta|<rdf:RDF")
-_LONGEST_CHUNK = 16 * 2**20  # of what is read of a PNG; Exif has 64 KB at most
+# JPEG 2000: boxes of an id and data; Exif of two writers.
+_JP2_SIGNATURE = b"\0\0\0\x0cjP  \r\n\x87\n"
+_JP2_XMP = bytes.fromhex("be7acfcb97a942e89c71999491e3afac")
+_JP2_EXIF = (b"JpgTiffExif->JP2", bytes.fromhex("0537cdab9d0c4431a72afa561f2a113e"))
+_LONGEST_CHUNK = 16 * 2**20  # of what is read of a PNG or a JPEG 2000; Exif has 64 KB at most
 _PNG_XMP = b"XML:com.adobe.xmp"
 _PNG_PROFILE = re.compile(rb"Raw profile type (exif|xmp|APP1)")
 _PNG_HEX = re.compile(rb"\s*\w+\s+\d+\s+([0-9a-fA-F\s]*)")
@@ -88,9 +93,37 @@ def png_packets(path: Path) -> Packets:
                 found.xmp.append(text)
             elif (profile := _PNG_PROFILE.fullmatch(keyword)) and (packed := _PNG_HEX.match(text)):
                 # ImageMagick's: a name, a length, and the segment in hexadecimal digits.
-                segment = bytes.fromhex(b"".join(packed[1].split()).decode())
+                digits = b"".join(packed[1].split()).decode()
+                segment = bytes.fromhex(digits[: len(digits) // 2 * 2])
                 bare = profile[1] == b"exif" and not _EXIF.match(segment)
                 found.add(b"Exif\0\0" + segment if bare else segment)
+    return found
+
+
+def jp2_packets(path: Path) -> Packets:
+    """Of the outer boxes of a JPEG 2000; a bare code stream has none."""
+    found = Packets()
+    size, place = path.stat().st_size, 0
+    with path.open("rb") as stream:
+        if stream.read(len(_JP2_SIGNATURE)) != _JP2_SIGNATURE:
+            return found
+        while place < size:
+            stream.seek(place)
+            head = stream.read(16)
+            length, kind, start = int.from_bytes(head[:4], "big"), head[4:8], place + 8
+            if length == 1:
+                length, start = int.from_bytes(head[8:], "big"), place + 16
+            after = place + length if length else size  # 0: to the end of the file
+            if len(head) < 8 or after <= place or after > size:
+                break
+            if kind == b"uuid" and after - start <= _LONGEST_CHUNK:
+                stream.seek(start)
+                name, data = stream.read(16), stream.read(after - start - 16)
+                if name == _JP2_XMP:
+                    found.xmp.append(data)
+                elif name in _JP2_EXIF:
+                    found.add(data if _EXIF.match(data) else b"Exif\0\0" + data)
+            place = after
     return found
 
 
