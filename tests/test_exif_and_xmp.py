@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,26 @@ def test_the_sounder_position_counts_and_the_other_is_named(
     assert bool(said) == bool(words)
     for word in words:
         assert word in said
+
+
+@pytest.mark.parametrize("altitude", [None, 0.0])
+def test_heights_above_the_take_off_point_count_where_there_are_no_others(altitude: float | None) -> None:
+    facts = {
+        f"{row}.jpg": ExifFacts(
+            40, 30, latitude_deg=a, longitude_deg=b, altitude_m=altitude, relative_altitude_m=80.0 + row
+        )
+        for row, (a, b, _) in enumerate(TRUE)
+    }
+    heights, remarks = settled(facts)
+    assert [one.altitude_m for one in heights.values()] == [80.0 + row for row in range(COUNT)]
+    (remark,) = remarks
+    assert remark.endswith(": heights above the take-off point (RelativeAltitude) are used")
+    facts["3.jpg"] = replace(facts["3.jpg"], relative_altitude_m=None)
+    heights, remarks = settled(facts)
+    assert [one.altitude_m for one in heights.values()] == [None] * COUNT
+    assert remarks == (["GPSAltitude is 0 in 8 of 8 images: not used"] if altitude == 0.0 else [])
+    facts["4.jpg"] = replace(facts["4.jpg"], altitude_m=120.0)  # a flight from the sea
+    assert settled(facts) == (facts, [])
 
 
 def test_positions_that_only_one_of_them_states_are_left_alone() -> None:

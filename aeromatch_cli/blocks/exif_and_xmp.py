@@ -22,6 +22,8 @@ _ALIKE_M = 3.0
 _COARSE = 0.5
 # A single position is elsewhere beyond so many times the extent of the others, and so many metres.
 _ELSEWHERE, _ELSEWHERE_M = 2.0, 200.0
+# A height of exactly 0 in so many images, and in all, is none.
+_LEAST_IMAGES = 3
 _NAMES = 5
 
 
@@ -45,7 +47,24 @@ def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[
         taken, remark = _sounder("heights", both, exif_m, xmp_m)
         remarks += remark
         found |= {name: replace(found[name], altitude_m=found[name].xmp_position[2]) for name in taken}
-    return found, remarks
+    heights, remark = _without_zeros(found)
+    return found | heights, remarks + remark
+
+
+def _without_zeros(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Headers of a block in which no height is stated, or 0 for all images: with heights above the take-off point,
+    where all have them, else without."""
+    placed = {name: fact for name, fact in facts.items() if fact.latitude_deg is not None}
+    if len(placed) < _LEAST_IMAGES or any(fact.altitude_m for fact in placed.values()):
+        return {}, []
+    zeros = [name for name, fact in placed.items() if fact.altitude_m == 0.0]
+    said = f"GPSAltitude is 0 in {len(zeros)} of {len(facts)} images" if zeros else "no image states an altitude"
+    if any(fact.relative_altitude_m for fact in placed.values()) and all(
+        fact.relative_altitude_m is not None for fact in placed.values()
+    ):
+        above = {name: replace(fact, altitude_m=fact.relative_altitude_m) for name, fact in placed.items()}
+        return above, [f"{said}: heights above the take-off point (RelativeAltitude) are used"]
+    return {name: replace(placed[name], altitude_m=None) for name in zeros}, [f"{said}: not used"] if zeros else []
 
 
 def _sounder(what: str, names: Sequence[str], exif_m: FloatArray, xmp_m: FloatArray) -> tuple[set[str], list[str]]:
