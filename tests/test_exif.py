@@ -538,3 +538,43 @@ def test_capture_times(tmp_path: Path, stamp: str, time: str) -> None:
     xmp = _RDF.format(spaces=space, body="<exif:DateTimeOriginal>2020-01-02T03:04:05+02:00</exif:DateTimeOriginal>")
     facts = read_exif(write_image(tmp_path / "a.jpg", exif={36867: stamp}, xmp=xmp))
     assert facts.time == time
+
+
+@pytest.mark.parametrize("table", ["main", "exif"])
+def test_a_packet_among_the_tags_of_a_jpeg(tmp_path: Path, table: str) -> None:
+    """As some DJI cameras write it: tag 700, bytes."""
+    facts = read_exif(write_image(tmp_path / "a.jpg", **{table: {700: _GIMBAL.encode()}}))
+    assert (facts.angles, facts.notes) == (_GIMBAL_ANGLES, ())
+
+
+def test_gps_tags_that_are_there_and_hold_nothing(tmp_path: Path) -> None:
+    """As DJI's mobile SDK leaves them at times, while XMP has the position."""
+    nothing = (IFDRational(0, 0),) * 3
+    for value in (nothing, (0.0, 0.0, 0.0)):
+        gps = {0: b"\0\0\0\0", 1: "", 2: value, 3: "", 4: value, 5: b"\0", 6: IFDRational(0, 0)}
+        facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps, xmp=_PLACED))
+        assert (facts.latitude_deg, facts.longitude_deg, facts.altitude_m) == (-46.5, 7.25, 198.31)
+        assert facts.notes[0].endswith(": that of XMP is used")
+
+
+def test_a_png_of_a_photo_program_has_everything_in_xmp(tmp_path: Path) -> None:
+    spaces = 'xmlns:exif="http://ns.adobe.com/exif/1.0/" xmlns:tiff="http://ns.adobe.com/tiff/1.0/"'
+    body = (
+        "<tiff:Make>DJI</tiff:Make><tiff:Model>FC6310</tiff:Model><tiff:Orientation>6</tiff:Orientation>"
+        "<exif:FocalLength>88/10</exif:FocalLength><exif:FocalLengthIn35mmFilm>24</exif:FocalLengthIn35mmFilm>"
+        "<exif:DateTimeOriginal>2024-05-01T10:20:30.5</exif:DateTimeOriginal><exif:GPSLatitude>52,30.0N</exif:GPSLatitude>"
+        "<exif:GPSLongitude>13,15.0W</exif:GPSLongitude><exif:GPSAltitude>1426/10</exif:GPSAltitude>"
+    )
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", _RDF.format(spaces=spaces, body=body))
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png", pnginfo=text)
+    facts = read_exif(tmp_path / "a.png")
+    assert (facts.make, facts.model, facts.orientation, facts.focal_mm, facts.focal_35mm_mm) == (
+        "DJI",
+        "FC6310",
+        6,
+        8.8,
+        24,
+    )
+    assert (facts.time, facts.latitude_deg, facts.longitude_deg) == ("2024-05-01T10:20:30.500000", 52.5, -13.25)
+    assert (facts.altitude_m, facts.notes) == (142.6, ())

@@ -106,7 +106,7 @@ class ExifFacts:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: packets."""
+    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: packets beside them."""
 
     size_px: tuple[int, int]
     main: Mapping[int, Any]
@@ -125,7 +125,10 @@ def read_exif(path: Path) -> ExifFacts:
     if width_px < 1 or height_px < 1:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
     check_pixels(path, width_px, height_px)
-    tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
+    tags, exif = header.main, header.exif
+    # Some aircraft put the packet among the tags of a JPEG, too.
+    packets = (*header.xmp, tags.get(_XMP_PACKET), exif.get(_XMP_PACKET))
+    xmp = xmp_properties(dict.fromkeys(packet for packet in packets if packet), notes)
     angles = xmp_angles(xmp)
     if angles is None and _text(tags.get(_MAKE)) == "DJI":
         angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
@@ -198,7 +201,7 @@ def _header(path: Path, notes: list[str]) -> _Header:
                 main, exif, gps = _tables(_readers(image.getexif), notes)
                 # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
                 size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
-                return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET), image.info.get("xmp")))
+                return _Header(size_px, main, exif, gps, (image.info.get("xmp"),))
             main, exif, gps = _tables_of(packets, notes)
             return _Header(image.size, main, exif, gps, tuple(packets.xmp))
     except UnidentifiedImageError as error:
@@ -237,7 +240,7 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
             return dict(directory)
 
         main, exif, gps = _tables([partial(table, pointer) for pointer in (None, _EXIF_IFD, _GPS_IFD)], notes)
-    return _Header(size_px, main, exif, gps, (main.get(_XMP_PACKET),))
+    return _Header(size_px, main, exif, gps, ())
 
 
 def _unreadable(path: Path) -> ItemError:
