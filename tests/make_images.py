@@ -124,5 +124,5 @@ def write_dji(path: Path, latitude_deg: float, longitude_deg: float, altitude_m:
         main={271: "DJI\0\0", 272: "FC6310"},
         exif={37386: 8.8, 41989: 24},
         gps=gps_tags(latitude_deg, longitude_deg, altitude_m),
-        xmp=DJI_XMP.format(**values),
+        xmp=DJI_XMP.format(**values).replace("+198.31", f"{altitude_m:+.2f}"),
     )

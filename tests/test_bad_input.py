@@ -13,6 +13,7 @@ import pytest
 from conftest import HEIGHT, IMAGES, UNORIENTED, WIDTH, contents, invoke
 
 from aeromatch_cli.blocks import scan
+from aeromatch_cli.formats.features import read_features
 
 pytestmark = pytest.mark.slow
 SETTINGS = UNORIENTED
@@ -277,6 +278,22 @@ def test_masks_inside_the_images_folder(site):
     outcome = site("run", "--masks", masks)
     assert outcome.code == 0
     assert outcome.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+
+
+def test_masks_beside_the_images_are_used_where_that_is_asked_for(site):
+    for name in site.names():
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, WIDTH // 2 :] = 0
+        cv2.imwrite(str(site.images / f"{Path(name).stem}_mask.png"), mask)
+    first = site.names()[0]
+    outcome = site("extract", "--masks", site.images)
+    assert outcome.code == 0
+    assert outcome.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+    assert "masks of images" not in outcome.stderr
+    points = read_features(site.work / "features" / f"{first.replace('.', '_')}.npz").keypoints_px
+    assert len(points) > 20
+    assert points[:, 0].max() < WIDTH // 2
+    assert f"passed over {IMAGES}: {Path(first).stem}_mask.png" in site("pairs").stderr
 
 
 def test_masks_that_fit_no_image_are_mentioned(site):

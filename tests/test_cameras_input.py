@@ -39,6 +39,30 @@ def test_focal_length_by_source() -> None:
     assert focal_from_exif_px(ExifFacts(**size, focal_mm=4.0, focal_plane_px_per_mm=1.0)) == (4800.0, "guess")
 
 
+def test_digital_zoom_makes_the_focal_length_longer() -> None:
+    size = {"width_px": 4000, "height_px": 3000, "digital_zoom": 2.0}
+    known = ExifFacts(**size, make="DJI", model="FC6310", focal_mm=8.8, focal_35mm_mm=24.0)
+    assert focal_from_exif_px(known) == (pytest.approx(6000.0), "sensor size")
+    plane = {"focal_mm": 4.0, "focal_plane_px_per_mm": 600.0, "focal_plane_confirmed": True}
+    assert focal_from_exif_px(ExifFacts(**size, **plane)) == (4800.0, "focal-plane resolution")
+    px, source = focal_from_exif_px(ExifFacts(**size, focal_35mm_mm=48.0))
+    assert (px, source) == (
+        pytest.approx(48.0 / math.hypot(36, 24) * 5000, rel=1e-4),
+        "35-mm equivalent of a zoomed picture",
+    )
+    found = cameras_from_exif({"a.jpg": known}, {})
+    assert [words for words in found.warnings if "digital zoom (a.jpg: 2 x)" in words] == list(found.warnings)
+
+
+def test_two_focal_lengths_of_which_one_must_be_wrong_are_named() -> None:
+    size = {"width_px": 4000, "height_px": 3000}
+    known = ExifFacts(**size, make="DJI", model="FC6310", focal_mm=8.8, focal_35mm_mm=99.0)
+    (warning,) = cameras_from_exif({"a.jpg": known}, {}).warnings
+    assert "a.jpg: 11441 px by 35-mm equivalent, 3000 px by sensor size): the latter is used" in warning
+    absurd = ExifFacts(**size, focal_mm=4.0, focal_35mm_mm=65535.0, focal_plane_px_per_mm=600.0)
+    assert focal_from_exif_px(absurd) == (2400.0, "focal-plane resolution")
+
+
 def test_exif_groups() -> None:
     wide = ExifFacts(40, 30, make="Canon", model="Canon S100", focal_mm=5.2, focal_35mm_mm=24.0)
     tele = ExifFacts(40, 30, make="Canon", model="Canon S100", focal_mm=26.0, focal_35mm_mm=120.0)

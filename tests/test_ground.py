@@ -98,6 +98,59 @@ def test_gaps_get_the_median_and_a_note(tmp_path: Path) -> None:
     assert "120.0 m" in note
 
 
+@pytest.mark.parametrize("code", [-9999.0, -32768.0, 32767.0, -3.4028235e38, 3.4028235e38, 0.0, -99999.0])
+@pytest.mark.parametrize("declared", [None, -9999.0])
+@pytest.mark.parametrize("crs", ["EPSG:32617", "EPSG:32618"])
+def test_voids_that_are_not_declared_are_none(tmp_path: Path, code: float, declared: float | None, crs: str) -> None:
+    lift = 700.0  # a block that lies high
+    path = plane_dem(tmp_path / "dem.tif", nodata=declared)
+    import rasterio
+
+    with rasterio.open(path, "r+") as dem:
+        heights = dem.read(1) + lift
+        heights[:, :200] = code  # west of the block's first image
+        dem.write(heights, 1)
+    positions = POSITIONS + np.array([50.0, 0.0, lift])
+    xy, origin = positions[:, :2], ORIGIN
+    if crs != "EPSG:32617":
+        from pyproj import Transformer
+
+        moved = Transformer.from_crs("EPSG:32617", crs, always_xy=True).transform(*(xy + origin[:2]).T)
+        positions = np.column_stack([np.array(moved).T - np.array(moved).T.min(axis=0), positions[:, 2]])
+        origin = (*np.array(moved).T.min(axis=0), 0.0)
+    ground, notes = open_dem(path, crs, origin, positions)  # type: ignore[arg-type]
+    expected = plane_m(*(xy + ORIGIN[:2]).T) + lift
+    np.testing.assert_allclose(ground.height_m(positions[:, :2]), expected, atol=0.05)
+    assert ground.heights_m.min() > 700.0
+    assert ground.heights_m.max() < 1000.0
+    named = [note for note in notes if f"has cells of {code:g} that it does not declare as no data" in note]
+    assert bool(named) == (code != declared)
+
+
+def test_a_coast_has_heights_of_zero(tmp_path: Path) -> None:
+    import rasterio
+
+    path = plane_dem(tmp_path / "dem.tif")
+    with rasterio.open(path, "r+") as dem:
+        dem.write(np.maximum(dem.read(1) - 100.0, 0.0), 1)
+    ground, notes = open_dem(path, "EPSG:32617", ORIGIN, POSITIONS)
+    assert ground.height_m(np.array([[-400.0, 400.0], [400.0, -400.0]])) == pytest.approx([0.0, 20.0], abs=0.01)
+    assert not any("declare" in note for note in notes)
+
+
+def test_scaled_heights_are_metres(tmp_path: Path) -> None:
+    import rasterio
+
+    path = plane_dem(tmp_path / "dem.tif")
+    with rasterio.open(path, "r+") as dem:
+        dem.write(dem.read(1) * 10.0, 1)
+        dem.scales = (0.1,)
+    ground, _ = open_dem(path, "EPSG:32617", ORIGIN, POSITIONS)
+    np.testing.assert_allclose(
+        ground.height_m(POSITIONS[:, :2]), plane_m(*(POSITIONS[:, :2] + ORIGIN[:2]).T), atol=0.01
+    )
+
+
 def test_dem_without_crs_is_taken_in_the_blocks(tmp_path: Path) -> None:
     path = plane_dem(tmp_path / "dem.tif", crs=None)
     ground, (note,) = open_dem(path, "EPSG:32617", ORIGIN, POSITIONS)

@@ -62,6 +62,9 @@ def test_the_same_picture_twice(site):
     outcome = site("run")
     assert outcome.code == 0
     assert outcome.facts["stages"]["filter"]["facts"]["components"] == [IMAGES + 1]
+    first = next(name for name in site.names() if name != "copy.jpg")
+    later, earlier = sorted(("copy.jpg", first), reverse=True)
+    assert f"1 of {IMAGES + 1} images are there twice ({later} is {earlier})" in outcome.stderr
 
 
 def test_sizes_depths_and_formats_mixed(site):

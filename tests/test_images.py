@@ -14,11 +14,13 @@ from PIL import Image as Picture
 from PIL.PngImagePlugin import PngImageFile, PngInfo
 
 from aeromatch_cli.blocks.exif import exif_or_reason
-from aeromatch_cli.blocks.png import late_chunks
+from aeromatch_cli.blocks.packets import png_packets
+from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.cameras import normalise
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.images import heif
 from aeromatch_cli.images.files import read_mask, read_pixels, write_png
 from aeromatch_cli.images.masks import below_horizon, mask_path, sees_sky
 from aeromatch_cli.images.scaling import shrink, shrink_camera
@@ -178,6 +180,37 @@ def test_png_round_trip(tmp_path: Path, pixels: NDArray[np.generic]) -> None:
     np.testing.assert_array_equal(read_pixels(tmp_path / "a.png", colour=True), pixels)
 
 
+def test_heic_by_pillow_heif(tmp_path: Path) -> None:
+    """Pixels, tags and XMP; without the package the message says what to install."""
+    pytest.importorskip("pillow_heif")
+    assert heif.readable()
+    tags = Picture.Exif()
+    tags[272], tags[274] = "Model", 1
+    colours = np.zeros((48, 64, 3), np.uint8)
+    colours[:, :32], colours[:, 32:] = (200, 30, 10), (10, 30, 200)
+    space = 'xmlns:d="http://www.dji.com/drone-dji/1.0/"'
+    xmp = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><a {space} d:RelativeAltitude="40"/></x:xmpmeta>'
+    path = tmp_path / "a.HEIC"
+    Picture.fromarray(colours).save(path, format="HEIF", exif=tags.tobytes(), xmp=xmp.encode(), quality=95)
+    pixels = read_pixels(path, colour=True)
+    assert np.abs(pixels.astype(int) - colours).mean() < 3.0
+    assert read_pixels(path, colour=False).shape == (48, 64)
+    facts = exif_or_reason(path)
+    assert not isinstance(facts, str)
+    assert (facts.width_px, facts.height_px, facts.model, facts.relative_altitude_m) == (64, 48, "Model", 40.0)
+    assert scan_images(tmp_path) == (["a.HEIC"], [])
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ItemError, match=r"a\.HEIC"):
+        read_pixels(path, colour=True)
+
+
+def test_heic_without_pillow_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heif, "readable", lambda: False)
+    (tmp_path / "a.heic").write_bytes(b"x")
+    with pytest.raises(ItemError, match=r"pip install 'aeromatch\[heif\]' reads it"):
+        read_pixels(tmp_path / "a.heic", colour=True)
+
+
 # --- masks ----------------------------------------------------------------------------------------------------------
 
 
@@ -191,6 +224,13 @@ def test_mask_names(tmp_path: Path) -> None:
     assert mask_path(masks, "a/2.jpg") == tmp_path / "a/2.png"
     assert mask_path(masks, "1.jpg") is None
     assert mask_path("", "a/1.jpg") is None
+    for name in ("c/3.JPG", "c/3_mask.JPG", "c/4.jpg", "c/4.png", "c/5.jpg", "c/5.jpg.mask.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert mask_path(masks, "c/3.JPG") == tmp_path / "c/3_mask.JPG"
+    assert mask_path(masks, "c/4.jpg") is None  # images and masks share a folder: c/4.png is another image
+    assert mask_path(masks, "c/4.png") is None
+    assert mask_path(masks, "c/5.jpg") == tmp_path / "c/5.jpg.mask.png"
     one = str(tmp_path / "a/2.png")
     assert mask_path(one, "a/1.jpg") == mask_path(one, "z.tif") == tmp_path / "a/2.png"
 
@@ -357,7 +397,7 @@ def test_tags_behind_the_pixels_of_a_png_are_read_without_decoding(
     facts = exif_or_reason(path)
     assert not isinstance(facts, str)
     assert facts.model == "Model X"
-    assert late_chunks(path)["xmp"].startswith(b"<x:xmpmeta")
+    assert png_packets(path).xmp[0].startswith(b"<x:xmpmeta")
     plain = exif_or_reason(_claiming(tmp_path / "plain.png", 20_000, 20_000))
     assert not isinstance(plain, str)
     assert (plain.width_px, plain.model) == (20_000, "")

@@ -203,7 +203,11 @@ def test_identical_pictures_are_named(site: Site) -> None:
 def test_equal_positions_are_named_and_not_used(site: Site) -> None:
     def same(rows):
         first = rows[0]
-        return [{"image": row["image"], "camera": row["camera"], **{k: first[k] for k in "xyz"}} for row in rows]
+        # Their heights go on, as those of a barometer do.
+        return [
+            {"image": row["image"], "camera": row["camera"], "z": row["z"]} | {k: first[k] for k in "xy"}
+            for row in rows
+        ]
 
     site.rewrite_poses(lambda rows: [{k: v for k, v in row.items() if not k.endswith("_deg")} for row in same(rows)])
     outcome = site("orient")

@@ -13,6 +13,7 @@ from conftest import IMAGES, UNORIENTED, Site, invoke
 from PIL import Image
 
 from aeromatch_cli.config import load, preset_names
+from aeromatch_cli.config.overview import first_settings
 from aeromatch_cli.config.schema import FAMILIES
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.report.pictures import image_picture, pair_picture
@@ -206,6 +207,32 @@ def test_init_writes_settings_for_what_it_sees(tmp_path: Path) -> None:
     assert again.code == 2
     assert "exists and is not replaced" in again.stderr
     assert invoke("init", tmp_path / "c.yaml", "--images", tmp_path / "none").code in (2, 3)
+
+
+def test_init_takes_the_pose_file_of_these_images_and_no_control_points(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        Image.new("RGB", (40, 30)).save(images / name)
+    points = [(500000, 4600000, 10, 12.5, 8.5, "a.jpg", "p"), (500000, 4600000, 10, 22.5, 8.5, "b.jpg", "p")]
+    (images / "gcp_list.txt").write_text("EPSG:32633\n" + "".join(" ".join(map(str, row)) + "\n" for row in points))
+    (images / "earlier.csv").write_text("image,x,y,z\nx.jpg,1,2,3\ny.jpg,4,5,6\n")  # of another flight
+    (images / "part.csv").write_text("image,x,y,z\na.jpg,500000,4600000,100\n")
+    (tmp_path / "rest.csv").write_text(
+        "image,x,y,z\n" + "".join(f"{k}.jpg,50000{n},4600000,100\n" for n, k in enumerate("abc"))
+    )
+    text, found = first_settings(images, tmp_path)
+    block = yaml.safe_load(text)["block"]
+    assert (block["poses"], block["gcp"]) == ("rest.csv", "images/gcp_list.txt")
+    assert [line.rpartition("/")[2] for line in found if line.startswith(("pose", "control"))] == [
+        "rest.csv: list with named columns, 3 of 3 images",
+        "part.csv: list with named columns, 1 of 3 images",
+        "gcp_list.txt",
+    ]
+    (tmp_path / "rest.csv").unlink()
+    (images / "part.csv").unlink()
+    text, _ = first_settings(images, tmp_path)
+    assert yaml.safe_load(text)["block"]["poses"] == "none"
 
 
 def test_show_takes_the_workspace_of_the_environment(done_site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

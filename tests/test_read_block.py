@@ -18,6 +18,7 @@ from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.read import BlockInputs
 from aeromatch_cli.blocks.scan import image_id, image_ids, scan_files, scan_images
+from aeromatch_cli.config.overview import first_settings
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError, InputError
 
@@ -403,3 +404,52 @@ def test_positions_have_the_deviations_of_their_axes(tmp_path: Path) -> None:
     said = " ".join(inputs.warnings)
     assert "1 of 4 images: no fixed RTK solution, so that the position counts with 0.5 m at least" in said
     assert "1 of 4 images: no RTK solution, so that the stated accuracy of the position does not count" in said
+
+
+@pytest.mark.parametrize(
+    ("names", "masks"),
+    [
+        (("a.JPG", "b.JPG", "a_mask.JPG", "b_mask.JPG"), ["a_mask.JPG", "b_mask.JPG"]),  # ODM
+        (("1/a.JPG", "1/a_mask.png", "2/a_mask.png"), ["1/a_mask.png"]),  # Metashape; the last one masks nothing
+        (("a.jpg", "masks/a.png", "masks/b.png"), ["masks/a.png"]),
+        (("in/a.jpg", "Masks/a_mask.png", "in/masks/a.jpg.png"), ["Masks/a_mask.png", "in/masks/a.jpg.png"]),
+        (("a.jpg", "a.jpg.png", "b.jpg", "b.jpg.mask.png"), ["a.jpg.png", "b.jpg.mask.png"]),
+        (("a.jpg", "a.png", "unmask.jpg", "white_mask.jpg"), []),
+        (("masks/a.jpg", "masks/b.jpg"), []),  # nothing but a name for the folder
+    ],
+)
+def test_masks_beside_the_images_are_no_images(tmp_path: Path, names: tuple[str, ...], masks: list[str]) -> None:
+    for name in names:
+        write_image(tmp_path / name)
+    for found, passed_over in (scan_images(tmp_path), scan_files(dict.fromkeys(names, 9))):
+        assert found == sorted(set(names) - set(masks))
+        assert [one.name for one in passed_over] == masks
+        assert not any(one.image_lost for one in passed_over)
+    said = read_inputs(tmp_path).warnings
+    assert any("masks of images by their names, not images: give the folder" in line for line in said) == bool(masks)
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("DJI_0001.DNG", "raw pictures are not read: develop them to JPEG or TIFF"),
+        ("IMG_1.HEIC", "HEIC is read where pillow-heif is installed"),
+        ("IMG_1.webp", "WEBP is not read: convert to JPEG or TIFF"),
+        ("DJI_0001.MP4", "videos are not read: extract pictures"),
+    ],
+)
+def test_pictures_that_are_not_read_are_named(
+    tmp_path: Path, file: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("aeromatch_cli.images.heif.readable", lambda: False)
+    (tmp_path / file).write_bytes(b"x")
+    with pytest.raises(
+        InputError, match=rf"^no image \(jpg, .*\) in .*: check --images; passed over 1: {file}: {words}"
+    ):
+        read_inputs(tmp_path)
+    with pytest.raises(InputError, match=f"{file}: {words}"):
+        first_settings(tmp_path, tmp_path)
+    write_image(tmp_path / "a.jpg")
+    assert [line for line in read_inputs(tmp_path).warnings if words in line]
+    write_image(tmp_path / Path(file).with_suffix(".JPG").name)  # of the same name: nothing is missing
+    assert not [line for line in read_inputs(tmp_path).warnings if words in line]

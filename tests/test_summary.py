@@ -81,7 +81,7 @@ TILTED = [from_omega_phi_kappa(2.0, 1.0, 10.0 * i) for i in range(6)]
     [
         (block(ONE_BELOW), ["1 image (flight/img2.jpg)", "below the ground (120 m)", "--ground"]),
         (block(RELATIVE), ["relative to the take-off point", "98 to 102 m", "6 images", "--ground"]),
-        (block(centers(z=6.0), ground_z_m=-58.0), ["ground lies at -58 m", "relative"]),
+        (block(centers(z=6.0), ground_z_m=-58.0), ["ground lies at -58 m", "take-off point, or from the ellipsoid"]),
         (block(NULL_ISLAND), ["1 image (flight/img4.jpg)", "latitude 0, longitude 0"]),
         (block(FAR), ["spread over 1,2", "1 image (flight/img5.jpg)", "--crs"]),
         (block(centers(x=0.0, y=0.0)), ["all 6 positions are identical"]),
@@ -115,6 +115,10 @@ def test_each_oddity_gives_exactly_its_warning(case: Block, words: list[str]) ->
     assert len(warnings) == 1, warnings
     for word in words:
         assert word in warnings[0]
+
+
+def test_ground_below_sea_level_is_not_odd_where_all_images_fly_below_it() -> None:
+    assert summarise(block(centers(z=-310.0), ground_z_m=-417.0)).warnings == ()
 
 
 def test_null_island_as_geographic_position() -> None:

@@ -28,14 +28,19 @@ FOCAL_SIGMAS: Mapping[str, float] = {
     "sensor size": 0.03,
     "focal-plane resolution": 0.05,
     "35-mm equivalent": 0.05,
+    "35-mm equivalent of a zoomed picture": 0.4,
     "guess": 0.4,
 }
 # Two statements of the focal length that differ by more than this factor cannot both be meant.
 _CONTRADICTION = 1.25
+# What is shorter or longer than so many times the longer side is no focal length of a camera that takes pictures.
+_SHORTEST, _LONGEST = 0.2, 50.0
 # Cameras are calibrated with pictures of another size: where EXIF confirms one of these factors to this share, it is
 # that.
 _OTHER_SIZES, _SIZE_SHARE = (0.25, 0.5, 2.0, 4.0), 0.1
 
+# What is computed from the focal length of the lens, and contradicts a 35-mm equivalent where the lens is another one.
+_BY_LENS = ("XMP calibration", "sensor size", "focal-plane resolution")
 # Shorter focal lengths, as a share of the longer side, are those of fisheye lenses (16 mm on 35-mm film).
 _FISHEYE_FOCAL = 0.45
 
@@ -62,29 +67,45 @@ def focal_from_exif_px(facts: ExifFacts) -> tuple[float, str]:
     In this order: the calibration in XMP, sensor size of a known model, focal-plane resolution whose raster EXIF names
     and that the 35-mm equivalent does not contradict, 35-mm equivalent (by the diagonal), any focal-plane resolution, a
     guess of 1.2 x the longer side. The picture lies inside the sensor, so its pixels are no larger than either side
-    allows. Programs that reduce pictures often keep the focal-plane resolution of the original.
+    allows. Programs that reduce pictures often keep the focal-plane resolution of the original. Digital zoom multiplies
+    the focal length of the lens; whether a 35-mm equivalent holds it depends on the maker.
     """
     if facts.calibrated is not None:
         return focal_px(facts.calibrated), "XMP calibration"
-    long_px, short_px = max(facts.width_px, facts.height_px), min(facts.width_px, facts.height_px)
-    sensor_mm = sensor_size_mm(facts.make, facts.model)
-    if facts.focal_mm and sensor_mm:
-        return facts.focal_mm * max(long_px / sensor_mm[0], short_px / sensor_mm[1]), "sensor size"
-    plane_px = (facts.focal_mm or 0.0) * (facts.focal_plane_px_per_mm or 0.0)
-    equivalent_px = (facts.focal_35mm_mm or 0.0) / FULL_FRAME_DIAGONAL_MM * math.hypot(long_px, short_px)
-    plausible = 0.2 * long_px < plane_px < 50.0 * long_px
-    if plausible and facts.focal_plane_confirmed and not _contradicts(plane_px, equivalent_px):
+    long_px = max(facts.width_px, facts.height_px)
+    sensor_px, plane_px, equivalent_px = _stated_px(facts)
+    if sensor_px:
+        return sensor_px, "sensor size"
+    if plane_px and facts.focal_plane_confirmed and not _contradicts(plane_px, equivalent_px, facts.digital_zoom):
         return plane_px, "focal-plane resolution"
     if equivalent_px:
-        return equivalent_px, "35-mm equivalent"
-    if plausible:
+        zoomed = " of a zoomed picture" if facts.digital_zoom > 1.0 else ""
+        return equivalent_px, f"35-mm equivalent{zoomed}"
+    if plane_px:
         return plane_px, "focal-plane resolution"
     return GUESSED_FOCAL_FACTOR * long_px, "guess"
 
 
-def _contradicts(first_px: float, second_px: float) -> bool:
-    """Whether two focal lengths cannot both be meant; one that is not stated, 0, contradicts none."""
-    return second_px > 0.0 and not 1.0 / _CONTRADICTION < first_px / second_px < _CONTRADICTION
+def _stated_px(facts: ExifFacts) -> tuple[float, float, float]:
+    """Focal length by sensor size, focal-plane resolution and 35-mm equivalent, 0 where it is not stated or absurd."""
+    long_px, short_px = max(facts.width_px, facts.height_px), min(facts.width_px, facts.height_px)
+    lens_mm = (facts.focal_mm or 0.0) * facts.digital_zoom
+    sensor_mm = sensor_size_mm(facts.make, facts.model)
+    sensor_px = lens_mm * max(long_px / sensor_mm[0], short_px / sensor_mm[1]) if sensor_mm else 0.0
+    plane_px = lens_mm * (facts.focal_plane_px_per_mm or 0.0)
+    equivalent_px = (facts.focal_35mm_mm or 0.0) / FULL_FRAME_DIAGONAL_MM * math.hypot(long_px, short_px)
+    sensor_px, plane_px, equivalent_px = (
+        px if _SHORTEST * long_px < px < _LONGEST * long_px else 0.0 for px in (sensor_px, plane_px, equivalent_px)
+    )
+    return sensor_px, plane_px, equivalent_px
+
+
+def _contradicts(first_px: float, second_px: float, zoom: float = 1.0) -> bool:
+    """Whether two focal lengths cannot both be meant; one that is not stated, 0, contradicts none. zoom: what the
+    second one may lack."""
+    return second_px > 0.0 and not any(
+        1.0 / _CONTRADICTION < first_px / (factor * second_px) < _CONTRADICTION for factor in (1.0, zoom)
+    )
 
 
 def cameras_from_exif(facts: Mapping[str, ExifFacts], groups: Mapping[str, str]) -> CameraAssignment:
@@ -157,19 +178,34 @@ def _with_lost_numbers(
 
 
 def _contradictions(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:
-    """One sentence where EXIF states two focal lengths of which one must be wrong."""
-    odd = []
+    """A sentence where EXIF states two focal lengths of which one must be wrong, and one about digital zoom."""
+    reduced, odd, zoomed = [], [], []
     for name, fact in facts.items():
-        plane_px = (fact.focal_mm or 0.0) * (fact.focal_plane_px_per_mm or 0.0)
-        other_px, source = focal_from_exif_px(fact)
-        if plane_px and source not in ("guess", "focal-plane resolution") and _contradicts(plane_px, other_px):
-            odd.append(f"{name}: {plane_px:.0f} px by focal-plane resolution, {other_px:.0f} px by {source}")
-    if not odd:
-        return ()
-    return (
-        f"EXIF of {len(odd)} of {len(facts)} images states two focal lengths ({odd[0]}): the latter is used; the "
-        "pictures were probably reduced by a program that kept the resolution of the original",
-    )
+        used_px, source = focal_from_exif_px(fact)
+        _, plane_px, equivalent_px = _stated_px(fact)
+        if fact.digital_zoom > 1.0:
+            zoomed.append(f"{name}: {fact.digital_zoom:g} x")
+        if plane_px and source not in ("guess", "focal-plane resolution") and _contradicts(plane_px, used_px):
+            reduced.append(f"{name}: {plane_px:.0f} px by focal-plane resolution, {used_px:.0f} px by {source}")
+        if source in _BY_LENS and _contradicts(used_px, equivalent_px, fact.digital_zoom):
+            odd.append(f"{name}: {equivalent_px:.0f} px by 35-mm equivalent, {used_px:.0f} px by {source}")
+    said = []
+    if reduced:
+        said.append(
+            f"EXIF of {len(reduced)} of {len(facts)} images states two focal lengths ({reduced[0]}): the latter is "
+            "used; the pictures were probably reduced by a program that kept the resolution of the original"
+        )
+    if odd:
+        said.append(
+            f"EXIF of {len(odd)} of {len(facts)} images states two focal lengths ({odd[0]}): the latter is used; was "
+            "there a zoom, a crop or another lens? Where the first is right give --cameras FILE"
+        )
+    if zoomed:
+        said.append(
+            f"{len(zoomed)} of {len(facts)} images were taken with digital zoom ({listed(zoomed)}): the focal length "
+            "is multiplied with it, a calibration in XMP does not count, and a 35-mm equivalent is taken as zoomed"
+        )
+    return tuple(said)
 
 
 def _fisheyes(facts: Mapping[str, ExifFacts]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -17,35 +17,40 @@ from typing import Any
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, calibrated_camera, position_sigmas_m
-from aeromatch_cli.blocks.png import late_chunks
+from aeromatch_cli.blocks.maker_notes import dji_camera_angles
+from aeromatch_cli.blocks.packets import Packets, jp2_packets, jpeg_packets, png_packets
 from aeromatch_cli.blocks.xmp import (
-    ALTITUDES,
-    LATITUDES,
-    LONGITUDES,
     CameraAngles,
     tag_number,
     xmp_angles,
     xmp_band,
+    xmp_panel,
+    xmp_position,
     xmp_properties,
     xmp_serial,
     xmp_speed_m_s,
 )
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import gdal
+from aeromatch_cli.images import gdal, heif
 from aeromatch_cli.images.gdal import check_pixels
 
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _DATE_TIME, _XMP_PACKET = 256, 257, 271, 272, 274, 306, 700
 _DATE_TIME_ORIGINAL, _SUBSEC, _SUBSEC_ORIGINAL, _OFFSET_ORIGINAL = 36867, 37520, 37521, 36881
 _BODY_SERIAL, _CAMERA_SERIAL, _LENS_MODEL, _LENS_SERIAL = 42033, 50735, 42036, 42037
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 37386, 41989
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM = 37386, 41989, 41988
+_MAKER_NOTE = 37500
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
 _POSITIONING_ERROR = 31  # GPSHPositioningError, metres
 _XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_TIME = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?", re.ASCII)
+# Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
+_NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
+_TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
 # What Pillow raises on headers that are cut or scrambled.
 _BROKEN = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, struct.error)
 
@@ -55,16 +60,17 @@ class ExifFacts:
     """The header of one image; None or "" where a fact is absent or unusable.
 
     width_px, height_px: the stored raster, whatever `orientation` (1-8) says. focal_35mm_mm: 35-mm equivalent.
-    focal_plane_px_per_mm: horizontal, for the stored raster; focal_plane_confirmed: EXIF names the raster that the tag
-    speaks of, so that resizing is allowed for. time: ISO text with fraction of a second.
-    latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file states it, whatever its datum.
-    relative_altitude_m: above the take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the
-    position to the east, to the north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg:
-    of the angles. serial: number of the aircraft, else that of the camera. camera_serial: of the camera's body, else
-    that of the aircraft. lens: model and serial number. band: of a multispectral camera. utc_offset: of `time`, such as
-    "+02:00". speed_m_s: of the aircraft, to true north, to the east and down.
-    georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes: what was found and could not
-    be used.
+    digital_zoom: how many times a part of the sensor was enlarged. focal_plane_px_per_mm: horizontal, for the stored
+    raster; focal_plane_confirmed: EXIF names the raster that the tag speaks of, so that resizing is allowed for. time:
+    ISO text with fraction of a second. latitude_deg, longitude_deg: WGS84, both or neither. altitude_m: as the file
+    states it, whatever its datum. xmp_position: the same three as XMP states them. relative_altitude_m: above the
+    take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the position to the east, to the
+    north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial:
+    number of the aircraft, else that of the camera. camera_serial: of the camera's body, else that of the aircraft.
+    lens: model and serial number. band: of a multispectral camera. panel: shows a
+    panel of known reflectance. utc_offset: of `time`, such as "+02:00".
+    speed_m_s: of the aircraft, to true north, to the east and down. georeferenced: the file says where its pixels lie
+    on the map, as orthophotos do. notes: what was found and could not be used.
     """
 
     width_px: int
@@ -74,12 +80,14 @@ class ExifFacts:
     model: str = ""
     focal_mm: float | None = None
     focal_35mm_mm: float | None = None
+    digital_zoom: float = 1.0
     focal_plane_px_per_mm: float | None = None
     focal_plane_confirmed: bool = False
     time: str = ""
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     altitude_m: float | None = None
+    xmp_position: tuple[float | None, float | None, float | None] = (None, None, None)
     relative_altitude_m: float | None = None
     angles: CameraAngles | None = None
     calibrated: Camera | None = None
@@ -90,6 +98,7 @@ class ExifFacts:
     camera_serial: str = ""
     lens: str = ""
     band: str = ""
+    panel: bool = False
     utc_offset: str = ""
     speed_m_s: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
@@ -97,13 +106,13 @@ class ExifFacts:
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: the packet, if any."""
+    """size_px: width and height of the stored raster. main, exif, gps: tags by number. xmp: packets beside them."""
 
     size_px: tuple[int, int]
     main: Mapping[int, Any]
     exif: Mapping[int, Any]
     gps: Mapping[int, Any]
-    xmp: Any
+    xmp: tuple[Any, ...]
 
 
 def read_exif(path: Path) -> ExifFacts:
@@ -116,10 +125,20 @@ def read_exif(path: Path) -> ExifFacts:
     if width_px < 1 or height_px < 1:
         raise ItemError(f"{path.name}: the header states a size of {width_px} x {height_px} px")
     check_pixels(path, width_px, height_px)
-    tags, exif, xmp = header.main, header.exif, xmp_properties(header.xmp, notes)
-    latitude_deg, longitude_deg, altitude_m = _position(header.gps, xmp, notes)
+    tags, exif = header.main, header.exif
+    # Some aircraft put the packet among the tags of a JPEG, too.
+    packets = (*header.xmp, tags.get(_XMP_PACKET), exif.get(_XMP_PACKET))
+    xmp = xmp_properties(dict.fromkeys(packet for packet in packets if packet), notes)
+    angles = xmp_angles(xmp)
+    if angles is None and _text(tags.get(_MAKE)) == "DJI":
+        angles = xmp_angles(dji_camera_angles(exif.get(_MAKER_NOTE)))
+        notes += ["no angles in XMP: those of DJI's maker notes are used"] if angles is not None else []
+    in_xmp = xmp_position(xmp)
+    latitude_deg, longitude_deg, altitude_m = _position(header.gps, in_xmp, notes)
     focal_plane, confirmed = _focal_plane(exif, width_px, height_px)
-    orientation = tag_number(tags.get(_ORIENTATION)) or 1.0
+    # 0 says that there is none; pictures are enlarged by it and not reduced.
+    zoom = max(_positive(exif.get(_DIGITAL_ZOOM)) or _positive(xmp.get("exif:DigitalZoomRatio")) or 1.0, 1.0)
+    orientation = tag_number(tags.get(_ORIENTATION)) or tag_number(xmp.get("tiff:Orientation")) or 1.0
     body = _serial(exif.get(_BODY_SERIAL)) or _serial(tags.get(_CAMERA_SERIAL)) or xmp.get(_XMP_CAMERA_SERIAL, "")
     return ExifFacts(
         width_px=width_px,
@@ -127,17 +146,19 @@ def read_exif(path: Path) -> ExifFacts:
         orientation=int(orientation) if 1 <= orientation <= 8 else 1,
         make=_text(tags.get(_MAKE)) or xmp.get("tiff:Make", ""),
         model=_text(tags.get(_MODEL)) or xmp.get("tiff:Model", ""),
-        focal_mm=_positive(exif.get(_FOCAL_LENGTH)),
-        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)),
+        focal_mm=_positive(exif.get(_FOCAL_LENGTH)) or _positive(xmp.get("exif:FocalLength")),
+        focal_35mm_mm=_positive(exif.get(_FOCAL_LENGTH_35MM)) or _positive(xmp.get("exif:FocalLengthIn35mmFilm")),
+        digital_zoom=zoom,
         focal_plane_px_per_mm=focal_plane,
         focal_plane_confirmed=confirmed,
-        time=_time(tags, exif),
+        time=_time(tags, exif, xmp),
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
         altitude_m=altitude_m,
+        xmp_position=in_xmp,
         relative_altitude_m=tag_number(xmp.get("drone-dji:RelativeAltitude")),
-        angles=xmp_angles(xmp),
-        calibrated=calibrated_camera(xmp, width_px, height_px),
+        angles=angles,
+        calibrated=calibrated_camera(xmp, width_px, height_px) if zoom == 1.0 else None,
         sigmas_m=_sigmas_m(header.gps, xmp, notes),
         sigma_angle_deg=angle_sigma_deg(xmp),
         georeferenced=bool(_GEOTIFF & tags.keys()),
@@ -145,6 +166,7 @@ def read_exif(path: Path) -> ExifFacts:
         camera_serial=body or xmp_serial(xmp),
         lens=" ".join(part for part in (_text(exif.get(_LENS_MODEL)), _serial(exif.get(_LENS_SERIAL))) if part),
         band=xmp_band(xmp),
+        panel=xmp_panel(xmp),
         utc_offset=_utc_offset(exif),
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
@@ -165,25 +187,23 @@ def _header(path: Path, notes: list[str]) -> _Header:
 
     # A mapping camera's frame is larger than Pillow's guard against hostile files; nothing is decoded here.
     Image.MAX_IMAGE_PIXELS = None
+    if path.suffix.lower() in heif.SUFFIXES:
+        heif.readable()
     try:
         with Image.open(path) as image:
             if image.format == "PNG":
-                image.info |= {name: value for name, value in late_chunks(path).items() if name not in image.info}
-
-            def table() -> Image.Exif:
-                # A PNG's own method decodes all pixels in search of what may stand behind them.
-                return Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
-
-            readers: tuple[Callable[[], Mapping[int, Any]], ...] = (
-                lambda: dict(table()),
-                lambda: dict(table().get_ifd(_EXIF_IFD)),
-                lambda: dict(table().get_ifd(_GPS_IFD)),
-            )
-            main, exif, gps = _tables(readers, notes)
-            # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
-            size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
-            packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or main.get(_XMP_PACKET)
-            return _Header(size_px, main, exif, gps, packet)
+                packets = png_packets(path)
+            elif image.format == "JPEG2000":
+                packets = jp2_packets(path)
+            elif image.format in ("JPEG", "MPO"):
+                packets = jpeg_packets(getattr(image, "applist", ()))
+            else:
+                main, exif, gps = _tables(_readers(image.getexif), notes)
+                # Pillow turns the size of a TIFF by its Orientation: here the stored raster counts.
+                size_px = (int(main[_WIDTH]), int(main[_HEIGHT])) if image.format == "TIFF" else image.size
+                return _Header(size_px, main, exif, gps, (image.info.get("xmp"),))
+            main, exif, gps = _tables_of(packets, notes)
+            return _Header(image.size, main, exif, gps, tuple(packets.xmp))
     except UnidentifiedImageError as error:
         if path.suffix.lower() not in gdal.SUFFIXES:
             raise _unreadable(path) from error
@@ -204,7 +224,9 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
     except ItemError as error:
         raise _unreadable(path) from error
     if path.suffix.lower() not in gdal.TIFF:
-        return _Header(size_px, {}, {}, {}, None)
+        packets = jp2_packets(path)
+        main, exif, gps = _tables_of(packets, notes)
+        return _Header(size_px, main, exif, gps, tuple(packets.xmp))
     with path.open("rb") as stream:
         magic = stream.read(16)
         magic = magic if magic[2:3] == b"+" else magic[:8]  # BigTIFF is version 43, and its offsets have 8 bytes
@@ -218,11 +240,16 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
             return dict(directory)
 
         main, exif, gps = _tables([partial(table, pointer) for pointer in (None, _EXIF_IFD, _GPS_IFD)], notes)
-    return _Header(size_px, main, exif, gps, main.get(_XMP_PACKET))
+    return _Header(size_px, main, exif, gps, ())
 
 
 def _unreadable(path: Path) -> ItemError:
     return ItemError(f"{path.name}: not a readable image (damaged header or another format)")
+
+
+def _readers(table: Callable[[], Any]) -> tuple[Callable[[], Mapping[int, Any]], ...]:
+    """Of main, EXIF and GPS tags. table: makes Pillow's, which reads what it is asked for."""
+    return lambda: dict(table()), lambda: dict(table().get_ifd(_EXIF_IFD)), lambda: dict(table().get_ifd(_GPS_IFD))
 
 
 def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]) -> list[Mapping[int, Any]]:
@@ -237,47 +264,90 @@ def _tables(readers: Iterable[Callable[[], Mapping[int, Any]]], notes: list[str]
     return tables
 
 
+def _tables_of(packets: Packets, notes: list[str]) -> list[Mapping[int, Any]]:
+    """The same of blocks of Exif: of a tag that several state the first block counts."""
+    from PIL import Image
+
+    tables: list[Mapping[int, Any]] = [{}, {}, {}]
+    for block in packets.exif:
+        exif = Image.Exif()
+
+        def table(exif: Image.Exif = exif, block: bytes = block) -> Image.Exif:
+            exif.load(block)  # once: what it has loaded it knows
+            return exif
+
+        tables = [{**later, **first} for first, later in zip(tables, _tables(_readers(table), notes), strict=True)]
+    return tables
+
+
 def _position(
-    gps: Mapping[int, Any], xmp: Mapping[str, str], notes: list[str]
+    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], notes: list[str]
 ) -> tuple[float | None, float | None, float | None]:
-    latitude = _sexagesimal(gps.get(2), _text(gps.get(1)), "NS", 90.0)
-    longitude = _sexagesimal(gps.get(4), _text(gps.get(3)), "EW", 180.0)
+    """Latitude, longitude and altitude: of EXIF, else of XMP."""
+    latitude, longitude = _exif_position(gps, in_xmp, notes)
     if latitude is None or longitude is None:
-        if gps.get(2) is not None or gps.get(4) is not None:
-            notes.append("GPS position is incomplete or out of range")
-        latitude, longitude = (_first(xmp, names) for names in (LATITUDES, LONGITUDES))
-    if latitude is None or longitude is None or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        latitude, longitude = in_xmp[:2]
+    if latitude is None or longitude is None:
         return None, None, None
-    if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
-        notes.append("GPS position is (0, 0): no fix")
-        return None, None, None
-    return latitude, longitude, _altitude(gps, xmp)
+    return latitude, longitude, _altitude(gps, in_xmp[2], notes)
 
 
-def _first(xmp: Mapping[str, str], names: Sequence[str]) -> float | None:
-    return next((tag_number(xmp[name]) for name in names if name in xmp), None)
+def _exif_position(
+    gps: Mapping[int, Any], in_xmp: tuple[float | None, float | None, float | None], notes: list[str]
+) -> tuple[float | None, float | None]:
+    """Both, or None and a note where they cannot be used."""
+    if gps.get(2) is None and gps.get(4) is None:
+        return None, None
+    letters = _text(gps.get(1)), _text(gps.get(3))
+    bare = not all(letters)
+    latitude = _sexagesimal(gps.get(2), letters[0], "NS", 90.0)
+    longitude = _sexagesimal(gps.get(4), letters[1], "EW", 180.0)
+    instead = ": that of XMP is used" if in_xmp[0] is not None else ""
+    if latitude is None or longitude is None:
+        notes.append(f"GPS position is incomplete or out of range{instead}")
+        return None, None
+    if abs(latitude) < _NO_FIX_DEG and abs(longitude) < _NO_FIX_DEG:
+        notes.append(f"GPS position is (0, 0): no fix{instead}")
+        return None, None
+    if bare:
+        notes.append(f"GPS position without hemisphere (GPSLatitudeRef, GPSLongitudeRef){instead or _TAKEN_NORTH_EAST}")
+        return (None, None) if instead else (latitude, longitude)
+    return latitude, longitude
 
 
-def _altitude(gps: Mapping[int, Any], xmp: Mapping[str, str]) -> float | None:
+def _altitude(gps: Mapping[int, Any], in_xmp: float | None, notes: list[str]) -> float | None:
     altitude = tag_number(gps.get(6))
     if altitude is None:
-        return _first(xmp, ALTITUDES)
+        return in_xmp
     reference = gps.get(5)
     code = reference[0] if isinstance(reference, bytes) and reference else tag_number(reference)
     # 1: below sea level; 3: below the ellipsoid (Exif 3.0). Some writers store the character instead of the number.
-    return -abs(altitude) if code in (1, 3, 49, 51) else altitude
+    altitude = -abs(altitude) if code in (1, 3, 49, 51) else altitude
+    instead = ": that of XMP is used" if in_xmp is not None else ""
+    if abs(altitude) > _HIGHEST_M:
+        notes.append(f"GPSAltitude is out of range{instead}")
+        return in_xmp
+    if in_xmp is not None and altitude == 0.0 and abs(in_xmp) > _ALTITUDE_ROUNDING_M:
+        notes.append(f"GPSAltitude is 0{instead}")
+        return in_xmp
+    if in_xmp is not None and altitude * in_xmp < 0.0 and abs(altitude + in_xmp) < _ALTITUDE_ROUNDING_M:
+        notes.append(f"GPSAltitude and the altitude of XMP have opposite signs (GPSAltitudeRef){instead}")
+        return in_xmp
+    return altitude
 
 
 def _sexagesimal(value: Any, reference: str, letters: str, largest: float) -> float | None:
-    """Signed degrees of (degrees, minutes, seconds); None where a part or the hemisphere is missing or absurd."""
+    """Signed degrees of (degrees, minutes, seconds); None where a part is missing or absurd. Without a hemisphere the
+    first letter counts, unless degrees have a sign, which must not contradict it."""
     parts = value if isinstance(value, tuple | list) else (value,)
-    sign = {letters[0]: 1.0, letters[1]: -1.0}.get(reference[:1].upper())
+    letter = reference[:1].upper()
+    sign = {"": 1.0, letters[0]: 1.0, letters[1]: -1.0}.get(letter)
     if sign is None or not parts or len(parts) > 3:
         return None
     degrees = tag_number(parts[0])
-    if degrees is None or degrees < 0:
+    if degrees is None or (degrees < 0.0 and letter == letters[0]):
         return None
-    total = degrees
+    sign, total = (-1.0 if degrees < 0.0 else sign), abs(degrees)
     for part, scale in zip(parts[1:], (60.0, 3600.0), strict=False):
         number = tag_number(part)
         if number is None and getattr(part, "numerator", None) == 0:
@@ -300,16 +370,21 @@ def _focal_plane(exif: Mapping[int, Any], width_px: int, height_px: int) -> tupl
     return resolution / unit_mm, False
 
 
-def _time(tags: Mapping[int, Any], exif: Mapping[int, Any]) -> str:
+def _time(tags: Mapping[int, Any], exif: Mapping[int, Any], xmp: Mapping[str, str]) -> str:
     for stamp, subsec in (
         (exif.get(_DATE_TIME_ORIGINAL), exif.get(_SUBSEC_ORIGINAL)),
+        (xmp.get("exif:DateTimeOriginal"), None),
         (tags.get(_DATE_TIME), exif.get(_SUBSEC)),
     ):
+        # Exif separates dates by colons, XMP and some cameras in other ways.
+        parts = _TIME.match(_text(stamp))
         try:
-            time = datetime.strptime(_text(stamp), "%Y:%m:%d %H:%M:%S")
+            time = datetime.strptime(" ".join(parts.groups()[:6]), "%Y %m %d %H %M %S") if parts else None
         except ValueError:
             continue
-        digits = _text(subsec)
+        if time is None or parts is None:
+            continue
+        digits = _text(subsec) or parts[7] or ""
         fraction = digits[:6].ljust(6, "0") if digits.isascii() and digits.isdigit() else "0"
         return time.replace(microsecond=int(fraction)).isoformat()
     return ""

@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 # A block's window of a DEM is read with at most this many cells per side; a finer DEM is averaged.
 _MAX_CELLS = 4096
 _MARGIN_M = (100.0, 20_000.0)
+# A height beyond these is none on land: -9999, -32768, 3.4e38 stand for no data, declared or not. So does 0 where all
+# other heights are higher than a cliff.
+_LOWEST_M, _HIGHEST_M, _ABOVE_ZERO_M = -500.0, 9000.0, 100.0
+_CODES_NAMED = 3
+# So many cells more than asked for, half of them for interpolation.
+_BESIDE = 8
 
 
 @dataclass(frozen=True)
@@ -112,22 +118,31 @@ def open_dem(
             absolute = np.asarray(positions_m, dtype=np.float64) + np.asarray(origin_m)
             low, high = absolute[:, :2].min(axis=0), absolute[:, :2].max(axis=0)
             frames = (source_crs, source_crs if crs == "local" else rasterio.CRS.from_user_input(crs))
-            coarse, _ = _read_extent(dataset, frames, low - _MARGIN_M[0], high + _MARGIN_M[0], 512)
+            coarse, _, _ = _read_extent(dataset, frames, low - _MARGIN_M[0], high + _MARGIN_M[0], 512)
             if not np.isfinite(coarse).any():
                 raise ConfigError(f"the DEM {path} does not cover the block {_extent_text(low, high, crs)}")
             reach = MAX_DISTANCE_FACTOR * float(absolute[:, 2].max() - np.nanmin(coarse))
             margin = float(np.clip(reach, *_MARGIN_M))
-            heights, transform = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS)
+            heights, transform, codes = _read_extent(dataset, frames, low - margin, high + margin, _MAX_CELLS)
     except (RasterioError, OSError) as error:
         said = getattr(error, "strerror", None) or error
         raise ConfigError(f"cannot read the DEM {path}: {said}; give a GeoTIFF of heights or a constant") from error
+    if codes:
+        listed = ", ".join(f"{code:g}" for code in codes[:_CODES_NAMED]) + (
+            ", ..." if len(codes) > _CODES_NAMED else ""
+        )
+        notes = (
+            *notes,
+            f"the DEM {path} has cells of {listed} that it does not declare as no data: they count as such",
+        )
     known = np.isfinite(heights)
     median = float(np.median(heights[known]))
     if not known.all():
-        missing = 100.0 * float(1.0 - known.mean())
+        share = 100.0 * float(1.0 - known.mean())
+        missing = f"{share:.0f}" if share < 99.0 else "more than 99"
         notes = (
             *notes,
-            f"the DEM {path} has no data in {missing:.0f} % of the block's surroundings: {median:.1f} m there",
+            f"the DEM {path} has no data in {missing} % of the block's surroundings: {median:.1f} m there",
         )
         heights = np.where(known, heights, median)
     ground = DemGround(
@@ -158,8 +173,9 @@ def _source_crs(dataset: DatasetReader, path: Path, crs: str) -> tuple[Any, tupl
 
 def _read_extent(
     dataset: DatasetReader, frames: tuple[Any, Any], low: FloatArray, high: FloatArray, max_cells: int
-) -> tuple[FloatArray, Any]:
-    """Heights (H, W) float64, NaN without data, over a box of the second frame's CRS, and their affine transform.
+) -> tuple[FloatArray, Any, list[float]]:
+    """Heights (H, W) float64, NaN without data, over a box of the second frame's CRS, their affine transform, and what
+    stands for no data without being declared.
 
     frames: CRS of the DEM and of the block. Cells are as fine as the DEM's; within one CRS they are its own.
     """
@@ -180,19 +196,59 @@ def _read_extent(
     columns, rows = np.ceil((np.array([high[0] - west, north - low[1]])) / size).astype(int) + 1
     transform = rasterio.Affine(size[0], 0.0, west, 0.0, -size[1], north)
     heights = np.full((rows, columns), np.nan)
+    stored, stored_transform = _stored_part(dataset, (left, bottom, right, top), max_cells + _BESIDE)
+    if stored.size == 0:
+        return heights, transform, []
+    stored, codes = _without_voids(stored)
     reproject(
-        rasterio.band(dataset, 1),
+        stored,
         heights,
-        src_transform=own,
+        src_transform=stored_transform,
         src_crs=frames[0],
-        src_nodata=dataset.nodata,
+        src_nodata=np.nan,
         dst_transform=transform,
         dst_crs=frames[1],
         dst_nodata=np.nan,
         resampling=Resampling.bilinear,
         tolerance=0.0,
     )
-    return heights, transform
+    return heights, transform, codes
+
+
+def _stored_part(
+    dataset: DatasetReader, box: tuple[float, float, float, float], max_cells: int
+) -> tuple[FloatArray, Any]:
+    """Heights (H, W) float64 of the cells around a box of the DEM's CRS, NaN where it declares no data, and their
+    affine transform; every n-th cell where they would be too many."""
+    import rasterio
+    from rasterio.windows import Window
+
+    left, bottom, right, top = box
+    place_from_cell = np.reshape(dataset.transform, (3, 3))
+    places = np.array([[x, y, 1.0] for x in (left, right) for y in (bottom, top)])
+    corners = (places @ np.linalg.inv(place_from_cell).T)[:, :2]
+    first = np.maximum(np.floor(np.min(corners, axis=0)).astype(int) - _BESIDE // 4, 0)
+    last = np.minimum(np.ceil(np.max(corners, axis=0)).astype(int) + _BESIDE // 4, [dataset.width, dataset.height])
+    if (last <= first).any():
+        return np.zeros((0, 0)), dataset.transform
+    size = last - first
+    step = max(1, int(np.ceil(size.max() / max_cells)))
+    shape = np.maximum(size // step, 1)
+    part = dataset.read(1, window=Window(*first, *size), out_shape=(int(shape[1]), int(shape[0])), masked=True)
+    heights = part.astype(np.float64).filled(np.nan) * dataset.scales[0] + dataset.offsets[0]
+    steps = size / shape
+    cell_from_part = np.array([[steps[0], 0.0, first[0]], [0.0, steps[1], first[1]], [0.0, 0.0, 1.0]])
+    return heights, rasterio.Affine(*(place_from_cell @ cell_from_part)[:2].ravel())
+
+
+def _without_voids(heights: FloatArray) -> tuple[FloatArray, list[float]]:
+    """Heights with NaN for what can be none, and the values that were taken out."""
+    with np.errstate(invalid="ignore"):
+        void = (heights < _LOWEST_M) | (heights > _HIGHEST_M)
+        rest = heights[~void & np.isfinite(heights) & (heights != 0.0)]
+        if rest.size and rest.min() > _ABOVE_ZERO_M:
+            void |= heights == 0.0
+    return np.where(void, np.nan, heights), np.unique(heights[void]).tolist()
 
 
 def _extent_text(low: FloatArray, high: FloatArray, crs: str) -> str:

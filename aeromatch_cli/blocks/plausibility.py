@@ -25,8 +25,8 @@ _NAMES_SHOWN = 3
 _LOWEST_HEIGHT_M, _HIGHEST_HEIGHT_M = 5.0, 10_000.0
 _LARGEST_SPREAD_M = 1_000_000.0
 _NULL_ISLAND_DEG = 0.01
-# Dry land lies hardly below sea level, and the ellipsoid, where altitudes may count from, up to 106 m above the geoid:
-# a ground this low most likely means altitudes above the take-off point.
+# Dry land lies hardly below sea level: a ground this low below images that fly above 0 most likely means altitudes
+# above the take-off point, or above the ellipsoid, which lies up to 106 m above sea level.
 _LOW_GROUND_M = -40.0
 # Largest relative altitude that is worth suspecting.
 _RELATIVE_ALTITUDE_M = 1500.0
@@ -123,10 +123,12 @@ def _height_warnings(block: Block, names: Names, centers: FloatArray, elsewhere:
             f"{_some(names[below])} below the ground ({ground_altitude:.0f} m): these images see nothing; check their "
             "altitude and --ground"
         )
-    elif block.crs != "local" and ground_altitude < _LOW_GROUND_M:
+    elif block.crs != "local" and ground_altitude < _LOW_GROUND_M and altitudes.max() >= 0.0:
         found.append(
-            f"the ground lies at {ground_altitude:.0f} m, so the altitudes look relative to the take-off point: fine "
-            "within this block, but a DEM or another flight will not fit; give absolute altitudes if that matters"
+            f"the ground lies at {ground_altitude:.0f} m: do the altitudes ({altitudes.min():.0f} to "
+            f"{altitudes.max():.0f} m) count from the take-off point, or from the ellipsoid? Fine within this block, "
+            "but a DEM or another flight that counts from sea level will not fit; give absolute altitudes if that "
+            "matters"
         )
     odd = ~below & ~elsewhere & ((heights < _LOWEST_HEIGHT_M) | (heights > _HIGHEST_HEIGHT_M))
     if odd.any():

@@ -26,6 +26,8 @@ from aeromatch_cli.blocks.cameras import (
 )
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
 from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.exif_and_xmp import settled
+from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
@@ -36,8 +38,9 @@ from aeromatch_cli.blocks.observations import (
     observation_of_row,
     oriented,
 )
+from aeromatch_cli.blocks.other_files import KINDS
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.blocks.scan import KINDS, ScanFailure, image_ids
+from aeromatch_cli.blocks.scan import ScanFailure, image_ids
 from aeromatch_cli.blocks.sorties import captures_of, flights, velocities
 from aeromatch_cli.data import Camera, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError, InputError
@@ -127,19 +130,24 @@ def block_inputs(
     sigma_position_m: float,
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
+    drop_ground_shots: bool = False,
 ) -> BlockInputs:
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
     why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
     "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move.
+    that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
     warnings, failures = _report_scan(passed_over)
     failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
+    shots = ground_shots(facts)
+    warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
+    if drop_ground_shots:
+        facts = {name: fact for name, fact in facts.items() if name not in shots}
     rows: dict[str, PoseRow] = {}
     if lists.pose_list is not None:
         rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}")
@@ -149,9 +157,11 @@ def block_inputs(
     failures += [ReadFailure(name, reason) for name, reason in assignment.reasons.items()]
     facts = {name: fact for name, fact in facts.items() if name in assignment.camera_ids}
     if not facts:
-        raise InputError(_nothing_left(images_dir, failures))
+        raise InputError(_nothing_left(images_dir, failures, warnings))
 
     warnings += _rasters(facts)
+    facts, remarks = settled(facts)
+    warnings += remarks if lists.poses == EXIF else []
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
@@ -226,9 +236,9 @@ def _report_scan(scan_failures: Sequence[ScanFailure]) -> tuple[list[str], list[
     return [f"passed over {len(items)}: {listed(items)}: {reason}" for reason, items in passed.items()], failures
 
 
-def _nothing_left(images_dir: str, failures: list[ReadFailure]) -> str:
+def _nothing_left(images_dir: str, failures: list[ReadFailure], passed_over: list[str]) -> str:
     if not failures:
-        return f"no image ({KINDS}) in {images_dir}: check --images"
+        return "; ".join([f"no image ({KINDS}) in {images_dir}: check --images", *passed_over])
     return f"none of the {len(failures)} images in {images_dir} can be used; {failures[0].name}: {failures[0].reason}"
 
 

@@ -9,10 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from aeromatch_cli.blocks.other_files import MASK, image_suffixes, masks_among, unread_kind
 from aeromatch_cli.errors import ConfigError
-
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
-KINDS = ", ".join(suffix[1:] for suffix in SUFFIXES)  # as messages say it
 
 _FOLDER_MARK = "--"
 _LONGEST_SLUG = 150
@@ -63,7 +61,7 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
 
     passed_over = {os.path.realpath(path) for path in exclude} - {os.path.realpath(folder)}
     files_passed_over = {path for path in passed_over if Path(path).is_file()}
-    visited = set(passed_over)
+    visited, suffixes = set(passed_over), image_suffixes()
     for parent, subfolders, files in os.walk(folder, onerror=unreadable, followlinks=True):
         real = os.path.realpath(parent)
         if real in visited:  # excluded, or a link that leads back up
@@ -75,31 +73,34 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
             continue
         subfolders[:] = sorted(name for name in subfolders if not name.startswith(".") and name != _THUMBNAILS)
         for name in subfolders:
-            if Path(name).suffix.lower() in SUFFIXES:
+            if Path(name).suffix.lower() in suffixes:
                 relative = (Path(parent) / name).relative_to(folder).as_posix()
                 failures.append(ScanFailure(relative, "is a folder with the name of an image", False))
         for name in files:
-            if Path(name).suffix.lower() not in SUFFIXES:
-                continue
             path = Path(parent) / name
+            relative = path.relative_to(folder).as_posix()
+            if Path(name).suffix.lower() not in suffixes:
+                failures += _unread(relative)
+                continue
             if files_passed_over and os.path.realpath(path) in files_passed_over:
                 continue
-            relative = path.relative_to(folder).as_posix()
             failure = _failure_of(path, relative)
             if failure is not None:
                 failures.append(failure)
             elif not name.startswith("."):
                 names.append(relative)
-    return sorted(names), sorted(failures, key=lambda failure: failure.name)
+    return _sorted_out(names, failures)
 
 
 def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[ScanFailure]]:
     """The same of a listing: relative name -> size of every file below a folder that is not on this machine."""
     names: list[str] = []
     failures: list[ScanFailure] = []
+    suffixes = image_suffixes()
     for name, size_bytes in sorted(sizes_bytes.items()):
         *parents, file = name.split("/")
-        if Path(file).suffix.lower() not in SUFFIXES:
+        if Path(file).suffix.lower() not in suffixes:
+            failures += _unread(name)
             continue
         if name.startswith("/") or ".." in name.replace("\\", "/").split("/"):
             failures.append(ScanFailure(name, "leads out of the folder: it is not read", True))
@@ -113,7 +114,27 @@ def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[S
             failures.append(ScanFailure(name, _EMPTY, True))
         elif not file.startswith("."):
             names.append(name)
-    return names, failures
+    return _sorted_out(names, failures)
+
+
+def _sorted_out(names: list[str], failures: list[ScanFailure]) -> tuple[list[str], list[ScanFailure]]:
+    """Both sorted, masks among what is passed over, without what is not read of pictures that are there as well (raw
+    beside JPEG)."""
+    masks = masks_among(names)
+    kept = sorted(name for name in names if name not in masks)
+    twins = {str(Path(name).with_suffix("")).lower() for name in kept}
+    failures = [
+        one for one in failures if not (unread_kind(one.name) and str(Path(one.name).with_suffix("")).lower() in twins)
+    ]
+    failures += [ScanFailure(name, MASK, False) for name in masks]
+    return kept, sorted(failures, key=lambda failure: failure.name)
+
+
+def _unread(name: str) -> list[ScanFailure]:
+    """What is said of a file that has another suffix than images."""
+    hidden = any(part.startswith(".") for part in name.split("/"))
+    reason = "" if hidden or _CONTROL.search(name) else unread_kind(name)
+    return [ScanFailure(name, reason, False)] if reason else []
 
 
 def _unfit(name: str) -> ScanFailure | None:

@@ -9,11 +9,12 @@ from typing import Any
 
 from aeromatch_cli import DEFAULT_PRESET
 from aeromatch_cli.blocks.camera_files import read_camera_file
+from aeromatch_cli.blocks.control_files import read_survey
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
-from aeromatch_cli.blocks.pose_files import POSE_FORMATS
-from aeromatch_cli.blocks.pose_files.source import Source
-from aeromatch_cli.blocks.poses import read_poses
-from aeromatch_cli.blocks.scan import KINDS, scan_images
+from aeromatch_cli.blocks.image_names import matched_names, matched_rows
+from aeromatch_cli.blocks.other_files import KINDS
+from aeromatch_cli.blocks.pose_files import read_pose_file
+from aeromatch_cli.blocks.scan import scan_images
 from aeromatch_cli.config.faults import nearest
 from aeromatch_cli.config.load import differences_of_preset, load, preset_names
 from aeromatch_cli.config.schema import FAMILIES, Settings
@@ -26,6 +27,7 @@ _LOOKED_AT = 20
 # Files that may hold poses, by suffix: others are not opened.
 _POSE_SUFFIXES = (".csv", ".txt", ".json", ".geojson", ".xml", ".mrk", ".prj", ".ori", ".nvm", ".out", ".bin")
 _LARGEST_BYTES = 50_000_000
+_CONTROL_SUFFIXES = (".csv", ".txt", ".xml")
 _CAMERA_FILES = ("cameras.txt", "cameras.json", "cameras.yaml", "cameras.yml", "block.json")
 
 
@@ -88,19 +90,23 @@ def first_settings(images: Path, folder: Path) -> tuple[str, list[str]]:
 
     Raises InputError where the folder holds no image.
     """
-    names, _ = scan_images(images, [])
+    names, passed_over = scan_images(images, [])
     if not names:
-        raise InputError(f"no image ({KINDS}) in {images}: check --images")
+        said = f": {passed_over[0].name}: {passed_over[0].reason}" if passed_over else ": check --images"
+        raise InputError(f"no image ({KINDS}) in {images}{said}")
     looked = [exif_or_reason(images / name) for name in names[:: max(1, len(names) // _LOOKED_AT)][:_LOOKED_AT]]
     facts = [fact for fact in looked if isinstance(fact, ExifFacts)]
     found = [f"{len(names)} images", *_seen(facts)]
-    poses = list(_pose_files(images))
+    poses = _pose_files(images, names)
+    control = next(_control_files(images, names), None)
     cameras = next(_camera_files(images), None)
     found += [f"pose file {path}: {title}" for path, title in poses]
     found += [f"camera file {cameras}"] if cameras else []
+    found += [f"control points {control}"] if control else []
     below = [(_below(path, folder), title) for path, title in poses]
     camera_file = _below(cameras, folder) if cameras else "exif"
-    return _settings_text(_below(images, folder), facts, below, camera_file, found), found
+    gcp = _below(control, folder) if control else ""
+    return _settings_text(_below(images, folder), facts, below, camera_file, gcp, found), found
 
 
 def _below(path: Path, folder: Path) -> str:
@@ -123,28 +129,38 @@ def _seen(facts: list[ExifFacts]) -> Iterator[str]:
         yield f"GPS position in {positions} of {len(facts)} headers, angles in {angles}"
 
 
-def _pose_files(images: Path) -> Iterator[tuple[Path, str]]:
-    """Files in the folder and beside it that a reader knows."""
+def _pose_files(images: Path, names: list[str]) -> list[tuple[Path, str]]:
+    """Files in the folder and beside it whose lines mean these images, the one that means most of them first, and what
+    they are."""
+    found = []
+    for path in _candidates(images, _POSE_SUFFIXES):
+        try:
+            pose_list = read_pose_file(path)
+            rows, _ = matched_rows(pose_list, names, path.name)
+        except ConfigError:
+            continue  # another file, or poses of other images
+        found.append((len(rows), path, pose_list.format))
+    found.sort(key=lambda one: -one[0])
+    return [(path, f"{title}, {count} of {len(names)} images") for count, path, title in found]
+
+
+def _control_files(images: Path, names: list[str]) -> Iterator[Path]:
+    """Files in the folder and beside it whose control points are measured in these images."""
+    for path in _candidates(images, _CONTROL_SUFFIXES):
+        try:
+            survey = read_survey(path, None)
+            measured, _ = matched_names({mark.image: mark.line for mark in survey.marks}, names, path.name)
+        except ConfigError:
+            continue
+        if measured and survey.points:
+            yield path
+
+
+def _candidates(images: Path, suffixes: tuple[str, ...]) -> Iterator[Path]:
     for folder in dict.fromkeys((images, images.parent)):
         for path in sorted(folder.iterdir()):
-            if not path.is_file() or path.suffix.lower() not in _POSE_SUFFIXES or path.stat().st_size > _LARGEST_BYTES:
-                continue
-            source = Source(path)
-            for known in POSE_FORMATS.values():
-                if known.recognises is not None and known.recognises(source):
-                    yield path, known.title
-                    break
-            else:
-                if path.suffix.lower() in (".csv", ".txt") and _names_columns(path):
-                    yield path, POSE_FORMATS["columns"].title
-
-
-def _names_columns(path: Path) -> bool:
-    """Whether it is a list whose first line names an image and a position."""
-    try:
-        return bool(read_poses(path).rows)
-    except ConfigError:
-        return False
+            if path.is_file() and path.suffix.lower() in suffixes and path.stat().st_size <= _LARGEST_BYTES:
+                yield path
 
 
 def _camera_files(images: Path) -> Iterator[Path]:
@@ -160,7 +176,7 @@ def _camera_files(images: Path) -> Iterator[Path]:
 
 
 def _settings_text(
-    images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], cameras: str, found: list[str]
+    images: str, facts: list[ExifFacts], poses: list[tuple[str, str]], cameras: str, gcp: str, found: list[str]
 ) -> str:
     located = any(fact.latitude_deg is not None for fact in facts)
     chosen = poses[0][0] if poses else "exif" if located else "none"
@@ -185,7 +201,7 @@ block:
   # Folder of masks in COLMAP's naming, or one mask for all images.
   # masks: masks
   # Ground control points (ODM's gcp_list.txt, or files of Pix4D or Metashape).
-  # gcp: gcp_list.txt
+  {f"gcp: {scalar(gcp)}" if gcp else "# gcp: gcp_list.txt"}
 
 # More keypoints: more matches, more time.
 # extract: {{keypoints: 12000}}

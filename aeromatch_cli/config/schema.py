@@ -111,6 +111,11 @@ class BlockSettings(_Section):
         description="What control points are for: the fit, except those that are marked as check points (adjust), or "
         "none of them (check).",
     )
+    ground_shots: Literal["keep", "drop"] = Field(
+        "keep",
+        description="Pictures that were taken on the ground, of reflectance panels and before take-off: keep (they are "
+        "named) or drop.",
+    )
     angles: Literal["auto", "gimbal", "nadir"] = Field(
         "auto",
         description="Convention of yaw, pitch, roll: at zero the camera looks forward (gimbal, DJI) or down (nadir, "

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray
 from aeromatch_cli.errors import ItemError
-from aeromatch_cli.images import gdal
+from aeromatch_cli.images import gdal, heif
 from aeromatch_cli.images.depth import in_16_bits, to_gray8
 from aeromatch_cli.images.masks import both_valid, without_frames
 from aeromatch_cli.images.png import SIGNATURE, chunks
@@ -86,6 +86,8 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     import cv2
 
     check_size(path)
+    if path.suffix.lower() in heif.SUFFIXES:
+        return _decoded_heif(path)
     try:
         data = path.read_bytes()
         if fault := _png_fault(data):
@@ -100,6 +102,19 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
+def _decoded_heif(path: Path) -> NDArray[Any]:
+    """(H, W, 3) BGR, as OpenCV would give it."""
+    from PIL import Image
+
+    if not heif.readable():
+        raise ItemError(f"image {path} is HEIC: pip install 'aeromatch[heif]' reads it")
+    try:
+        with Image.open(path) as picture:
+            return np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
+    except (OSError, ValueError, SyntaxError, RuntimeError) as error:
+        raise ItemError(f"cannot decode image {path}: {error}; replace or remove it") from None
+
+
 def check_size(path: Path) -> None:
     """Raises ItemError for a picture that is too large to decode, by its header: a file of some kilobytes may claim
     any size. To be called before Pillow opens a picture, too."""
@@ -107,6 +122,8 @@ def check_size(path: Path) -> None:
 
     # Pillow's own guard refuses a mapping camera's frame; nothing is decoded here.
     Image.MAX_IMAGE_PIXELS = None
+    if path.suffix.lower() in heif.SUFFIXES:
+        heif.readable()
     try:
         with Image.open(path) as picture:
             width, height = picture.size

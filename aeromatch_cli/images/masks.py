@@ -14,9 +14,13 @@ from aeromatch_cli.geometry.cameras import world_rays
 from aeromatch_cli.geometry.footprints import sees_horizon
 from aeromatch_cli.images.depth import strips
 
+# Of masks, in both cases: file systems tell them apart.
+_SUFFIXES = tuple(form for suffix in (".png", ".jpg", ".jpeg", ".tif", ".tiff") for form in (suffix, suffix.upper()))
+
 
 def mask_path(masks: str, name: str) -> Path | None:
-    """Mask of an image: COLMAP's naming (a/1.jpg.png), the bare stem (a/1.png), or the one file for all.
+    """Mask of an image: COLMAP's naming (a/1.jpg.png), Metashape's and ODM's (a/1_mask.png, .jpg or .tif), the bare
+    stem (a/1.png) where the images lie elsewhere, or the one file for all.
 
     Raises ConfigError where that is no file (a pipe, a device), or a link that leads out of the folder.
     """
@@ -25,7 +29,11 @@ def mask_path(masks: str, name: str) -> Path | None:
     root = Path(masks)
     if root.is_file():
         return root
-    for candidate in (root / f"{name}.png", (root / name).with_suffix(".png")):
+    picture = root / name
+    candidates = [root / f"{name}.png", root / f"{name}.mask.png"]
+    candidates += [picture.with_name(f"{picture.stem}_mask{suffix}") for suffix in _SUFFIXES]
+    candidates += [] if picture.exists() else [picture.with_suffix(".png")]
+    for candidate in candidates:
         if not candidate.exists():
             continue
         if not candidate.is_file():

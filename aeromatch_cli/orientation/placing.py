@@ -272,7 +272,9 @@ def similarity(source: FloatArray, target: FloatArray) -> tuple[float, FloatArra
 def _by_positions(centers: FloatArray, positions_m: FloatArray, sigmas_m: FloatArray) -> Placement | None:
     """The similarity that most positions agree with, or None where they are all in one place."""
     extent_m = float(np.linalg.norm(np.ptp(positions_m, axis=0)))
-    if extent_m <= float(np.median(sigmas_m)) * 1e-3 or np.linalg.norm(np.ptp(centers, axis=0)) <= 0.0:
+    # Heights alone scale nothing: where a file states one place for all images, their barometer goes on.
+    across_m = float(np.linalg.norm(np.ptp(positions_m[:, :2], axis=0)))
+    if across_m <= float(np.median(sigmas_m)) * 1e-3 or np.linalg.norm(np.ptp(centers, axis=0)) <= 0.0:
         return None
     limits_m = np.maximum(_AGREE_SIGMAS * sigmas_m, _AGREE_EXTENT * extent_m)
     rng = np.random.default_rng(0)

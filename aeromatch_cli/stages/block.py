@@ -15,8 +15,10 @@ from typing import Any
 
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
+from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
+from aeromatch_cli.blocks.other_files import MASK
 from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
@@ -183,11 +185,9 @@ def _read_inputs(
         names, passed_over = scan_files({name: file.size_bytes for name, file in remote.items()})
     else:
         masks = [Path(given.masks)] if given.masks else []
-        if any(path.is_dir() and path.resolve() == root.resolve() for path in masks):
-            raise ConfigError(
-                f"{root} holds images and masks, which would be matched too: give masks a folder of their own"
-            )
         names, passed_over = scan_images(root, [workspace.root, *masks])
+    if given.masks and Path(given.masks).resolve() == root.resolve():
+        passed_over = [one for one in passed_over if one.reason != MASK]
     pictures = [remote.get(name) or root / name for name in names]
     outcomes = dict(zip(names, executor.run(_read_header, pictures, "read"), strict=True))
     for name, outcome in outcomes.items():
@@ -204,7 +204,10 @@ def _read_inputs(
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
+        drop_ground_shots=given.ground_shots == "drop",
     )
+    twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
+    inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, len(inputs.images))))
     prints = {name: outcome.value[1] for name, outcome in outcomes.items() if outcome.value}
     return inputs, {image.image_id: prints[image.name] for image in inputs.images}, remote
 

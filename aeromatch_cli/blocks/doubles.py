@@ -1,0 +1,53 @@
+"""Files that are there twice under different names."""
+
+from __future__ import annotations
+
+import filecmp
+from collections import defaultdict
+from collections.abc import Mapping
+from pathlib import Path
+
+from aeromatch_cli.blocks.cameras import listed
+
+# Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
+_EDGE_BYTES = 65_536
+
+
+def doubles(files: Mapping[str, Path]) -> dict[str, str]:
+    """Name -> the name before it, in the order given, whose file has the same contents. Files that cannot be read have
+    none."""
+    by_size: dict[int, list[str]] = defaultdict(list)
+    for name, path in files.items():
+        try:
+            by_size[path.stat().st_size].append(name)
+        except OSError:
+            continue
+    found: dict[str, str] = {}
+    for size, names in by_size.items():
+        by_edges: dict[bytes, list[str]] = defaultdict(list)
+        for name in names if len(names) > 1 and size else []:
+            try:
+                edges = _edges(files[name], size)
+                same = next((n for n in by_edges[edges] if filecmp.cmp(files[n], files[name], shallow=False)), None)
+            except OSError:
+                continue
+            if same is None:
+                by_edges[edges].append(name)
+            else:
+                found[name] = same
+    return found
+
+
+def remarks_on(found: Mapping[str, str], total: int) -> list[str]:
+    """One sentence about all of them."""
+    if not found:
+        return []
+    pairs = [f"{name} is {first}" for name, first in found.items()]
+    return [f"{len(found)} of {total} images are there twice ({listed(pairs)}): remove one of each"]
+
+
+def _edges(path: Path, size: int) -> bytes:
+    with path.open("rb") as stream:
+        head = stream.read(_EDGE_BYTES)
+        stream.seek(max(0, size - _EDGE_BYTES))
+        return head + stream.read(_EDGE_BYTES)

@@ -1,0 +1,106 @@
+"""Positions and heights that EXIF and XMP of the same images both state, and that contradict each other.
+
+EXIF counts, since corrected positions (PPK) are written there, unless it is the broken one: coarser than XMP (cut to
+minutes, the same for all), or in single images far from where all others are, and XMP is not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.data import BoolArray, FloatArray
+
+_METRES_PER_DEGREE = 111_320.0
+# What is stated twice differs by less: rounding, and the time between two readings.
+_ALIKE_M = 3.0
+# One of two statements is the coarser where it has at most this share of the other's different numbers.
+_COARSE = 0.5
+# A single position is elsewhere beyond so many times the extent of the others, and so many metres.
+_ELSEWHERE, _ELSEWHERE_M = 2.0, 200.0
+# A height of exactly 0 in so many images, and in all, is none.
+_LEAST_IMAGES = 3
+_NAMES = 5
+
+
+def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Headers with the sounder of both statements as their position, and what is said of it. facts: by image name."""
+    found, remarks = dict(facts), []
+    both = [n for n, fact in found.items() if fact.latitude_deg is not None and fact.xmp_position[0] is not None]
+    if both:
+        exif_deg = np.array([[found[name].latitude_deg, found[name].longitude_deg] for name in both], dtype=float)
+        xmp_deg = np.array([found[name].xmp_position[:2] for name in both], dtype=float)
+        scale = _METRES_PER_DEGREE * np.array([1.0, math.cos(math.radians(float(np.median(exif_deg[:, 0]))))])
+        taken, remark = _sounder("positions", both, exif_deg * scale, xmp_deg * scale)
+        remarks += remark
+        for name, (latitude, longitude) in zip(both, xmp_deg, strict=True):
+            if name in taken:
+                found[name] = replace(found[name], latitude_deg=float(latitude), longitude_deg=float(longitude))
+    both = [n for n, fact in found.items() if fact.altitude_m is not None and fact.xmp_position[2] is not None]
+    if both:
+        exif_m = np.array([[found[name].altitude_m] for name in both], dtype=float)
+        xmp_m = np.array([[found[name].xmp_position[2]] for name in both], dtype=float)
+        taken, remark = _sounder("heights", both, exif_m, xmp_m)
+        remarks += remark
+        found |= {name: replace(found[name], altitude_m=found[name].xmp_position[2]) for name in taken}
+    heights, remark = _without_zeros(found)
+    return found | heights, remarks + remark
+
+
+def _without_zeros(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Headers of a block in which no height is stated, or 0 for all images: with heights above the take-off point,
+    where all have them, else without."""
+    placed = {name: fact for name, fact in facts.items() if fact.latitude_deg is not None}
+    if len(placed) < _LEAST_IMAGES or any(fact.altitude_m for fact in placed.values()):
+        return {}, []
+    zeros = [name for name, fact in placed.items() if fact.altitude_m == 0.0]
+    said = f"GPSAltitude is 0 in {len(zeros)} of {len(facts)} images" if zeros else "no image states an altitude"
+    if any(fact.relative_altitude_m for fact in placed.values()) and all(
+        fact.relative_altitude_m is not None for fact in placed.values()
+    ):
+        above = {name: replace(fact, altitude_m=fact.relative_altitude_m) for name, fact in placed.items()}
+        return above, [f"{said}: heights above the take-off point (RelativeAltitude) are used"]
+    return {name: replace(placed[name], altitude_m=None) for name in zeros}, [f"{said}: not used"] if zeros else []
+
+
+def _sounder(what: str, names: Sequence[str], exif_m: FloatArray, xmp_m: FloatArray) -> tuple[set[str], list[str]]:
+    """Images of which XMP counts, and what is said. exif_m, xmp_m: (N, K)."""
+    apart_m = np.linalg.norm(xmp_m - exif_m, axis=1)
+    far = apart_m > _ALIKE_M
+    if not far.any():
+        return set(), []
+    contradiction = f"EXIF and XMP state different {what} of {_some(names, far)}, by {np.median(apart_m[far]):,.1f} m"
+    counts = [sum(len(np.unique(column)) for column in one.T) for one in (exif_m, xmp_m)]
+    if counts[0] <= _COARSE * counts[1]:
+        return set(names), [f"{contradiction}: EXIF has the same or rounded numbers in many images, so XMP is used"]
+    if counts[1] <= _COARSE * counts[0]:
+        return set(), [f"{contradiction}: XMP has the same or rounded numbers in many images, so EXIF is used"]
+    strays = _strays(exif_m, far) & ~_strays(xmp_m, far)
+    remarks = []
+    if strays.any():
+        remarks.append(f"EXIF states {what} of {_some(names, strays)} far from all others, XMP does not: XMP is used")
+    if (far & ~strays).any():
+        rest = far & ~strays
+        remarks.append(
+            f"EXIF and XMP state different {what} of {_some(names, rest)}, by {np.median(apart_m[rest]):,.1f} m: EXIF "
+            "is used"
+        )
+    return {name for name, stray in zip(names, strays, strict=True) if stray}, remarks
+
+
+def _strays(places_m: FloatArray, far: BoolArray) -> BoolArray:
+    """(N,) which lie elsewhere than those that both state alike, which must be most of them."""
+    if 2 * far.sum() >= len(far):
+        return np.zeros(len(far), dtype=bool)
+    middle = np.median(places_m[~far], axis=0)
+    distances = np.linalg.norm(places_m - middle, axis=1)
+    return np.asarray(distances > _ELSEWHERE * distances[~far].max() + _ELSEWHERE_M)
+
+
+def _some(names: Sequence[str], chosen: BoolArray) -> str:
+    shown = [name for name, one in zip(names, chosen, strict=True) if one]
+    return f"{len(shown)} of {len(names)} images ({', '.join(shown[:_NAMES])}{', ...' if len(shown) > _NAMES else ''})"

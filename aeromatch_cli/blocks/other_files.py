@@ -1,0 +1,77 @@
+"""Files of a folder of images that are none of the block, by their names: masks, and what is not
+read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+
+from aeromatch_cli.images import heif
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
+KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
+MASK = "masks of images by their names, not images: give the folder with --masks to use them"
+
+# Metashape and ODM (a_mask.png, a_mask.jpg), RealityCapture (a.jpg.mask.png).
+_MASK_ENDINGS = ("_mask", ".mask")
+_MASK_FOLDERS = ("mask", "masks")
+_RAW = (
+    *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
+    *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw"),
+)
+_OTHER_PICTURES = (".avif", ".webp", ".jxl", ".bmp", ".gif")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".insv", ".lrv")
+
+
+def image_suffixes() -> tuple[str, ...]:
+    """Of what is read here: HEIC only where pillow-heif is installed."""
+    return (*_SUFFIXES, *heif.SUFFIXES) if heif.readable() else _SUFFIXES
+
+
+def masks_among(names: Iterable[str]) -> set[str]:
+    """Those of these pictures that are masks of others of them. names: relative, with forward slashes."""
+    found = list(names)
+    places = {name: PurePosixPath(name) for name in found}
+    pictures = {name for name in found if not _in_mask_folder(places[name])}
+    beside = {(places[name].parent, key) for name in pictures for key in _keys(places[name].name)}
+    anywhere = {key for _, key in beside}
+    masks = set()
+    for name in found:
+        place, own = places[name], places[name].stem.lower()
+        masked = next((own.removesuffix(end) for end in _MASK_ENDINGS if own.endswith(end)), "")
+        if name not in pictures:
+            is_mask = bool({own, masked} & anywhere)
+        elif masked:
+            is_mask = (place.parent, masked) in beside
+        else:  # COLMAP's: a.jpg.png beside a.jpg
+            is_mask = own.endswith(image_suffixes()) and (place.parent, own) in beside
+        if is_mask:
+            masks.add(name)
+    return masks
+
+
+def unread_kind(name: str) -> str:
+    """What a file is that shows something and is not read, with the remedy; "" for any other file."""
+    suffix = PurePosixPath(name).suffix.lower()
+    if suffix in _RAW:
+        return "raw pictures are not read: develop them to JPEG or TIFF in full size, without correction of the lens"
+    if suffix in heif.SUFFIXES:
+        return (
+            "HEIC is read where pillow-heif is installed (pip install 'aeromatch[heif]'); else convert to JPEG or TIFF "
+            "in full size, with the metadata"
+        )
+    if suffix in _OTHER_PICTURES:
+        return f"{suffix[1:].upper()} is not read: convert to JPEG or TIFF in full size, with the metadata"
+    if suffix in _VIDEOS:
+        return "videos are not read: extract pictures, and give their positions with --poses"
+    return ""
+
+
+def _keys(file: str) -> set[str]:
+    """Under which names a mask may speak of a picture."""
+    lowered = file.lower()
+    return {lowered, lowered.rpartition(".")[0]}
+
+
+def _in_mask_folder(place: PurePosixPath) -> bool:
+    return any(part.lower() in _MASK_FOLDERS for part in place.parts[:-1])
