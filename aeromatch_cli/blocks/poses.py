@@ -15,6 +15,10 @@ Columns, in any order and case (aliases in brackets):
   sigma_omega_deg sigma_phi_deg sigma_kappa_deg   the largest counts
   frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
 
+Lengths are metres and angles degrees unless the name of the column says otherwise (`alt_ft`, `x [us-ft]`, `omega_gon`,
+`yaw (rad)`, `accuracy_mm`), or a comment above the header (`# angles in gon`, `# heights: feet`); a cell may have its
+own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and seconds.
+
 Beside x y or lat lon, a height under another name (altitude, ellipsoidal height, height, elevation) is taken and said;
 heights above ground (relative_altitude, agl) are refused.
 
@@ -30,12 +34,22 @@ import csv
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
+from aeromatch_cli.blocks.units import (
+    Kind,
+    degrees_of,
+    factor,
+    is_relative,
+    kind_of,
+    metres_of,
+    named_column,
+    stated_units,
+)
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -72,19 +86,28 @@ _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
+    **{"x/longitude": "lon", "y/latitude": "lat", "longitude/x": "lon", "latitude/y": "lat", "height/z": "alt"},
     **_axis_names("sigma_x_m", "x", "e", "easting"),
     **_axis_names("sigma_y_m", "y", "n", "northing"),
     **_axis_names("sigma_z_m", "z", "u", "elevation", "vertical", "vert", "altitude"),
     **_axis_names("sigma_xy_m", "xy", "horizontal", "horz"),
     **{"hrms": "sigma_xy_m", "vrms": "sigma_z_m", "gpsxyaccuracy": "sigma_xy_m", "gpszaccuracy": "sigma_z_m"},
     **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
+    **{"sigma_angle": "sigma_angle_deg"} | {f"sigma_{name}": f"sigma_{name}_deg" for name in ("omega", "phi", "kappa")},
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
 }
 # Columns that are taken for z or alt where there is none, the likeliest first.
 _OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "ellipsoidal_height", "ellipsoid_height", "orthometric_height",
                   "height", "elevation", "h")  # fmt: skip
 # Heights above ground, or above where the flight began.
-_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "rel_alt")
+_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "altitude_agl", "rel_alt", "salt", "height_above_ground",
+                     "height_above_takeoff", "altitude_above_ground", "altitude_above_takeoff")  # fmt: skip
+# Every name of a column, in lower case, and the one that it has here.
+_NAMES: Mapping[str, str] = {
+    **{name: name for name in (*_KNOWN, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, "gps_altitude")},
+    **_ALIASES,
+}
+_HEIGHTS = (*_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS)
 _BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 _LARGEST_LATITUDE_DEG = 90.0
 # So many latitudes that are none are no slip of the pen.
@@ -151,6 +174,7 @@ class _Layout:
     position_kind: PositionKind
     attitude_kind: AttitudeKind
     ignored: tuple[str, ...]
+    factors: Mapping[str, float]  # metres or degrees of one unit, by column
     height: str = ""  # the column that is taken for z or alt under another name
 
 
@@ -239,10 +263,11 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
     # A header behind a comment mark counts only where the first plain line is none.
     for place in [*places, *range(first - 1, -1, -1)]:
         number, line = lines[place]
-        separator, columns = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
+        separator, columns, units = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
         if "image" in columns and len(columns) > 1:
             records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
-            return number, _layout(path, number, separator, columns), records
+            said = stated_units(text for _, text in lines)
+            return number, _layout(path, number, separator, columns, units, said), records
     number, line = lines[min(first, len(lines) - 1)]
     found = ", ".join(_columns(line.strip())[1])[:120]
     raise ConfigError(
@@ -251,43 +276,86 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
     )
 
 
-def _columns(line: str) -> tuple[str | None, tuple[str, ...]]:
-    """The separator under which most column names are known, and the canonical names."""
-    best: tuple[int, str | None, tuple[str, ...]] = (-1, None, ())
+def _columns(line: str) -> tuple[str | None, tuple[str, ...], tuple[str, ...]]:
+    """The separator under which most column names are known, the canonical names, and the units that they state."""
+    best: tuple[int, str | None, list[tuple[str, str]]] = (-1, None, [])
     for separator in (",", ";", "\t", None):
         cells = line.split(separator) if separator else line.split()
-        names = tuple(_canonical(cell) for cell in cells)
-        known = sum(name in _KNOWN for name in names)
+        columns = [_canonical(cell) for cell in cells]
+        known = sum(name in _KNOWN for name, _ in columns)
         if known > best[0]:
-            best = (known, separator, names)
-    return best[1], best[2]
+            best = (known, separator, columns)
+    return best[1], tuple(name for name, _ in best[2]), tuple(unit for _, unit in best[2])
 
 
-def _canonical(cell: str) -> str:
+def _canonical(cell: str) -> tuple[str, str]:
     if len(cell) > _LONGEST_NAME:
-        return cell[:_LONGEST_NAME]  # no name, and the pattern would take hours for a hundred thousand brackets
-    name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", cell.strip().strip("\"'").strip().lower())
-    name = re.sub(r"[\s-]+", "_", name)
-    return _ALIASES.get(name, name)
+        return cell[:_LONGEST_NAME], ""  # no name, and the pattern would take hours for a hundred thousand brackets
+    name, unit = named_column(cell, _NAMES)
+    return (_RELATIVE_HEIGHTS[0], "") if name in _OTHER_HEIGHTS and is_relative(unit) else (name, unit)
 
 
-def _layout(path: Path, number: int, separator: str | None, columns: tuple[str, ...]) -> _Layout:
+def _kind(column: str) -> Kind | None:
+    """Whether a column holds lengths or angles, None for neither."""
+    if column in ("lat", "lon") or column.endswith("_deg"):
+        return "angle"
+    return "length" if column in ("x", "y", *_HEIGHTS) or column in _ALL_SIGMAS else None
+
+
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Mapping[str, str]) -> dict[str, float]:
+    """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
+    found: dict[str, float] = {}
+    for column, unit in zip(columns, units, strict=True):
+        kind = _kind(column)
+        if kind is None:
+            continue
+        if column in _ALL_SIGMAS:
+            subjects: tuple[str, ...] = ("accuracies",)
+        elif column in _HEIGHTS:
+            subjects = ("heights", "coordinates", "units")
+        else:
+            subjects = ("coordinates", "units") if column in ("x", "y", "lat", "lon") else ("angles", "units")
+        stated = (said[subject] for subject in subjects if subject in said)
+        # Coordinates in degrees say nothing of heights, and one unit of all that is given nothing of the other kind.
+        others = (text for text in stated if kind_of(text) == kind or subjects[0] in said)
+        found[column] = factor(where, column, unit or next(others, ""), kind)
+    return found
+
+
+def _layout(
+    path: Path, number: int, separator: str | None, columns: tuple[str, ...], units: tuple[str, ...],
+    said: Mapping[str, str],
+) -> _Layout:  # fmt: skip
     where = f"{path}, line {number}"
     twice = sorted({name for name in columns if name and columns.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
+    factors = _factors(where, columns, units, said)
     columns, height = _with_height(columns)
+    if height:
+        factors |= {own: factors[height] for own in ("z", "alt") if own in columns}
     unknown = tuple(name for name in columns if name and name not in _KNOWN)
     for name in unknown:
         near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
-        if near and len(name) > 2:
+        if near and len(name) > 2 and name not in _HEIGHTS:
             raise ConfigError(f"{where}: unknown column {name!r}: did you mean {near[0]!r}?")
     position = _form(where, "position", _POSITIONS, columns, unknown)
     if position is None:
         raise ConfigError(f"{where}: no position: add the columns x,y,z or lat,lon,alt")
+    if "relative" in said and _POSITIONS[cast(PositionKind, position)][2] in columns:
+        raise ConfigError(
+            f"{path}: {said['relative']!r} says that heights do not count from a datum: leave the column out, or give "
+            "heights above the ellipsoid or sea level"
+        )
     attitude = _form(where, "attitude", _ATTITUDES, columns, unknown)
     return _Layout(
-        separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown, height
+        separator,
+        columns,
+        cast(PositionKind, position),
+        cast(AttitudeKind, attitude or "none"),
+        unknown,
+        factors,
+        height,
     )
 
 
@@ -347,7 +415,7 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         raise ConfigError(f"{path}, line {number}, column image: empty: name the image")
 
     def numbers(names: tuple[str, ...]) -> tuple[float | None, ...]:
-        return tuple(_number(path, number, name, record[name]) for name in names)
+        return tuple(_number(path, number, name, record[name], layout.factors.get(name, 1.0)) for name in names)
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
     x_m, y_m, z_m, across_m = (numbers((name,))[0] if name in record else None for name in _AXIS_SIGMAS)
@@ -391,17 +459,22 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     )
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float | None:
-    """The value of a cell, None where it is empty or NaN. Raises ConfigError where it is no number or out of range."""
+def _number(path: Path, line: int, column: str, cell: str, unit: float) -> float | None:
+    """The value of a cell in metres or degrees, None where it is empty or NaN. unit: one of the column's, in these.
+
+    Raises ConfigError where it is no number or out of range.
+    """
     where = f"{path}, line {line}, column {column}"
     if cell.lower() in _BLANKS:
         return None
-    if cell.count(",") == 1 and "." not in cell:  # beside commas as separators it stands in quotes
-        cell = cell.replace(",", ".")
-    try:
-        value = float(cell)
-    except ValueError as error:
-        raise ConfigError(f"{where}: {cell!r} is not a number") from error
+    kind = _kind(column)
+    if kind == "length":
+        value = metres_of(cell, unit)
+    else:
+        plain = degrees_of(cell, {"lat": "NS", "lon": "EW"}.get(column, ""))
+        value = None if plain is None else plain * unit
+    if value is None:
+        raise ConfigError(f"{where}: {cell!r} is not a number")
     if math.isnan(value):
         return None
     largest = _RANGES.get(column, _LARGEST_ANGLE_DEG if column.endswith("_deg") else math.inf)

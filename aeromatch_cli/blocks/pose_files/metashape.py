@@ -25,6 +25,7 @@ from aeromatch_cli.blocks.lenses import of_metashape
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.units import factor, named_column
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
@@ -46,7 +47,8 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     crs: str | None = None
     kind: PositionKind | None = None
     system = ""
-    columns: list[str] = []
+    columns: Sequence[str] = ()
+    factors: Mapping[str, float] = {}
     rows: list[PoseRow] = []
     used_estimated = disabled = 0
     separator, angles = ",", _ANGLES[0]
@@ -58,8 +60,9 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             system = f", {crs or ('WGS84' if kind == 'geographic' else 'local')}"
         elif not columns and re.match(r"#?\s*label\b", stripped, re.IGNORECASE):
             separator = max(",;\t", key=stripped.count)
-            columns = [_column(cell) for cell in stripped.lstrip("#").split(separator)]
+            columns, units = zip(*map(_column, stripped.lstrip("#").split(separator)), strict=True)
             kind = kind or ("geographic" if "longitude" in stripped.lower() else "grid")
+            factors = _factors(source.at(line), columns, units, kind == "geographic")
             angles = _angle_columns(columns)
         elif stripped and not stripped.startswith("#"):
             if not columns:
@@ -68,7 +71,7 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             record = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
             if record.get("enable", "1").lower() in ("0", "false"):
                 disabled += 1
-            row, from_estimate = _row(source, line, record, angles, kind == "geographic", separator, estimated)
+            row, from_estimate = _row(source, line, record, angles, kind == "geographic", separator, estimated, factors)
             rows.append(row)
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
@@ -84,12 +87,22 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     )
 
 
-def _column(cell: str) -> str:
-    """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names."""
-    name = cell.strip().strip('"').lower()
+def _column(cell: str) -> tuple[str, str]:
+    """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names, and the unit that they state."""
+    name, unit = named_column(cell, {})
     name = re.sub(r"^([xyz])/[a-z]+", r"\1", name)
-    name = re.sub(r"[\s_]*\((m|deg|pix)\)$", "", name)
-    return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", re.sub(r"\s+", "_", name))
+    return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", name), unit
+
+
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], geographic: bool) -> dict[str, float]:
+    """Metres or degrees of one unit of the columns that state one. Raises ConfigError naming the column."""
+    found = {}
+    for name, unit in zip(columns, units, strict=True):
+        parts = set(name.removeprefix("accuracy_").removesuffix("_est").split("/"))
+        turns = bool(parts & set(_ANGLES[0] + _ANGLES[1])) or (geographic and name[:1] in "xy" and parts <= {"x", "y"})
+        if unit and (turns or parts <= {"x", "y", "z", "accuracy"}):
+            found[name] = factor(where, name, unit, "angle" if turns else "length")
+    return found
 
 
 def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
@@ -103,11 +116,13 @@ def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
 
 def _row(
     source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], geographic: bool,
-    separator: str, estimated: bool,
+    separator: str, estimated: bool, factors: Mapping[str, float],
 ) -> tuple[PoseRow, bool]:  # fmt: skip
     def value(name: str) -> float:
         cell = record.get(name, "")
-        return number(source.at(line, name), cell, decimal_comma=separator != ",") if cell else math.nan
+        if not cell:
+            return math.nan
+        return number(source.at(line, name), cell, decimal_comma=separator != ",") * factors.get(name, 1.0)
 
     def triple(names: Sequence[str]) -> tuple[tuple[float, ...], bool]:
         own = tuple(value(f"{name}_est") for name in names)

@@ -28,6 +28,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     number,
     numbers,
     rotation_row,
+    units_of_comments,
 )
 from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
 from aeromatch_cli.errors import ConfigError
@@ -48,6 +49,7 @@ def is_geolocation(source: Source) -> bool:
 def read_geolocation(source: Source, angles: str = "") -> PoseList:
     """angles: "opk" or "ypr", "" to go by the numbers. Raises ConfigError with line and column."""
     table: list[tuple[int, str, list[float]]] = []
+    said = units_of_comments(source)
     for line, record in source.records():
         cells = cells_of(record)
         if len(cells) not in _COUNTS:
@@ -56,6 +58,9 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
         values = [
             number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
         ]
+        across_m, up_m, angle_deg = (one or 1.0 for one in (said.across_m, said.up_m, said.angle_deg))
+        units = [across_m, across_m, up_m, *([angle_deg] * 3 if len(values) >= 6 else [])]
+        values[: len(units)] = [a * b for a, b in zip(values, units, strict=False)]
         table.append((line, cells[0], values))
     places = np.array([values[:2] for _, _, values in table])
     kind: PositionKind = "geographic" if np.abs(places).max() <= 180.0 else "grid"

@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
+from aeromatch_cli.blocks.units import Kind, factor, kind_of, stated_units
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -119,6 +120,34 @@ class Source:
     def at(self, line: int, column: str = "") -> str:
         """A place for messages."""
         return f"{self.path}, line {line}" + (f", column {column}" if column else "")
+
+
+@dataclass(frozen=True)
+class Units:
+    """Metres of one unit of x and y, and of a height, degrees of one unit of angles, None where nothing says so."""
+
+    across_m: float | None = None
+    up_m: float | None = None
+    angle_deg: float | None = None
+
+
+def units_of_comments(source: Source) -> Units:
+    """What the comments of a file without header say. Raises ConfigError where heights do not count from a datum."""
+    said = stated_units(source.lines)
+    if "relative" in said:
+        raise ConfigError(
+            f"{source.path}: {said['relative']!r} says that heights do not count from a datum: leave them out, or give "
+            "heights above the ellipsoid or sea level"
+        )
+
+    def of(kind: Kind, *subjects: str) -> float | None:
+        text = next((said[one] for one in subjects if kind_of(said.get(one, "")) == kind), "")
+        return factor(str(source.path), subjects[0], text, kind) if text else None
+
+    return Units(
+        of("length", "coordinates", "units"), of("length", "heights", "coordinates", "units"),
+        of("angle", "angles", "units"),
+    )  # fmt: skip
 
 
 @dataclass

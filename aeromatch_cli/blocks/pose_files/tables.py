@@ -28,6 +28,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     number,
     numbers,
     rotation_row,
+    units_of_comments,
 )
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.data import FloatArray
@@ -64,21 +65,28 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
         ]
         table.append((line, cells[0], values))
     angles = np.array([values[3:] for _, _, values in table])
+    said = units_of_comments(source)
     gon = unit == "gon" or (not unit and bool(len(angles)) and float(np.abs(angles).max()) > _FULL_DEG)
-    angles = angles * (_GON_DEG if gon else 1.0)
+    one_deg = _GON_DEG if gon else 1.0
+    if not unit and said.angle_deg is not None:
+        one_deg = said.angle_deg
+    angles = angles * one_deg
+    metres = (said.across_m or 1.0, said.across_m or 1.0, said.up_m or 1.0)
+    table = [(line, name, [a * b for a, b in zip(values, metres, strict=False)]) for line, name, values in table]
     rows = []
     for (line, name, values), (first, second, kappa) in zip(table, angles, strict=True):
         numbered = is_number(name)
         if order == "pok":
             photo = rotation_y(first) @ rotation_x(second) @ rotation_z(kappa)
-            row = rotation_row(name, line, values[:3], CAM_FROM_PHOTO @ photo.T)
+            row = rotation_row(name, line, values, CAM_FROM_PHOTO @ photo.T)
         else:
             row = PoseRow(
                 image=image_name(name), line=line, position=(values[0], values[1], values[2]), position_kind="grid",
                 attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
             )  # fmt: skip
         rows.append(replace(row, numbered=numbered))
-    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {'gon' if gon else 'degrees'}"
+    unit_words = {_GON_DEG: "gon", 1.0: "degrees"}.get(one_deg, "radians")
+    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {unit_words}"
     remarks: tuple[str, ...] = ()
     if not (order or unit):
         remarks = (
