@@ -7,10 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import CRS
 
+from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.control_files import read_survey
+from aeromatch_cli.blocks.crs import checked_crs, geographic_from_grid
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.blocks.units import degrees_of, metres_of
+from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 
 FT, US_FT = 0.3048, 1200.0 / 3937.0
@@ -160,3 +164,115 @@ def test_numbers_in_degrees_and_metres() -> None:
     assert degrees_of("1.234,5") is None
     assert metres_of("467,84 ft") == pytest.approx(467.84 * FT)
     assert metres_of("12 parsec") is None
+
+
+# The same place in California's zone 3: metres, and US survey feet of EPSG:2227.
+CALIFORNIA = "EPSG:26943"
+CX, CY, CZ = 1_850_123.456, 650_234.567, 45.678
+
+
+def geo_txt(crs: str, across_m: float, up_m: float, more: str = "") -> str:
+    return f"{crs}\na.jpg {CX / across_m:.6f} {CY / across_m:.6f} {CZ / up_m:.6f}{more}\n"
+
+
+@pytest.mark.parametrize(
+    ("crs", "across_m", "up_m"),
+    [
+        ("EPSG:26943", 1.0, 1.0),
+        ("EPSG:2227", US_FT, US_FT),
+        ("EPSG:2227+6360", US_FT, US_FT),
+        ("EPSG:2227+5703", US_FT, 1.0),
+        ("EPSG:26943+6360", 1.0, US_FT),
+        ("EPSG:26943+8228", 1.0, FT),
+    ],
+)
+def test_a_crs_in_feet_is_brought_to_metres(tmp_path: Path, crs: str, across_m: float, up_m: float) -> None:
+    """The same grid, so that the places are those of the CRS in metres."""
+    found = read_pose_file(written(tmp_path, geo_txt(crs, across_m, up_m), "geo.txt"))
+    np.testing.assert_allclose(found.rows[0].position or (), (CX, CY, CZ), rtol=0, atol=1e-5)
+    assert checked_crs(found.crs or "") == found.crs
+    place = geographic_from_grid(found.crs or "", np.array([[CX, CY]]))
+    np.testing.assert_allclose(place, geographic_from_grid(CALIFORNIA, np.array([[CX, CY]])), rtol=0, atol=1e-9)
+    assert any("heights are read in US survey foot" in text for text in found.warnings) == (crs == "EPSG:2227")
+
+
+@pytest.mark.parametrize(
+    ("crs", "cells", "expected"),
+    [
+        ("EPSG:32633+5773", (X, Y, Z), (X, Y, Z)),
+        ("EPSG: 32633", (X, Y, Z), (X, Y, Z)),
+        ("WGS 84 / UTM zone 33N", (X, Y, Z), (X, Y, Z)),
+        ("WGS84 UTM 33N", (X, Y, Z), (X, Y, Z)),
+        ("WGS84", (LONGITUDE, LATITUDE, Z), (LATITUDE, LONGITUDE, Z)),
+        ("EPSG:4326+6360", (LONGITUDE, LATITUDE, Z / US_FT), (LATITUDE, LONGITUDE, Z)),
+        ("EPSG:4979", (LONGITUDE, LATITUDE, Z), (LATITUDE, LONGITUDE, Z)),
+        # Gon from Paris, and metres that grow towards the poles.
+        ("EPSG:4901", ((LONGITUDE - 2.337229166667) / 0.9, LATITUDE / 0.9, Z), (LATITUDE, LONGITUDE, Z)),
+        ("ESRI:102100", (1490918.5690998, 6892782.3166716, Z), (LATITUDE, LONGITUDE, Z)),
+    ],
+)
+def test_first_lines_of_geo_txt(tmp_path: Path, crs: str, cells: tuple, expected: tuple) -> None:
+    found = read_pose_file(written(tmp_path, f"{crs}\na.jpg {cells[0]:.9f} {cells[1]:.9f} {cells[2]:.9f}\n", "geo.txt"))
+    atol = 1e-6 if found.position_kind == "grid" else 2e-3 if crs == "EPSG:4901" else 1e-7
+    np.testing.assert_allclose(found.rows[0].position or (), expected, rtol=0, atol=atol)
+    assert "ODM geo.txt" in found.format
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"EPSG:4326\na.jpg {X} {Y} 3\n", "line 2: (390949, 5.81892e+06) are no longitude and latitude"),
+        ("EPSG:99999\na.jpg 1 2 3\n", "the CRS 'EPSG:99999' is unknown"),
+        ("EPSG:5773\na.jpg 1 2 3\n", "EGM96 height has no easting and northing"),
+        ("EPSG:32633+5706\na.jpg 1 2 3\n", "counts depths downwards: give heights"),
+    ],
+)
+def test_first_lines_that_cannot_be_meant(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_pose_file(written(tmp_path, text, "geo.txt"))
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("EPSG:3857", "has no true lengths"),
+        ("EPSG:26943+6360", "counts heights in another unit"),
+        ("EPSG:2227", "foot"),
+    ],
+)
+def test_a_world_has_metres(code: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        checked_crs(code)
+
+
+@pytest.mark.parametrize(
+    ("crs", "across_m", "up_m"),
+    [("EPSG:2227", US_FT, US_FT), ("EPSG:2227+5703", US_FT, 1.0), ("EPSG:26943+6360", 1.0, US_FT)],
+)
+@pytest.mark.parametrize("block", [CALIFORNIA, "local"])
+def test_control_points_of_a_crs_in_feet(tmp_path: Path, crs: str, across_m: float, up_m: float, block: str) -> None:
+    line = f"{CX / across_m:.6f} {CY / across_m:.6f} {CZ / up_m:.6f} 10 20 a.jpg p\n"
+    image = Image(image_id="a", name="a.jpg", width_px=100, height_px=100, camera_id="1", exif_orientation=1)
+    points, remarks = read_control(
+        str(written(tmp_path, f"{crs}\n{line}", "gcp.txt")), (image,), block, (0.0, 0.0, 0.0)
+    )
+    np.testing.assert_allclose(points[0].position_m, (CX, CY, CZ), rtol=0, atol=1e-3)
+    assert any("heights are read in US survey foot" in text for text in remarks) == (crs == "EPSG:2227")
+
+
+def test_columns_in_feet_below_a_crs_in_feet_are_converted_once(tmp_path: Path) -> None:
+    wkt = CRS("EPSG:2227").to_wkt()
+    cells = f"{CX / US_FT},{CY / US_FT},{CZ / FT}"
+    marks = written(tmp_path, "a.jpg,p,10,20\n", "marks.csv")
+    written(tmp_path, wkt, "gcp.prj")
+    image = Image(image_id="a", name="a.jpg", width_px=100, height_px=100, camera_id="1", exif_orientation=1)
+    path = written(tmp_path, f"label,x [us-ft],y [us-ft],z [ft]\np,{cells}\n", "gcp.csv")
+    points, _ = read_control(str(path), (image,), CALIFORNIA, (0.0, 0.0, 0.0), marks=str(marks))
+    np.testing.assert_allclose(points[0].position_m, (CX, CY, CZ), rtol=0, atol=1e-3)
+    head = "#Label,X/Easting (us-ft),Y/Northing (us-ft),Z/Altitude (ft),Yaw_(rad),Pitch_(rad),Roll_(rad)"
+    row = read_pose_file(
+        written(tmp_path, f"# CoordinateSystem: {wkt}\n{head}\na,{cells},1,0,0\n", "reference.csv")
+    ).rows[0]
+    np.testing.assert_allclose(row.position or (), (CX, CY, CZ), rtol=0, atol=1e-4)
+    assert row.attitude == pytest.approx((math.degrees(1.0), 0.0, 0.0))

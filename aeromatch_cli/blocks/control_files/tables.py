@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, is_number
 from aeromatch_cli.blocks.units import (
     Kind,
@@ -90,6 +91,10 @@ def read_coordinates(source: Source) -> Survey:
     header, names, units = _header(source, _COORDINATES)
     factors = _factors(source, header, names, units)
     crs, crs_where = _stated_crs(source)
+    if crs is not None and factors.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
+        stated = described_crs(crs_where, crs)
+        factors |= {name: factors.get(name, stated.across_m) / stated.across_m for name in "xy"}
+        factors["z"] = factors.get("z", stated.up_m) / stated.up_m
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
         for line, cells, _ in _rows(source, header)
@@ -191,7 +196,9 @@ def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[st
             if name.startswith("sigma_"):
                 subjects = ("accuracies",)
             others = (text for subject in subjects if kind_of(text := said.get(subject, "")) == kind)
-            found[name] = factor(source.at(line), name, unit or next(others, ""), kind)
+            text = unit or next(others, "")
+            if text:
+                found[name] = factor(source.at(line), name, text, kind)
     return found
 
 

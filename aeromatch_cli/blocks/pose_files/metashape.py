@@ -22,7 +22,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_metashape
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, enu_from_geocentric, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.blocks.units import factor, named_column
@@ -44,9 +44,8 @@ def is_reference(source: Source) -> bool:
 
 def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     """estimated: take the columns `_est` where a line has them. Raises ConfigError with line and column."""
-    crs: str | None = None
-    kind: PositionKind | None = None
-    system = ""
+    system: StatedCrs | None = None
+    stated_one = False
     columns: Sequence[str] = ()
     factors: Mapping[str, float] = {}
     rows: list[PoseRow] = []
@@ -56,13 +55,13 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
         stripped = text.strip()
         stated = re.match(r"#\s*coordinatesystem\s*:\s*(.*)", stripped, re.IGNORECASE)
         if stated:
-            crs, kind = described_crs(source.at(line), stated[1])
-            system = f", {crs or ('WGS84' if kind == 'geographic' else 'local')}"
+            system, stated_one = described_crs(source.at(line), stated[1]), True
         elif not columns and re.match(r"#?\s*label\b", stripped, re.IGNORECASE):
             separator = max(",;\t", key=stripped.count)
             columns, units = zip(*map(_column, stripped.lstrip("#").split(separator)), strict=True)
-            kind = kind or ("geographic" if "longitude" in stripped.lower() else "grid")
-            factors = _factors(source.at(line), columns, units, kind == "geographic")
+            if system is None:
+                system = StatedCrs(kind="geographic" if "longitude" in stripped.lower() else "grid", name="the list")
+            factors = _factors(source.at(line), columns, units, system)
             angles = _angle_columns(columns)
         elif stripped and not stripped.startswith("#"):
             if not columns:
@@ -71,7 +70,9 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             record = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
             if record.get("enable", "1").lower() in ("0", "false"):
                 disabled += 1
-            row, from_estimate = _row(source, line, record, angles, kind == "geographic", separator, estimated, factors)
+            row, from_estimate = _row(
+                source, line, record, angles, system or StatedCrs(), separator, estimated, factors
+            )
             rows.append(row)
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
@@ -82,9 +83,10 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
             "the given one is used"
         )
-    return PoseList(
-        tuple(rows), kind or "grid", tuple(remarks), f"Metashape reference, {', '.join(words)}{system}", crs
-    )
+    system = system or StatedCrs()
+    words += [system.crs or ("WGS84" if system.kind == "geographic" else "local")] if stated_one else []
+    title = f"Metashape reference, {', '.join(words)}"
+    return PoseList(tuple(rows), system.kind, (*system.remarks, *remarks), title, system.crs)
 
 
 def _column(cell: str) -> tuple[str, str]:
@@ -94,14 +96,18 @@ def _column(cell: str) -> tuple[str, str]:
     return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", name), unit
 
 
-def _factors(where: str, columns: Sequence[str], units: Sequence[str], geographic: bool) -> dict[str, float]:
-    """Metres or degrees of one unit of the columns that state one. Raises ConfigError naming the column."""
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], system: StatedCrs) -> dict[str, float]:
+    """What numbers of the columns that state a unit are multiplied by: coordinates count in units of the CRS then, all
+    else in metres and degrees. Raises ConfigError naming the column."""
     found = {}
+    geographic = system.kind == "geographic"
     for name, unit in zip(columns, units, strict=True):
         parts = set(name.removeprefix("accuracy_").removesuffix("_est").split("/"))
         turns = bool(parts & set(_ANGLES[0] + _ANGLES[1])) or (geographic and name[:1] in "xy" and parts <= {"x", "y"})
         if unit and (turns or parts <= {"x", "y", "z", "accuracy"}):
-            found[name] = factor(where, name, unit, "angle" if turns else "length")
+            stem = name.removesuffix("_est")
+            one = system.up_m if stem == "z" else system.across_m if stem in ("x", "y") else 1.0
+            found[name] = factor(where, name, unit, "angle" if turns else "length") / one
     return found
 
 
@@ -115,7 +121,7 @@ def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
 
 
 def _row(
-    source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], geographic: bool,
+    source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], system: StatedCrs,
     separator: str, estimated: bool, factors: Mapping[str, float],
 ) -> tuple[PoseRow, bool]:  # fmt: skip
     def value(name: str) -> float:
@@ -136,10 +142,10 @@ def _row(
     overall_m = overall_m if overall_m > 0.0 else value("accuracy")
     sigmas_m = completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m)
     turns = [v for name in (*angles, "/".join(angles)) if (v := value(f"accuracy_{name}")) > 0.0]
-    kind: PositionKind = "geographic" if geographic else "grid"
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,
-        position=((y, x, z) if geographic else (x, y, z)) if math.isfinite(x + y) else None, position_kind=kind,
+        position=system.position(source.at(line), x, y, z) if math.isfinite(x + y) else None,
+        position_kind=system.kind,
         attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
         forward=False, true_north=angles[0] == "yaw",
         sigmas_m=None if from_estimate else sigmas_m,
@@ -150,7 +156,7 @@ def _row(
     if whole and angles == _ANGLES[2]:
         phi, omega, kappa = attitude
         photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
-        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, kind)
+        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, system.kind)
         return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None), from_estimate
     return row, from_estimate
 

@@ -24,7 +24,12 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import rotation_z
 
-_CRS = re.compile(r"(EPSG:\d+|.*\+proj=.*|WGS84\s+UTM\s+\d{1,2}\s*[NS])", re.IGNORECASE)
+# What names a CRS, and what no line of a list begins with.
+_CRS = re.compile(
+    r"((EPSG|ESRI|IGNF|OGC)\s*:\s*\S.*|.*\+(proj|init)=.*|(PROJ|GEOG|COMPD|GEOD|BOUND)(CS|CRS)\[.*"
+    r"|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
+    re.IGNORECASE,
+)
 _WITH_ANGLES, _WITH_ACCURACIES = 7, 9
 # Angles of all lines that are positive and below this, in degrees, may be standard deviations.
 _LIKE_SIGMAS = 1.0
@@ -39,7 +44,7 @@ def read_geo_txt(source: Source) -> PoseList:
     """Raises ConfigError with file, line and column."""
     records = list(source.records())
     head, text = records[0]
-    crs, kind = described_crs(source.at(head), text)
+    stated = described_crs(source.at(head), text)
     rows: list[PoseRow] = []
     for line, record in records[1:]:
         fields = record.split()
@@ -49,22 +54,22 @@ def read_geo_txt(source: Source) -> PoseList:
         x, y, z = [*values, np.nan, np.nan][:3]
         angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
         across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
-        place = (y, x, z) if kind == "geographic" else (x, y, z)
+        place = stated.position(source.at(line), x, y, z)
         whole = bool(np.isfinite(angles).all())
         rows.append(
             PoseRow(
                 image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
-                position_kind=kind, attitude=tuple(angles) if whole else None,
+                position_kind=stated.kind, attitude=tuple(angles) if whole else None,
                 attitude_kind="yaw_pitch_roll" if whole else "none", forward=False, true_north=True,
                 sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
             )
         )  # fmt: skip
     given = [row.attitude for row in rows if row.attitude is not None]
     words = "yaw, pitch, roll" if given else "positions"
-    remarks: tuple[str, ...] = ()
+    remarks = stated.remarks
     if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
-        remarks = (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
-    return PoseList(tuple(rows), kind, remarks, f"ODM geo.txt, {text}, {words}", crs)
+        remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
+    return PoseList(tuple(rows), stated.kind, remarks, f"ODM geo.txt, {text}, {words}", stated.crs)
 
 
 def _value(where: str, cell: str) -> float:

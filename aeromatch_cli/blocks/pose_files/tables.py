@@ -19,7 +19,7 @@ from pathlib import PureWindowsPath
 
 import numpy as np
 
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import (
     Source,
     cells_of,
@@ -30,7 +30,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
@@ -159,11 +159,10 @@ def is_inpho(source: Source) -> bool:
 def read_inpho(source: Source) -> PoseList:
     """Raises ConfigError with file and line."""
     turns = dict(_mounts(source.lines))
-    crs: str | None = None
-    kind: PositionKind = "grid"
+    system = StatedCrs()
     stated = re.search(r"\$COORDINATE_SYSTEM\s*:\s*(\S.*)", source.text)
     if stated and stated[1].strip().upper().startswith(("PROJCS", "PROJCRS", "EPSG", "GEOGCS", "GEOGCRS", "COMPD")):
-        crs, kind = described_crs(str(source.path), stated[1])
+        system = described_crs(str(source.path), stated[1])
     rows: list[PoseRow] = []
     name, camera = "", ""
     lines = list(source.records("%"))
@@ -184,13 +183,14 @@ def read_inpho(source: Source) -> PoseList:
             following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
             center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
             photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])
-            at = (center[1], center[0], center[2]) if kind == "geographic" else center
-            rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, kind))
+            at = system.position(source.at(line), *center)
+            rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, system.kind))
         elif key == "$END":
             name = ""
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this Inpho project has $EXT_ORI: export it after orientation")
-    return PoseList(tuple(rows), kind, (), f"Inpho project, {crs or 'its coordinate system is not stated'}", crs)
+    words = system.name or "its coordinate system is not stated"
+    return PoseList(tuple(rows), system.kind, system.remarks, f"Inpho project, {words}", system.crs)
 
 
 def _mounts(lines: Sequence[str]) -> Iterator[tuple[str, float]]:
