@@ -5,6 +5,7 @@ The files of ODM, Pix4D and Metashape that hold them are read by `control_files`
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,9 @@ ControlUse = Literal["adjust", "check"]
 
 # Control points so many extents of the block, and so many metres more, from its middle are elsewhere.
 _FAR_EXTENTS, _FAR_M = 5.0, 2000.0
+# More measurements outside their image than these are no slips of the pen: the pixels are those of other pictures.
+_FEW_OUTSIDE, _SHARE_OUTSIDE = 2, 0.25
+_LARGEST_SIZE = 8
 _WGS84 = "EPSG:4326"
 _LATITUDE_DEG, _LONGITUDE_DEG = 90.0, 180.0
 
@@ -217,6 +221,8 @@ def _measured(
         remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
     if twice:
         remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")
+    if len(outside) > max(_FEW_OUTSIDE, _SHARE_OUTSIDE * sum(mark.image in known for mark in marks)):
+        raise ConfigError(f"{path}: {_other_pictures(marks, known, by_name, outside, turned)}")
     if outside:
         question = "are pixel x and y exchanged?" if turned == len(outside) else "were they measured in these pictures?"
         remarks.append(
@@ -224,6 +230,27 @@ def _measured(
             f"({listed(outside)}): {question}"
         )
     return {point: list(seen.items()) for point, seen in found.items() if seen}, remarks
+
+
+def _other_pictures(
+    marks: Sequence[Mark], known: Mapping[str, str], images: Mapping[str, Image], outside: list[str], turned: int
+) -> str:
+    """What is wrong with a file of which many measurements lie outside their image."""
+    count = f"{len(outside)} measurements of control points lie outside their image ({listed(outside)})"
+    if turned == len(outside):
+        return f"{count}, and inside with x and y exchanged: exchange pixel x and y"
+    shares = []
+    for mark in marks:
+        if mark.image in known:
+            image = images[known[mark.image]]
+            shares.append(max(mark.pixel[0] / image.width_px, mark.pixel[1] / image.height_px))
+    times = math.ceil(max(shares) - 1e-9)
+    return (
+        f"{count}: most likely they were measured in pictures of {times} times the size; divide the pixels by {times}, "
+        "or measure in these pictures"
+        if 1 < times <= _LARGEST_SIZE
+        else f"{count}: were they measured in these pictures, from the upper left corner?"
+    )
 
 
 def _inside(image: Image, x: float, y: float) -> bool:

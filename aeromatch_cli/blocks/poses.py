@@ -40,6 +40,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
+from aeromatch_cli.blocks.fields import with_name, words_of
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,
@@ -130,8 +131,8 @@ class PoseRow:
     says; None with "none". camera: "" where not given. forward: of yaw, pitch, roll, whether the optical axis is body x
     (gimbal) or down (nadir) at zero angles; None where the format leaves it open. true_north: angles and quaternions of
     grid positions count from true north instead of grid north; those of latitudes and longitudes, too. numbered: the
-    image is named by its running number alone. sigmas_m: standard deviations to the east, to the north and of the
-    height.
+    image is named by its running number alone. time_s: of the exposure, in GPS time. sigmas_m: standard deviations to
+    the east, to the north and of the height.
     """
 
     image: str
@@ -146,6 +147,7 @@ class PoseRow:
     forward: bool | None = None
     true_north: bool = False
     numbered: bool = False
+    time_s: float | None = None
 
     @property
     def sigma_position_m(self) -> float | None:
@@ -186,7 +188,7 @@ def read_poses(path: Path) -> PoseList:
     rows: list[PoseRow] = []
     lines_of: dict[str, int] = {}
     for number, line in records:
-        row = _row(path, number, _split(path, number, line, layout.separator), layout, faults)
+        row = _row(path, number, _split(path, number, line, layout), layout, faults)
         if row.image in lines_of:
             raise ConfigError(
                 f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
@@ -391,11 +393,13 @@ def _form(
     return str(present[0])
 
 
-def _split(path: Path, number: int, line: str, separator: str | None) -> list[str]:
-    if separator is None:
-        return line.split()
+def _split(path: Path, number: int, line: str, layout: _Layout) -> list[str]:
+    if layout.separator is None:
+        cells = words_of(line)
+        more = len(cells) - len(layout.columns)
+        return with_name(cells, layout.columns.index("image"), more + 1) if more > 0 else cells
     try:
-        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        return next(csv.reader([line], delimiter=layout.separator, skipinitialspace=True))
     except (csv.Error, StopIteration) as error:
         raise ConfigError(f"{path}, line {number}: not a line of separated values ({error})") from error
 

@@ -1,7 +1,7 @@
 """OpenDroneMap's gcp_list.txt: coordinates and image measurements in one file.
 
 First line: the CRS of the coordinates, as a code (EPSG:32633), a PROJ string, or "WGS84 UTM 33N". Then one line for
-every point in every image, separated by blanks or tabs:
+every point in every image, separated by blanks, tabs, commas or semicolons:
 
   geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z [accuracy_px]]
 
@@ -17,6 +17,7 @@ from dataclasses import replace
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.source import Source, is_number, number
 from aeromatch_cli.errors import ConfigError
 
@@ -45,18 +46,26 @@ def read_gcp_list(source: Source) -> Survey:
 
 
 def _row(source: Source, line: int, record: str) -> tuple[SurveyedPoint, Mark]:
-    cells = [cell.strip() for cell in record.split("\t")] if "\t" in record else record.split()
+    fields, comma = fields_of(record)
+    while fields and not fields[-1]:
+        fields.pop()
+    cells = with_name(fields, 5)
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
-    x, y, z = (number(source.at(line, what), cell) for what, cell in zip(("x", "y", "z"), cells[:3], strict=True))
+    x, y, z = (
+        number(source.at(line, what), cell, decimal_comma=comma)
+        for what, cell in zip(("x", "y", "z"), cells[:3], strict=True)
+    )
     named = len(cells) > 6 and not is_check(cells[6])
     name = cells[6] if named else " ".join(cells[:3])
     rest = [cell for cell in cells[7 if named else 6 :] if not is_check(cell)]
-    sigmas = [float(cell) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
+    sigmas = (
+        [float(cell.replace(",", ".")) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
+    )
     if not all(0.0 < sigma < float("inf") for sigma in sigmas):
         sigmas = []
     across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
     check = any(map(is_check, cells[6:]))
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
-    return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px)
+    return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px, comma=comma)

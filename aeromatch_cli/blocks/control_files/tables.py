@@ -20,8 +20,9 @@ from collections.abc import Mapping, Sequence
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
+from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, is_number
+from aeromatch_cli.blocks.pose_files.source import Source, is_number
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,

@@ -1,8 +1,9 @@
 """OpenDroneMap: geo.txt, and the shots.geojson that ODM and WebODM export.
 
-geo.txt (opendm/geo.py): the CRS in the first line, then `name x y [z] [yaw pitch roll] [h_acc v_acc] ...`; x is the
-easting or longitude in every CRS; angles where the line has seven fields and more, accuracies from nine on; yaw, pitch,
-roll are zero for a camera that looks straight down with the image's top to the north.
+geo.txt (opendm/geo.py): the CRS in the first line, then `name x y [z] [yaw pitch roll] [h_acc v_acc] ...`, between
+blanks or any other separator; x is the easting or longitude in every CRS; angles where the line has seven fields and
+more, accuracies from nine on; yaw, pitch, roll are zero for a camera that looks straight down with the image's top to
+the north.
 
 shots.geojson (opendm/shots.py): Point [lon, lat, alt]; `rotation` is the angle-axis vector of cam_from_world relative
 to the grid of the UTM zone.
@@ -17,6 +18,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
+from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
@@ -47,10 +49,11 @@ def read_geo_txt(source: Source) -> PoseList:
     stated = described_crs(source.at(head), text)
     rows: list[PoseRow] = []
     for line, record in records[1:]:
-        fields = record.split()
+        cells, comma = fields_of(record)
+        fields = with_name(cells, 0)
         if len(fields) < 3:
             raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
-        values = [_value(source.at(line, f"{column}"), cell) for column, cell in enumerate(fields[1:9], start=2)]
+        values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
         x, y, z = [*values, np.nan, np.nan][:3]
         angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
         across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
@@ -72,8 +75,8 @@ def read_geo_txt(source: Source) -> PoseList:
     return PoseList(tuple(rows), stated.kind, remarks, f"ODM geo.txt, {text}, {words}", stated.crs)
 
 
-def _value(where: str, cell: str) -> float:
-    return float("nan") if cell.lower() == "nan" else number(where, cell)
+def _value(where: str, cell: str, comma: bool) -> float:
+    return float("nan") if cell.lower() in ("nan", "") else number(where, cell, decimal_comma=comma)
 
 
 def is_shots(source: Source) -> bool:

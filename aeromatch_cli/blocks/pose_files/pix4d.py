@@ -18,11 +18,10 @@ from functools import partial
 import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.fields import IMAGE, fields_of
 from aeromatch_cli.blocks.pose_files.source import (
-    IMAGE,
     CameraShelf,
     Source,
-    cells_of,
     image_name,
     is_number,
     number,
@@ -42,7 +41,7 @@ def is_geolocation(source: Source) -> bool:
     record = next((line for _, line in source.records()), "")
     if "," not in record and ";" not in record:
         return False
-    cells = cells_of(record)
+    cells = fields_of(record)[0]
     return len(cells) in _COUNTS and bool(IMAGE.fullmatch(cells[0])) and all(map(is_number, cells[1:]))
 
 
@@ -51,10 +50,9 @@ def read_geolocation(source: Source, angles: str = "") -> PoseList:
     table: list[tuple[int, str, list[float]]] = []
     said = units_of_comments(source)
     for line, record in source.records():
-        cells = cells_of(record)
+        cells, comma = fields_of(record)
         if len(cells) not in _COUNTS:
             raise ConfigError(f"{source.at(line)}: {len(cells)} values, a line of Pix4D's geolocation has 4, 6, 7 or 9")
-        comma = ";" in record or "\t" in record
         values = [
             number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
         ]

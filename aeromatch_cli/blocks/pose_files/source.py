@@ -23,8 +23,6 @@ from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
 _LARGEST_BYTES = 2_000_000_000
-# A name that is an image's.
-IMAGE = re.compile(r".+\.(jpe?g|tiff?|jp2|j2k|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -171,14 +169,6 @@ class CameraShelf:
     def key(self, wanted: str) -> str:
         """The name for a row, "" where there is no such camera."""
         return wanted if wanted in self.found else ""
-
-
-def cells_of(line: str) -> list[str]:
-    """Values of a line without header: semicolons and tabs before commas before blanks."""
-    for separator in (";", "\t", ","):
-        if separator in line:
-            return [cell.strip().strip('"') for cell in line.split(separator)]
-    return line.split()
 
 
 def number(where: str, cell: str, *, decimal_comma: bool = False) -> float:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from aeromatch_cli.blocks.fields import IMAGE, fields_of
 from aeromatch_cli.blocks.pose_files import (
     blocks_exchange,
     colmap,
@@ -20,7 +22,7 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, cells_of, is_number, world_beside
+from aeromatch_cli.blocks.pose_files.source import Source, is_number, world_beside
 from aeromatch_cli.blocks.poses import PoseList, read_poses
 from aeromatch_cli.errors import ConfigError
 
@@ -43,6 +45,20 @@ def _named_columns(source: Source) -> PoseList:
     crs, _ = world_beside(source)
     own = source.name == "orientation.csv" and found.position_kind == "grid" and crs is not None
     return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else found
+
+
+_MISSION_PLANNER = re.compile(r"#\s*name\s+latitude/y\s+longitude/x\b.*", re.IGNORECASE)
+
+
+def _is_mission_planner(source: Source) -> bool:
+    return any(_MISSION_PLANNER.match(line.strip()) for line in source.lines[:5])
+
+
+def _mission_planner(source: Source) -> PoseList:
+    """Angles are the aircraft's, below which the camera looks down; SAlt is the height above ground."""
+    found = read_poses(source.path)
+    rows = tuple(replace(row, forward=False) for row in found.rows)
+    return replace(found, rows=rows, format="Mission Planner location.txt")
 
 
 # In the order in which they are tried: those that nothing else looks like first.
@@ -68,6 +84,8 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
     "exiftool": PoseFormat("ExifTool -csv or -json", exiftool.read_exiftool, exiftool.is_exiftool),
     "odm": PoseFormat("ODM geo.txt", odm.read_geo_txt, odm.is_geo_txt),
     "dji-mrk": PoseFormat("DJI *_Timestamp.MRK", dji.read_mrk, dji.is_mrk),
+    "mission-planner": PoseFormat("Mission Planner location.txt", _mission_planner, _is_mission_planner),
+    "bingo": PoseFormat("BINGO's records ORIA", tables.read_oria, tables.is_oria),
     "bundler": PoseFormat("Bundler .out with list.txt", scenes.read_bundler, scenes.is_bundler),
     "nvm": PoseFormat("VisualSFM .nvm", scenes.read_nvm, scenes.is_nvm),
     "inpho": PoseFormat("Inpho project .prj", tables.read_inpho, tables.is_inpho),
@@ -161,7 +179,7 @@ def _by_content(source: Source) -> str:
         if tree.get("type") == "FeatureCollection":
             return "GeoJSON: export its table as CSV with the image names and the coordinates"
     record = next((line for _, line in source.records()), "")
-    cells = cells_of(record) or [""]
+    cells = fields_of(record)[0] or [""]
     if cells[0].lower() == "track" or (len(cells) == 1 and cells[0].startswith("OPENSFM_TRACKS_VERSION")):
         return "a list of tracks, which are tie points: give the poses of the images"
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):

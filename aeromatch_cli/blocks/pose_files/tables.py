@@ -3,6 +3,8 @@
 Lines without header are `name x y z a1 a2 a3`. Nothing in them says what the angles are; omega, phi, kappa in degrees
 are taken unless one is beyond 360, which only gon are, and --pose-format opk-gon, pok or pok-gon say otherwise.
 
+BINGO's own records are `ORIA name x y z omega phi kappa`, in gon; others in the file are passed over.
+
 PATB (three records of fixed width): number, x, y, z; a11 to a22; a23 to a33. Programs write the matrix in one direction
 or the other: the one is taken by which the flight goes along a side of the images.
 
@@ -19,10 +21,10 @@ from pathlib import PureWindowsPath
 
 import numpy as np
 
+from aeromatch_cli.blocks.fields import fields_of, with_name, words_of
 from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import (
     Source,
-    cells_of,
     image_name,
     is_number,
     number,
@@ -38,12 +40,13 @@ from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _NAMES = ("name", "x", "y", "z", "a1", "a2", "a3")
 _GON_DEG = 0.9
+_ORIA = "ORIA"
 _FULL_DEG = 360.0
 
 
 def is_plain_table(source: Source) -> bool:
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
-    tables = [cells_of(record) for record in records]
+    tables = [with_name(fields_of(record)[0], 0) for record in records]
     return bool(tables) and all(
         (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
         or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
@@ -55,10 +58,10 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
     """order: "opk" or "pok". unit: "deg" or "gon". "" for what is usual. Raises ConfigError with line and column."""
     table = []
     for line, record in source.records():
-        cells = cells_of(record)
+        fields, comma = fields_of(record)
+        cells = with_name(fields, 0)
         if len(cells) != len(_NAMES):
             raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {', '.join(_NAMES)}")
-        comma = ";" in record or "\t" in record
         values = [
             number(source.at(line, name), cell, decimal_comma=comma)
             for name, cell in zip(_NAMES[1:], cells[1:], strict=True)
@@ -104,6 +107,33 @@ read_pok, read_pok_gon = (
     partial(read_plain_table, order="pok", unit="deg"),
     partial(read_plain_table, order="pok", unit="gon"),
 )
+
+
+def is_oria(source: Source) -> bool:
+    return any(
+        record.split(maxsplit=1)[0] == _ORIA for _, (_, record) in zip(range(100), source.records(), strict=False)
+    )
+
+
+def read_oria(source: Source) -> PoseList:
+    """Raises ConfigError with line and column."""
+    rows, more = [], False
+    for line, record in source.records():
+        cells = words_of(record)
+        if cells[0] != _ORIA:
+            continue
+        values = numbers(source.at(line), cells[2:], ("x", "y", "z", "omega", "phi", "kappa"))
+        more |= len(cells) > 2 + len(values)
+        omega, phi, kappa = (_GON_DEG * angle for angle in values[3:])
+        rows.append(
+            PoseRow(
+                image=image_name(cells[1]), line=line, position=(values[0], values[1], values[2]),
+                position_kind="grid", attitude=(omega, phi, kappa), attitude_kind="omega_phi_kappa",
+                numbered=is_number(cells[1]),
+            )
+        )  # fmt: skip
+    remarks = (f"{source.path.name}: what stands behind kappa in {_ORIA} is not read",) if more else ()
+    return PoseList(tuple(rows), "grid", remarks, f"BINGO, {_ORIA}, omega, phi, kappa in gon")
 
 
 def is_patb(source: Source) -> bool:
