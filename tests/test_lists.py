@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.blocks.agreement import refuse_degrees
+from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import observation_of_row
@@ -153,3 +154,85 @@ def test_records_oria(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert found.rows[0].position == (1000.0, 2000.0, 500.0)
     assert "behind kappa" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "position", "attitude"),
+    [
+        ("# name,lon,lat,alt\na.jpg,13.4,52.5,140\n", (52.5, 13.4, 140.0), None),
+        ("#image x y z yaw pitch roll\na.jpg 1 2 3 10 -90 0\n", (1.0, 2.0, 3.0), (10.0, -90.0, 0.0)),
+        ("# name X[m] Y[m] Z[m] Omega[gon] Phi[gon] Kappa[gon]\na.jpg 1 2 3 10 20 100\n", (1, 2, 3), (9.0, 18.0, 90.0)),
+        ("sep=;\nimage;lat;lon;alt\na.jpg;52,5;13,4;140,0\n", (52.5, 13.4, 140.0), None),
+        ("FileName,GPSLatitude,GPSLongitude,GPSAltitude\na.jpg,52.5 N,13.4 W,140\n", (52.5, -13.4, 140.0), None),
+        (
+            "image,latitude,longitude,height_above_takeoff(feet),altitude_above_seaLevel(feet)\na.jpg,52.5,13.4,1,100\n",
+            (52.5, 13.4, 30.48),
+            None,
+        ),
+        (
+            "photo,filename,directory,altitude,direction,longitude,latitude\na.jpg,a,C:/f,140,,13.4,52.5\n",
+            (52.5, 13.4, 140.0),
+            None,
+        ),
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs(tmp_path: Path, text: str, position: tuple, attitude: tuple | None) -> None:
+    row = read_pose_file(written(tmp_path, text, "list.csv")).rows[0]
+    assert row.image == "a.jpg"
+    assert row.position == pytest.approx(position)
+    assert row.attitude == (attitude and pytest.approx(attitude))
+
+
+@pytest.mark.parametrize(
+    ("text", "position", "crs"),
+    [
+        ("# CRS: EPSG:2227\nimage,x,y,z\na.jpg,{fx},{fy},{fz}\n", (1850000.0, 650000.0, 90.0), "EPSG:26943"),
+        ("# EPSG:2227+5703\nimage,x,y,z\na.jpg,{fx},{fy},90\n", (1850000.0, 650000.0, 90.0), "EPSG:26943"),
+        ("image,x [m],y [m],z,crs\na.jpg,1850000,650000,{fz},2227\n", (1850000.0, 650000.0, 90.0), "EPSG:26943"),
+        ("image,x,y,z,crs\na.jpg,390950,5818970,90,EPSG:32633\n", (390950.0, 5818970.0, 90.0), "EPSG:32633"),
+        ("# coordinate system: WGS84\nimage,x,y,z\na.jpg,13.4,52.5,90\n", (52.5, 13.4, 90.0), None),
+        ("# crs: EPSG:32633\nimage,lat,lon,alt\na.jpg,52.5,13.4,90\n", (52.5, 13.4, 90.0), "EPSG:32633"),
+    ],
+)
+def test_a_list_names_its_crs(tmp_path: Path, text: str, position: tuple, crs: str | None) -> None:
+    foot = 1200.0 / 3937.0
+    text = text.format(fx=1850000.0 / foot, fy=650000.0 / foot, fz=90.0 / foot)
+    found = read_pose_file(written(tmp_path, text, "list.csv"))
+    np.testing.assert_allclose(found.rows[0].position or (), position, rtol=0, atol=1e-6)
+    assert found.crs == crs
+    assert {row.position_kind for row in found.rows} == {found.position_kind}
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_two_forms_of_coordinates(tmp_path: Path, named: bool) -> None:
+    """Emlid Flow: the elevation goes with easting and northing, the ellipsoidal height with the degrees."""
+    head = "Name,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height,Lateral RMS,Elevation RMS"
+    line = "P1,390950,5818970,34,13.39315,52.50993,74.5,0.01,0.02"
+    if named:
+        head, line = f"{head},CS name", f"{line},WGS 84 / UTM zone 33N + EGM96 height"
+    path = written(tmp_path, f"{head}\n{line}\n", "gcp.csv")
+    marks = written(tmp_path, "a.jpg,P1,100,200\n", "marks.csv")
+    points, remarks = read_control(str(path), images("a.jpg"), "EPSG:32633", (0.0, 0.0, 0.0), marks=str(marks))
+    expected = (390950.0, 5818970.0, 34.0) if named else (390950.4, 5818970.3, 74.5)
+    np.testing.assert_allclose(points[0].position_m, expected, rtol=0, atol=1e-6 if named else 1.0)
+    assert points[0].sigmas_m == (0.01, 0.01, 0.02)
+    assert "of two forms of coordinates" in remarks[0]
+
+
+def test_units_of_comments_in_gcp_list_and_inpho(tmp_path: Path) -> None:
+    text = "EPSG:32633\n# heights in feet\n390950 5818970 100 10 20 a.jpg P1\n"
+    points, _ = read_control(str(written(tmp_path, text, "gcp.txt")), images("a.jpg"), "EPSG:32633", (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(points[0].position_m, (390950.0, 5818970.0, 30.48), atol=1e-6)
+    prj = (
+        "$PROJECT\n$LINEAR_UNITS_OBJECT : ft\n$PHOTO\n $PHOTO_FILE : a.tif\n $EXT_ORI : \n 100 1000 2000 500\n"
+        " 1 0 0\n 0 1 0\n 0 0 1\n$END\n"
+    )
+    found = read_pose_file(written(tmp_path, prj, "block.prj"))
+    assert found.rows[0].position == pytest.approx((304.8, 609.6, 152.4))
+
+
+@pytest.mark.parametrize("focal", [8.8, 0.85])
+def test_a_focal_length_that_is_no_pixels_is_refused(tmp_path: Path, focal: float) -> None:
+    path = written(tmp_path, f"1 SIMPLE_PINHOLE 5472 3648 {focal} 6.6 4.4\n", "cameras.txt")
+    with pytest.raises(ConfigError, match=r"line 1: a focal length of .* is it in millimetres"):
+        read_camera_file(path)

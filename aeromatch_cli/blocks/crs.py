@@ -25,6 +25,7 @@ _ORIGIN_STEP_M = 1000.0
 _MARGIN_DEG = 3.0
 # Eastings of some CRSs and many lists begin with the number of the zone, in millions.
 _PREFIX_M = 1_000_000.0
+_SAME_M = 0.001
 _LOCAL_WKT = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
 _UTM = re.compile(r"WGS\s*84[\s/]+UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IGNORECASE)
 
@@ -75,10 +76,9 @@ def parsed_crs(text: str) -> Any:
     its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none."""
     from pyproj import CRS
 
-    utm = _UTM.fullmatch(text.strip())
-    crs: Any = CRS.from_user_input(
-        f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text.strip()
-    )
+    text = text.strip(" \t;,\"'")  # as spreadsheets leave it
+    utm = _UTM.fullmatch(text)
+    crs: Any = CRS.from_user_input(f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text)
     return crs.source_crs if crs.is_bound else crs
 
 
@@ -124,6 +124,9 @@ def metric_crs(crs: Any) -> str:
 
     horizontal = (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
     if across_unit_m(horizontal) != 1.0:
+        twin = _metric_twin(horizontal)
+        if twin:
+            return twin
         tree = horizontal.to_json_dict()
         for axis in tree["coordinate_system"]["axis"]:
             axis["unit"] = "metre"
@@ -132,6 +135,28 @@ def metric_crs(crs: Any) -> str:
         horizontal = CRS.from_json_dict(tree)
     authority = horizontal.to_authority(min_confidence=60)
     return ":".join(authority) if authority else str(horizontal.to_wkt())
+
+
+def _metric_twin(crs: Any) -> str:
+    """Code of the CRS that has the name of one in feet without its unit, and the same places; "" for none."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    if crs.area_of_use is None or "(ft" not in crs.name:
+        return ""
+    try:
+        twin = CRS.from_user_input(crs.name.partition("(ft")[0].strip())
+    except CRSError:
+        return ""
+    area = crs.area_of_use
+    place = (area.west + area.east) / 2.0, (area.south + area.north) / 2.0
+    own, other = (
+        np.array(Transformer.from_crs(one.geodetic_crs, one, always_xy=True).transform(*place)) * across_unit_m(one)
+        for one in (crs, twin)
+    )
+    code = twin.to_authority()
+    fits = twin.is_projected and across_unit_m(twin) == 1.0 and crs.geodetic_crs == twin.geodetic_crs
+    return ":".join(code) if code and fits and float(np.abs(own - other).max()) < _SAME_M else ""
 
 
 def utm_crs(latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> str:

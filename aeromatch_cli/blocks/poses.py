@@ -34,7 +34,7 @@ import csv
 import difflib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -84,9 +84,12 @@ def _axis_names(column: str, *axes: str) -> dict[str, str]:
 
 
 _ALIASES = {
-    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
+    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename", "file_name"), "image"),
+    **dict.fromkeys(("photo_name", "sourcefile", "image_path", "picture"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
+    **{"gpslatitude": "lat", "gpslongitude": "lon", "gpsaltitude": "alt"},
+    **{"gps_latitude": "lat", "gps_longitude": "lon", "gps_altitude": "alt"},
     **{"x/longitude": "lon", "y/latitude": "lat", "longitude/x": "lon", "latitude/y": "lat", "height/z": "alt"},
     **_axis_names("sigma_x_m", "x", "e", "easting"),
     **_axis_names("sigma_y_m", "y", "n", "northing"),
@@ -99,13 +102,22 @@ _ALIASES = {
 }
 # Columns that are taken for z or alt where there is none, the likeliest first.
 _OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "ellipsoidal_height", "ellipsoid_height", "orthometric_height",
-                  "height", "elevation", "h")  # fmt: skip
+                  "altitude_above_sealevel", "altitude_msl", "height", "elevation", "h")  # fmt: skip
+# Those that are taken beside heights above ground, too.
+_FROM_DATUM = _OTHER_HEIGHTS[2:-3]
 # Heights above ground, or above where the flight began.
 _RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "altitude_agl", "rel_alt", "salt", "height_above_ground",
                      "height_above_takeoff", "altitude_above_ground", "altitude_above_takeoff")  # fmt: skip
+# What names the CRS of every line.
+_CRS_COLUMNS = ("crs", "srs", "epsg", "cs_name", "coordinate_system")
+_CRS_COMMENT = re.compile(
+    r"#\s*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=]\s*(?P<named>\S.*)"
+    r"|(?P<code>EPSG\s*:\s*\d+(?:\+\d+)?)\s*)",
+    re.IGNORECASE,
+)
 # Every name of a column, in lower case, and the one that it has here.
 _NAMES: Mapping[str, str] = {
-    **{name: name for name in (*_KNOWN, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, "gps_altitude")},
+    **{name: name for name in (*_KNOWN, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, *_CRS_COLUMNS)},
     **_ALIASES,
 }
 _HEIGHTS = (*_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS)
@@ -116,6 +128,8 @@ _CERTAINLY = 3
 # A latitude beyond 90 degrees may be a longitude: see _with_latitudes.
 _RANGES = {"lat": 180.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
 _LARGEST_ANGLE_DEG = 360.0
+# What a spreadsheet writes to say what separates.
+_SEPARATOR_LINE = re.compile(r"\"?sep=.\"?", re.IGNORECASE)
 _LINES_NAMED = 5  # of those with the same fault
 # Images by line, by what is wrong with it.
 _Faults = dict[str, dict[int, str]]
@@ -178,17 +192,31 @@ class _Layout:
     ignored: tuple[str, ...]
     factors: Mapping[str, float]  # metres or degrees of one unit, by column
     height: str = ""  # the column that is taken for z or alt under another name
+    crs_column: int = -1
 
 
-def read_poses(path: Path) -> PoseList:
-    """Reads a pose list. Raises ConfigError with file, line and column where the list is malformed."""
+def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0)) -> PoseList:
+    """Reads a pose list. Its `crs` is as the list states it, a code or other text.
+
+    usual_m: metres of one unit of x and y, and of heights, where the list names none. Raises ConfigError with file,
+    line and column where the list is malformed.
+    """
     lines = [line for line in enumerate(_text(path).splitlines(), start=1) if line[1].strip()]
+    if lines and _SEPARATOR_LINE.fullmatch(lines[0][1].strip()):
+        lines = lines[1:]
     header, layout, records = _header(path, lines)
+    across_m, up_m = usual_m
+    usual = {"x": across_m, "y": across_m, "z": up_m, "alt": up_m}
+    layout = replace(layout, factors={**usual, **layout.factors})
+    systems: dict[str, int] = {}
     faults: _Faults = {}
     rows: list[PoseRow] = []
     lines_of: dict[str, int] = {}
     for number, line in records:
-        row = _row(path, number, _split(path, number, line, layout), layout, faults)
+        cells = _split(path, number, line, layout)
+        row = _row(path, number, cells, layout, faults)
+        if layout.crs_column >= 0 and (text := cells[layout.crs_column].strip()):
+            systems.setdefault(f"EPSG:{text}" if text.isdigit() else text, number)
         if row.image in lines_of:
             raise ConfigError(
                 f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
@@ -204,7 +232,30 @@ def read_poses(path: Path) -> PoseList:
         own = _POSITIONS[layout.position_kind][2]
         ignored.append(f"{path.name}: {layout.height} is taken for the height {own}, which counts from the datum")
     warnings = [_fault(path, fault, images) for fault, images in faults.items()]
-    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings))
+    if len(systems) > 1:
+        raise ConfigError(
+            f"{path}, line {max(systems.values())}: the list names {len(systems)} coordinate systems: one is needed"
+        )
+    crs = next(iter(systems), None) or stated_crs(text for _, text in lines)
+    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings), crs=crs)
+
+
+def stated_crs(lines: Iterable[str]) -> str | None:
+    """What a comment says of the CRS, None where none does."""
+    found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
+    return next(((match["named"] or match["code"]).strip() for match in found if match), None)
+
+
+def has_header(lines: Sequence[str]) -> bool:
+    """Whether a comment names the columns of lines that could do without."""
+    for line in lines:
+        text = line.strip()
+        if text and not text.startswith("#"):
+            return False
+        _, columns, _ = _columns(text.lstrip("#").strip())
+        if "image" in columns and {*_POSITIONS["grid"][:2], *_POSITIONS["geographic"][:2]} & set(columns):
+            return True
+    return False
 
 
 def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], list[str]]:
@@ -320,7 +371,9 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Map
         stated = (said[subject] for subject in subjects if subject in said)
         # Coordinates in degrees say nothing of heights, and one unit of all that is given nothing of the other kind.
         others = (text for text in stated if kind_of(text) == kind or subjects[0] in said)
-        found[column] = factor(where, column, unit or next(others, ""), kind)
+        text = unit or next(others, "")
+        if text:
+            found[column] = factor(where, column, text, kind)
     return found
 
 
@@ -329,14 +382,17 @@ def _layout(
     said: Mapping[str, str],
 ) -> _Layout:  # fmt: skip
     where = f"{path}, line {number}"
+    first = columns.index("image")
+    columns = tuple("" if name == "image" and place != first else name for place, name in enumerate(columns))
     twice = sorted({name for name in columns if name and columns.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
     factors = _factors(where, columns, units, said)
     columns, height = _with_height(columns)
-    if height:
+    if height in factors:
         factors |= {own: factors[height] for own in ("z", "alt") if own in columns}
-    unknown = tuple(name for name in columns if name and name not in _KNOWN)
+    crs_column = next((place for place, name in enumerate(columns) if name in _CRS_COLUMNS), -1)
+    unknown = tuple(name for name in columns if name and name not in _KNOWN and name not in _CRS_COLUMNS)
     for name in unknown:
         near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
         if near and len(name) > 2 and name not in _HEIGHTS:
@@ -358,14 +414,16 @@ def _layout(
         unknown,
         factors,
         height,
+        crs_column,
     )
 
 
 def _with_height(columns: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
     """Columns in which z or alt stands for a height under another name, and that name, "" for none."""
     for across, own in ((("x", "y"), "z"), (("lat", "lon"), "alt")):
-        if set(across) <= set(columns) and own not in columns and not set(columns) & set(_RELATIVE_HEIGHTS):
-            other = next((name for name in _OTHER_HEIGHTS if name in columns), "")
+        if set(across) <= set(columns) and own not in columns:
+            relative = bool(set(columns) & set(_RELATIVE_HEIGHTS))
+            other = next((name for name in (_FROM_DATUM if relative else _OTHER_HEIGHTS) if name in columns), "")
             if other:
                 return tuple(own if name == other else name for name in columns), other
     return columns, ""

@@ -51,6 +51,8 @@ _COORDINATES: Mapping[str, str] = {
     **dict.fromkeys(("lat", "latitude"), "latitude"),
     **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "h", "up", "ellipsoidal_height"), "z"),
     **dict.fromkeys(("type", "role", "usage", "use"), "type"),
+    **dict.fromkeys(("cs_name", "crs", "srs", "epsg", "coordinate_system"), "crs"),
+    **{"easting_rms": "sigma_x", "northing_rms": "sigma_y", "elevation_rms": "sigma_z", "lateral_rms": "sigma_xy"},
     **dict.fromkeys(("enable", "enabled"), "enable"),
     **{f"accuracy_{name}".rstrip("_"): f"sigma_{side}" for name, side in _SIDES.items()},
     **{f"{name}_accuracy": f"sigma_{side}" for name, side in _SIDES.items() if name},
@@ -90,15 +92,18 @@ def is_marks(source: Source) -> bool:
 def read_coordinates(source: Source) -> Survey:
     """Raises ConfigError with file and line."""
     header, names, units = _header(source, _COORDINATES)
-    factors = _factors(source, header, names, units)
+    records = list(_rows(source, header))
     crs, crs_where = _stated_crs(source)
+    crs = crs or _crs_of_column(source, names, records)
+    names, remarks = _one_form(source, names, crs)
+    factors = _factors(source, header, names, units)
     if crs is not None and factors.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
         stated = described_crs(crs_where, crs)
         factors |= {name: factors.get(name, stated.across_m) / stated.across_m for name in "xy"}
         factors["z"] = factors.get("z", stated.up_m) / stated.up_m
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
-        for line, cells, _ in _rows(source, header)
+        for line, cells, _ in records
     ]
     points = [_point(source, line, record, factors) for line, record in rows]
     if not points:
@@ -109,7 +114,9 @@ def read_coordinates(source: Source) -> Survey:
     geographic = "latitude" in names or _in_degrees(points)
     if not header and crs is None and geographic:  # the latitude stands first
         points = [_exchanged(point) for point in points]
-    return Survey(tuple(points), (), crs, crs_where, geographic)
+    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
+        crs = None  # of coordinates that the file does not have
+    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
 
 
 def read_marks(source: Source) -> Survey:
@@ -258,6 +265,34 @@ def _stated_crs(source: Source) -> tuple[str | None, str]:
     if beside is not None and beside.text.strip():
         return beside.text.strip(), str(beside.path)
     return None, str(source.path)
+
+
+def _crs_of_column(source: Source, names: Sequence[str], records: Sequence[tuple[int, list[str], bool]]) -> str | None:
+    """The CRS that a column names, None where there is none. Raises ConfigError where lines name several."""
+    if "crs" not in names:
+        return None
+    place = names.index("crs")
+    lines = {cells[place]: line for line, cells, _ in records if len(cells) > place and cells[place]}
+    if len(lines) > 1:
+        raise ConfigError(f"{source.at(max(lines.values()))}: the file names {len(lines)} coordinate systems")
+    text = next(iter(lines), None)
+    return f"EPSG:{text}" if text and text.isdigit() else text
+
+
+def _one_form(source: Source, names: Sequence[str], crs: str | None) -> tuple[list[str], tuple[str, ...]]:
+    """Columns with one form of coordinates, and what is said where there are grid coordinates and degrees: the former
+    count where their CRS is known. Of two heights the first goes with the grid, the last with the degrees."""
+    found = list(names)
+    both = {"x", "y", "longitude", "latitude"} <= set(names)
+    grid = ("x", "y") if not both or crs is not None else ()
+    heights = [place for place, name in enumerate(names) if name == "z"]
+    for place in heights[1:] if grid or not both else heights[:-1]:
+        found[place] = ""
+    if not both:
+        return found, ()
+    found = ["" if name in (("longitude", "latitude") if grid else ("x", "y")) else name for name in found]
+    words = f"easting and northing in {crs}" if grid else "latitude and longitude, since no CRS of the others is named,"
+    return found, (f"{source.path.name}: of two forms of coordinates {words} and the height beside them count",)
 
 
 def _in_degrees(points: list[SurveyedPoint]) -> bool:

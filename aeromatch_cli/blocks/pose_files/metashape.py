@@ -33,6 +33,7 @@ from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
+_LONGEST_CODE = 20  # longer ones are WKT
 _ACCURACIES = ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y", "accuracy_x/y/z")
 # Geocentric coordinates of a place on the ground, and of nothing else.
 _EARTH_M = (6.2e6, 6.6e6)
@@ -84,7 +85,8 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             "the given one is used"
         )
     system = system or StatedCrs()
-    words += [system.crs or ("WGS84" if system.kind == "geographic" else "local")] if stated_one else []
+    code = system.crs if system.crs and len(system.crs) < _LONGEST_CODE else system.name
+    words += [(code if system.crs else "WGS84" if system.kind == "geographic" else "local")] if stated_one else []
     title = f"Metashape reference, {', '.join(words)}"
     return PoseList(tuple(rows), system.kind, (*system.remarks, *remarks), title, system.crs)
 

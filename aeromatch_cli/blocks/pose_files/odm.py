@@ -12,6 +12,7 @@ to the grid of the UTM zone.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
 from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row, units_of_comments
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -46,7 +47,9 @@ def read_geo_txt(source: Source) -> PoseList:
     """Raises ConfigError with file, line and column."""
     records = list(source.records())
     head, text = records[0]
-    stated = described_crs(source.at(head), text)
+    stated, said = described_crs(source.at(head), text), units_of_comments(source)
+    stated = replace(stated, across_m=said.across_m or stated.across_m, up_m=said.up_m or stated.up_m)
+    turn_deg = said.angle_deg or 1.0
     rows: list[PoseRow] = []
     for line, record in records[1:]:
         cells, comma = fields_of(record)
@@ -55,7 +58,7 @@ def read_geo_txt(source: Source) -> PoseList:
             raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
         values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
         x, y, z = [*values, np.nan, np.nan][:3]
-        angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
+        angles = [turn_deg * angle for angle in values[3:6]] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
         across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
         place = stated.position(source.at(line), x, y, z)
         whole = bool(np.isfinite(angles).all())

@@ -29,7 +29,7 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind, has_header
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
 
@@ -38,6 +38,8 @@ _LINES_OF_IMAGE = 10
 
 
 def is_geolocation(source: Source) -> bool:
+    if has_header(source.lines):
+        return False
     record = next((line for _, line in source.records()), "")
     if "," not in record and ";" not in record:
         return False

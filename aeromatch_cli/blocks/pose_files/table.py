@@ -22,8 +22,9 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, is_number, world_beside
-from aeromatch_cli.blocks.poses import PoseList, read_poses
+from aeromatch_cli.blocks.poses import PoseList, has_header, read_poses
 from aeromatch_cli.errors import ConfigError
 
 AUTO = "auto"
@@ -42,9 +43,30 @@ class PoseFormat:
 def _named_columns(source: Source) -> PoseList:
     """orientation.csv of this program counts in the CRS that its neighbours name."""
     found = read_poses(source.path)
+    if found.crs is not None:
+        return _in_stated_crs(source, found)
     crs, _ = world_beside(source)
     own = source.name == "orientation.csv" and found.position_kind == "grid" and crs is not None
     return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else found
+
+
+def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
+    """Of a list whose comment, or a column, names the CRS."""
+    stated = described_crs(str(source.path), found.crs or "")
+    if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
+        return replace(found, crs=stated.crs)
+    if found.position_kind == "grid":  # what columns state counts before the unit of the CRS
+        found = read_poses(source.path, (stated.across_m, stated.up_m))
+    one = replace(stated, across_m=1.0, up_m=1.0)
+    rows = []
+    for row in found.rows:
+        if row.position is not None:
+            x, y, height_m = row.position
+            across = (x, y) if found.position_kind == "grid" else (y, x)
+            row = replace(row, position=one.position(source.at(row.line), *across, height_m), position_kind=one.kind)
+        rows.append(row)
+    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *found.warnings)
+    return replace(found, rows=tuple(rows), position_kind=one.kind, crs=one.crs, warnings=warnings, format=words)
 
 
 _MISSION_PLANNER = re.compile(r"#\s*name\s+latitude/y\s+longitude/x\b.*", re.IGNORECASE)
@@ -182,6 +204,8 @@ def _by_content(source: Source) -> str:
     cells = fields_of(record)[0] or [""]
     if cells[0].lower() == "track" or (len(cells) == 1 and cells[0].startswith("OPENSFM_TRACKS_VERSION")):
         return "a list of tracks, which are tie points: give the poses of the images"
+    if has_header(source.lines):
+        return ""
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
         return "ODM's geo.txt without its first line, which names the CRS, such as EPSG:32633 or EPSG:4326: add it"
     return ""

@@ -32,7 +32,8 @@ from aeromatch_cli.blocks.pose_files.source import (
     rotation_row,
     units_of_comments,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, has_header
+from aeromatch_cli.blocks.units import factor
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
@@ -45,6 +46,8 @@ _FULL_DEG = 360.0
 
 
 def is_plain_table(source: Source) -> bool:
+    if has_header(source.lines):
+        return False
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
     tables = [with_name(fields_of(record)[0], 0) for record in records]
     return bool(tables) and all(
@@ -193,6 +196,10 @@ def read_inpho(source: Source) -> PoseList:
     stated = re.search(r"\$COORDINATE_SYSTEM\s*:\s*(\S.*)", source.text)
     if stated and stated[1].strip().upper().startswith(("PROJCS", "PROJCRS", "EPSG", "GEOGCS", "GEOGCRS", "COMPD")):
         system = described_crs(str(source.path), stated[1])
+    unit = re.search(r"\$LINEAR_UNITS_OBJECT\s*:\s*(\S.*)", source.text)
+    if unit:
+        one_m = factor(str(source.path), "$LINEAR_UNITS_OBJECT", unit[1].strip(), "length")
+        system = replace(system, across_m=one_m, up_m=one_m)
     rows: list[PoseRow] = []
     name, camera = "", ""
     lines = list(source.records("%"))
