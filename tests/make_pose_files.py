@@ -293,6 +293,18 @@ WORLD: dict[str, str | bytes] = {
         "ORIA " + f"{A.name} {PLACE} {texts(np.array(A.opk) / 0.9)}", "C a comment",
         "ORIA " + f"{B.name} {PLACE} {texts(np.array(B.opk) / 0.9)}",
     ),
+    "geojson/layer.geojson": json.dumps(
+        {
+            "type": "FeatureCollection", "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}},
+            "features": [
+                {
+                    "type": "Feature", "geometry": {"type": "Point", "coordinates": [E, N, H]},
+                    "properties": dict(zip(("filename", "omega", "phi", "kappa"), (c.name, *c.opk), strict=True)),
+                }
+                for c in (A, B)
+            ],
+        }
+    ),
     "mission-planner/location.txt": lines(
         "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt",
         *each(lambda c: f"{c.name} {LATITUDE} {LONGITUDE} {H} {texts(c.nadir)} 100.5"),

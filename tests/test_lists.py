@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -236,3 +237,17 @@ def test_a_focal_length_that_is_no_pixels_is_refused(tmp_path: Path, focal: floa
     path = written(tmp_path, f"1 SIMPLE_PINHOLE 5472 3648 {focal} 6.6 4.4\n", "cameras.txt")
     with pytest.raises(ConfigError, match=r"line 1: a focal length of .* is it in millimetres"):
         read_camera_file(path)
+
+
+@pytest.mark.parametrize(("coordinates", "height"), [([13.4, 52.5, 140.5], 140.5), ([13.4, 52.5], 30.48)])
+def test_a_layer_of_points(tmp_path: Path, coordinates: list[float], height: float) -> None:
+    point = {"type": "Feature", "geometry": {"type": "Point", "coordinates": coordinates}}
+    layer = {
+        "type": "FeatureCollection",
+        "features": [point | {"properties": {"Name": "my, a.jpg", "altitude_ft": 100, "lat": 1}}],
+    }
+    row = read_pose_file(written(tmp_path, json.dumps(layer), "layer.geojson")).rows[0]
+    assert (row.image, row.position, row.line) == ("my, a.jpg", (52.5, 13.4, height), 1)
+    layer["features"][0]["geometry"]["coordinates"] = [390950.0, 5818970.0]
+    with pytest.raises(ConfigError, match=r"feature 1: .* are no longitude and latitude"):
+        read_pose_file(written(tmp_path, json.dumps(layer), "layer.geojson"))

@@ -175,7 +175,7 @@ def _plausible(where: str, lens: Nearest) -> Nearest:
     if camera is None:
         raise ConfigError(f"{remark(lens, where)}: give one of {', '.join((*MODELS, FULL_OPENCV))}")
     names, size = MODELS[camera.model], (camera.width_px, camera.height_px)
-    if 0.0 < focal_px(camera) < _SHORTEST_FOCAL * max(size):
+    if focal_px(camera) > 0.0 and focal_px(camera) / _SHORTEST_FOCAL < max(size):
         raise ConfigError(
             f"{where}: a focal length of {focal_px(camera):g} px is none of an image of {size[0]} x {size[1]} px: is "
             "it in millimetres, or in widths of the image? Pixels are needed: millimetres by the size of a pixel"

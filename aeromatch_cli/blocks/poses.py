@@ -195,13 +195,14 @@ class _Layout:
     crs_column: int = -1
 
 
-def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0)) -> PoseList:
+def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str | None = None) -> PoseList:
     """Reads a pose list. Its `crs` is as the list states it, a code or other text.
 
-    usual_m: metres of one unit of x and y, and of heights, where the list names none. Raises ConfigError with file,
-    line and column where the list is malformed.
+    usual_m: metres of one unit of x and y, and of heights, where the list names none. text: instead of the
+    file's. Raises ConfigError with file, line and column where the list is malformed.
     """
-    lines = [line for line in enumerate(_text(path).splitlines(), start=1) if line[1].strip()]
+    text = _text(path) if text is None else text
+    lines = [line for line in enumerate(text.splitlines(), start=1) if line[1].strip()]
     if lines and _SEPARATOR_LINE.fullmatch(lines[0][1].strip()):
         lines = lines[1:]
     header, layout, records = _header(path, lines)
@@ -244,6 +245,12 @@ def stated_crs(lines: Iterable[str]) -> str | None:
     """What a comment says of the CRS, None where none does."""
     found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
     return next(((match["named"] or match["code"]).strip() for match in found if match), None)
+
+
+def is_position(name: str, *, height: bool) -> bool:
+    """Whether a column of this name holds a coordinate. height: or a height that counts from a datum."""
+    column, _ = _canonical(name)
+    return column in ("x", "y", "lat", "lon") or (height and column in _OTHER_HEIGHTS)
 
 
 def has_header(lines: Sequence[str]) -> bool:

@@ -68,7 +68,7 @@ def described_crs(where: str, text: str) -> StatedCrs:
     if not (crs.is_geographic or crs.is_projected):
         raise ConfigError(f"{where}: {crs.name} has no easting and northing: name a projected CRS, or one in degrees")
     if crs.is_geographic or is_stretched(crs.to_2d()):
-        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=_to_degrees(crs))
+        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=_to_degrees(where, crs))
     return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, tuple(unit_remarks(where, crs)))
 
 
@@ -83,12 +83,16 @@ def unit_remarks(where: str, crs: Any) -> list[str]:
     ]
 
 
-def _to_degrees(crs: Any) -> Any:
+def _to_degrees(where: str, crs: Any) -> Any:
     """None for WGS84 itself."""
     from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
 
     flat = crs.to_2d()
-    return None if flat == CRS("EPSG:4326") else Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
+    try:
+        return None if flat == CRS("EPSG:4326") else Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
+    except ProjError as error:
+        raise ConfigError(f"{where}: {crs.name} cannot be brought to WGS84: name another CRS") from error
 
 
 def _crs(where: str, text: str) -> Any:

@@ -84,7 +84,7 @@ def _value(where: str, cell: str, comma: bool) -> float:
 
 def is_shots(source: Source) -> bool:
     features = source.tree.get("features") if isinstance(source.tree, dict) else None
-    return bool(features) and isinstance(features, list) and "filename" in _properties(features[0])
+    return bool(features) and isinstance(features, list) and {"filename", "rotation"} <= _properties(features[0]).keys()
 
 
 def read_shots(source: Source) -> PoseList:
