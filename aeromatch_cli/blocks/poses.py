@@ -229,6 +229,12 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
     rows, exchanged = _with_latitudes(path, rows)
     ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
+    datum = stated_units(line for _, line in lines).get("datum")
+    if datum:
+        ignored.append(
+            f"{path.name}: {datum!r}: heights are not converted; ground and control points must count from the same "
+            "zero"
+        )
     if layout.height:
         own = _POSITIONS[layout.position_kind][2]
         ignored.append(f"{path.name}: {layout.height} is taken for the height {own}, which counts from the datum")

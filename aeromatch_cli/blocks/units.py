@@ -114,7 +114,7 @@ def _bare(text: str) -> str:
 
 def stated_units(lines: Iterable[str], mark: str = "#") -> dict[str, str]:
     """What comments say of units: "heights", "angles", "coordinates", "accuracies" or "units" -> the unit, and
-    "relative" -> the words of one that says that heights count from the ground.
+    "relative" -> the words of one that says that heights count from the ground, "datum" -> that name another zero.
 
     `# angles in gon`, `# heights: ellipsoidal, feet`: the unit follows the subject at once; other comments say nothing.
     """
@@ -134,7 +134,14 @@ def stated_units(lines: Iterable[str], mark: str = "#") -> dict[str, str]:
                     found.setdefault(what, unit)
                 if relative and what == "heights":
                     found.setdefault("relative", line.strip())
+                if what == "heights" and _names_datum(words[len(start) :]):
+                    found.setdefault("datum", line.strip())
     return found
+
+
+def _names_datum(words: list[str]) -> bool:
+    spans = (words[first : first + count] for first in range(len(words)) for count in (1, 2, 3))
+    return any(_DATUMS.fullmatch(_bare("".join(span))) for span in spans)
 
 
 def _unit_of(words: list[str]) -> tuple[str, bool]:
