@@ -289,6 +289,26 @@ WORLD: dict[str, str | bytes] = {
     "pix4d-cameras/x_calibrated_camera_parameters.txt": _pix4d_cameras(),
     "inpho/block.prj": _inpho(),
     "micmac-txt/ori.txt": lines("#F=N X Y Z W P K", "#", *each(lambda c: f"{c.name} {PLACE} {texts(c.opk)}")),
+    "bingo/itera.dat": lines(
+        "ORIA " + f"{A.name} {PLACE} {texts(np.array(A.opk) / 0.9)}", "C a comment",
+        "ORIA " + f"{B.name} {PLACE} {texts(np.array(B.opk) / 0.9)}",
+    ),
+    "geojson/layer.geojson": json.dumps(
+        {
+            "type": "FeatureCollection", "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}},
+            "features": [
+                {
+                    "type": "Feature", "geometry": {"type": "Point", "coordinates": [E, N, H]},
+                    "properties": dict(zip(("filename", "omega", "phi", "kappa"), (c.name, *c.opk), strict=True)),
+                }
+                for c in (A, B)
+            ],
+        }
+    ),
+    "mission-planner/location.txt": lines(
+        "#name latitude/Y longitude/X height/Z yaw pitch roll SAlt",
+        *each(lambda c: f"{c.name} {LATITUDE} {LONGITUDE} {H} {texts(c.nadir)} 100.5"),
+    ),
     "opk/table.txt": lines(*each(lambda c: f"{c.name} {PLACE} {texts(c.opk)}")),
     "opk-gon/table.txt": lines(*each(lambda c: f"{c.name} {PLACE} {texts(np.array(c.opk) / 0.9)}")),
     "pok/table.txt": lines(*each(lambda c: f"{c.name} {PLACE} {texts(c.pok)}")),

@@ -27,6 +27,8 @@ _MIXED_EXTENT, _MIXED_SHARE = 0.2, 0.25
 # Sea level lies within this of the ellipsoid everywhere, metres; the GPS of a camera adds some.
 _GEOID_M = 130.0
 _METRES_PER_DEG = 111_320.0
+_LARGEST_DEG = 180.0
+_WIDEST_DEG = 1.0  # a block is no wider, in degrees, and no narrower, in metres
 
 
 def agreed(
@@ -47,6 +49,9 @@ def agreed(
         return found, []
     grid = found[names[0]].position_kind == "grid"
     if grid and crs in (AUTO, LOCAL, ""):
+        for order, words in ((gps, "lat and lon"), (gps[:, ::-1], "lon and lat")):
+            if _median_m(listed, order, np.full(2, _METRES_PER_DEG)) <= _SAME_M:
+                raise ConfigError(f"{source}: x and y are degrees, as the GPS of the images shows: name them {words}")
         return found, _zone_of_local(listed, gps, source)
     places = _grid_places(crs, gps) if grid else gps
     to_metres = np.ones(2) if grid else _METRES_PER_DEG * np.array([1.0, np.cos(np.deg2rad(np.median(gps[:, 0])))])
@@ -66,6 +71,20 @@ def agreed(
     if zone:
         return found, [f"{remark}: x and y fit {zone}; give --crs {zone}"]
     return found, [f"{remark}: is it the list of another flight, or of another CRS?"]
+
+
+def refuse_degrees(observations: Mapping[str, Observation], crs: str, source: str) -> None:
+    """Raises ConfigError where x and y of a list are degrees below a projected CRS. crs: as in `agreed`."""
+    if crs.strip().lower() in (AUTO, LOCAL, ""):
+        return
+    places = np.array([one.position[:2] for one in observations.values() if one.position_kind == "grid"]).reshape(-1, 2)
+    places = places[places.any(axis=1)]  # zeros stand for "unknown"
+    if len(places) and np.abs(places).max() <= _LARGEST_DEG and np.ptp(places, axis=0).max() < _WIDEST_DEG:
+        x, y = places[0]
+        raise ConfigError(
+            f"{source}: x and y ({x:.6f}, {y:.6f}) are degrees by their size, and {crs[:60]} counts in metres: name "
+            "the columns lat and lon, or in geo.txt EPSG:4326, with the longitude first"
+        )
 
 
 def _other_heights(

@@ -23,6 +23,8 @@ from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.cameras import FULL_OPENCV, MODELS, corner_params, focal_px
 from aeromatch_cli.geometry.lenses import Nearest, of_colmap
 
+# Shorter focal lengths, as a share of the longer side, are no pixels: a fisheye's is about 0.3.
+_SHORTEST_FOCAL = 0.05
 _ENTRY_KEYS = ("model", "width", "height", "params")
 
 
@@ -173,6 +175,11 @@ def _plausible(where: str, lens: Nearest) -> Nearest:
     if camera is None:
         raise ConfigError(f"{remark(lens, where)}: give one of {', '.join((*MODELS, FULL_OPENCV))}")
     names, size = MODELS[camera.model], (camera.width_px, camera.height_px)
+    if focal_px(camera) > 0.0 and focal_px(camera) / _SHORTEST_FOCAL < max(size):
+        raise ConfigError(
+            f"{where}: a focal length of {focal_px(camera):g} px is none of an image of {size[0]} x {size[1]} px: is "
+            "it in millimetres, or in widths of the image? Pixels are needed: millimetres by the size of a pixel"
+        )
     named = dict(zip(names, corner_params(camera), strict=True))
     if focal_px(camera) <= 0 or not (0 <= named["cx"] <= size[0] and 0 <= named["cy"] <= size[1]):
         raise ConfigError(

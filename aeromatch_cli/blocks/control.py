@@ -5,7 +5,7 @@ The files of ODM, Pix4D and Metashape that hold them are read by `control_files`
 
 from __future__ import annotations
 
-import re
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,8 +15,9 @@ import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
-from aeromatch_cli.blocks.crs import LOCAL
+from aeromatch_cli.blocks.crs import LOCAL, across_unit_m, height_unit_m, is_local, local_unit_m, parsed_crs
 from aeromatch_cli.blocks.image_names import matched_names
+from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
@@ -25,6 +26,9 @@ ControlUse = Literal["adjust", "check"]
 
 # Control points so many extents of the block, and so many metres more, from its middle are elsewhere.
 _FAR_EXTENTS, _FAR_M = 5.0, 2000.0
+# More measurements outside their image than these are no slips of the pen: the pixels are those of other pictures.
+_FEW_OUTSIDE, _SHARE_OUTSIDE = 2, 0.25
+_LARGEST_SIZE = 8
 _WGS84 = "EPSG:4326"
 _LATITUDE_DEG, _LONGITUDE_DEG = 90.0, 180.0
 
@@ -100,42 +104,44 @@ def _places(
     survey: Survey, path: Path, crs: str, origin_m: FloatArray, poses: Mapping[str, Pose]
 ) -> tuple[FloatArray, list[str]]:
     """Positions (N, 3) of the points in the world frame, and a remark where the file has them exchanged."""
-    stated = _stated(survey, crs)
+    stated, across_m, up_m, remarks = _stated(survey, crs)
     given = np.array([point.position for point in survey.points], dtype=np.float64).reshape(-1, 3)
+    given[:, 2] *= up_m
     if crs == LOCAL:
         if stated is not None and stated.is_geographic:
             raise ConfigError(
                 f"{survey.crs_where}: the control points are in degrees, and the block has no CRS that they could be "
                 "brought to: give one with --crs, such as EPSG:32633"
             )
-        return given - origin_m, []
+        return given * (across_m, across_m, 1.0) - origin_m, remarks
     if stated is None:
-        stated = _crs(crs)
+        given[:, :2] *= across_m
+        stated = parsed_crs(crs).to_2d()
     degrees = _as_degrees(given)
     exchanged = given[:, [1, 0, 2]]
     said = f"{path.name}: the coordinates of the control points are exchanged (x and y): they were put right"
     if stated.is_geographic and not degrees:
         if _as_degrees(exchanged):
-            return _to_block(survey, stated, crs, exchanged) - origin_m, [said]
+            return _to_block(survey, stated, crs, exchanged) - origin_m, [*remarks, said]
         raise ConfigError(
             f"{survey.points[0].where}: {given[0, 0]:g}, {given[0, 1]:g} are no degrees, and {stated.name} counts in "
             "degrees: name the projected CRS of the coordinates, such as EPSG:32633"
         )
     places_m = _to_block(survey, stated, crs, given) - origin_m
     if _apart_m(places_m, poses) is None:
-        return places_m, []
+        return places_m, remarks
     turned_m = _to_block(survey, stated, crs, exchanged, strict=False) - origin_m
     if np.isfinite(turned_m).all() and _apart_m(turned_m, poses) is None:
-        return turned_m, [said]
+        return turned_m, [*remarks, said]
     for order in (given, exchanged) if not stated.is_geographic else ():
         if _as_degrees(order):
-            as_degrees_m = _to_block(survey, _crs(_WGS84), crs, order, strict=False) - origin_m
+            as_degrees_m = _to_block(survey, parsed_crs(_WGS84), crs, order, strict=False) - origin_m
             if np.isfinite(as_degrees_m).all() and _apart_m(as_degrees_m, poses) is None:
                 raise ConfigError(
                     f"{survey.crs_where}: the coordinates of the control points are degrees, and {stated.name} counts "
                     f"in metres: name {_WGS84} there"
                 )
-    return places_m, []
+    return places_m, remarks
 
 
 def _as_degrees(positions: FloatArray) -> bool:
@@ -144,39 +150,33 @@ def _as_degrees(positions: FloatArray) -> bool:
     return bool(largest[0] <= _LONGITUDE_DEG and largest[1] <= _LATITUDE_DEG)
 
 
-def _stated(survey: Survey, crs: str) -> Any:
-    """The CRS of the coordinates, None for the block's own. crs: the block's."""
+def _stated(survey: Survey, crs: str) -> tuple[Any, float, float, list[str]]:
+    """The CRS of the coordinates without heights, None for the block's own, metres of one unit of x and y and of
+    heights, and remarks. crs: the block's."""
     from pyproj.exceptions import CRSError
 
     if survey.crs is None:
-        return _crs(_WGS84) if survey.geographic else None
+        return parsed_crs(_WGS84) if survey.geographic else None, 1.0, 1.0, []
     text = survey.crs.strip()
-    if text.lower() == LOCAL or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
-        return None
+    if text.lower() == LOCAL:
+        return None, 1.0, 1.0, []
+    if is_local(text):
+        one_m = local_unit_m(text)
+        return None, one_m, one_m, []
     try:
-        found = _crs(text)
+        found = parsed_crs(text)
     except CRSError as error:
         if crs == LOCAL:
-            return None
+            return None, 1.0, 1.0, []
         raise ConfigError(
             f"{survey.crs_where}: {text[:60]!r} is no CRS: write a code such as EPSG:32633, or WGS84 UTM 33N"
         ) from error
     if found.is_geocentric:
         raise ConfigError(f"{survey.crs_where}: geocentric coordinates: export them in a projected CRS or in degrees")
-    return found
-
-
-def _crs(text: str) -> Any:
-    """Of a code, a PROJ string, WKT, or "WGS84 UTM 33N"; heights do not count."""
-    from pyproj import CRS
-
-    utm = re.fullmatch(r"WGS\s*84\s+UTM\s+(\d{1,2})\s*([NS])", text, re.IGNORECASE)
-    found: Any = CRS.from_user_input(
-        f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
-    )
-    if found.is_bound:  # a CRS that is written with its shift to WGS84 (TOWGS84)
-        found = found.source_crs
-    return found.to_2d()
+    if not (found.is_geographic or found.is_projected):
+        raise ConfigError(f"{survey.crs_where}: {found.name} has no easting and northing: name a projected CRS")
+    up_m = height_unit_m(survey.crs_where, found)
+    return found.to_2d(), across_unit_m(found), up_m, unit_remarks(survey.crs_where, found)
 
 
 def _to_block(survey: Survey, stated: Any, crs: str, positions: FloatArray, *, strict: bool = True) -> FloatArray:
@@ -221,6 +221,8 @@ def _measured(
         remarks.append(f"{path.name} names {count} that the block does not have: {listed(sorted(absent))}")
     if twice:
         remarks.append(f"{path.name} measures points twice in an image: the first counts: {listed(twice)}")
+    if len(outside) > max(_FEW_OUTSIDE, _SHARE_OUTSIDE * sum(mark.image in known for mark in marks)):
+        raise ConfigError(f"{path}: {_other_pictures(marks, known, by_name, outside, turned)}")
     if outside:
         question = "are pixel x and y exchanged?" if turned == len(outside) else "were they measured in these pictures?"
         remarks.append(
@@ -228,6 +230,27 @@ def _measured(
             f"({listed(outside)}): {question}"
         )
     return {point: list(seen.items()) for point, seen in found.items() if seen}, remarks
+
+
+def _other_pictures(
+    marks: Sequence[Mark], known: Mapping[str, str], images: Mapping[str, Image], outside: list[str], turned: int
+) -> str:
+    """What is wrong with a file of which many measurements lie outside their image."""
+    count = f"{len(outside)} measurements of control points lie outside their image ({listed(outside)})"
+    if turned == len(outside):
+        return f"{count}, and inside with x and y exchanged: exchange pixel x and y"
+    shares = []
+    for mark in marks:
+        if mark.image in known:
+            image = images[known[mark.image]]
+            shares.append(max(mark.pixel[0] / image.width_px, mark.pixel[1] / image.height_px))
+    times = math.ceil(max(shares) - 1e-9)
+    return (
+        f"{count}: most likely they were measured in pictures of {times} times the size; divide the pixels by {times}, "
+        "or measure in these pictures"
+        if 1 < times <= _LARGEST_SIZE
+        else f"{count}: were they measured in these pictures, from the upper left corner?"
+    )
 
 
 def _inside(image: Image, x: float, y: float) -> bool:

@@ -1,9 +1,9 @@
 """The world frame: a projected CRS in metres minus a rounded origin, or a local frame.
 
-Heights are never transformed: z is the altitude as given, whatever its vertical datum, so that ground heights of the
-same source fit. Meridian convergence is the grid azimuth's defect: grid azimuth = true azimuth - convergence. It is
-positive east of the central meridian in the northern hemisphere, where true north lies to the left (west) of grid
-north. Worked case: at 28 N, 1 degree east of UTM 17's meridian it is +sin(28) = +0.47 degrees.
+Heights are never transformed but for their unit: z is the altitude as given, whatever its vertical datum, so that
+ground heights of the same source fit. Meridian convergence is the grid azimuth's defect: grid azimuth = true azimuth -
+convergence. It is positive east of the central meridian in the northern hemisphere, where true north lies to the left
+(west) of grid north. Worked case: at 28 N, 1 degree east of UTM 17's meridian it is +sin(28) = +0.47 degrees.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ _ORIGIN_STEP_M = 1000.0
 _MARGIN_DEG = 3.0
 # Eastings of some CRSs and many lists begin with the number of the zone, in millions.
 _PREFIX_M = 1_000_000.0
+_SAME_M = 0.001
+_LOCAL_WKT = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
+_UTM = re.compile(r"WGS\s*84[\s/]+UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,16 @@ def checked_crs(code: str) -> str:
     """
     if code.strip().lower() == LOCAL:
         return LOCAL
-    crs = _crs(code)
-    if not crs.is_projected:
+    whole = _crs(code)
+    if not whole.is_projected:
         raise ConfigError(
-            f"crs {code!r} ({crs.name}) is not projected: give one in metres, such as EPSG:32633, or auto"
+            f"crs {code!r} ({whole.name}) is not projected: give one in metres, such as EPSG:32633, or auto"
+        )
+    crs = whole.to_2d()
+    if is_stretched(crs):
+        raise ConfigError(
+            f"crs {code!r} ({crs.name}) has no true lengths: its metres grow towards the poles; export the list in UTM "
+            "or in degrees"
         )
     for axis in crs.axis_info[:2]:
         if axis.direction.lower() not in ("east", "north") or axis.unit_conversion_factor != 1.0:
@@ -53,8 +62,101 @@ def checked_crs(code: str) -> str:
                 f"crs {code!r} ({crs.name}) counts in {axis.unit_name} to the {axis.direction}: coordinates in metres "
                 "whose axes point east and north are needed, or degrees; export the list in such a CRS"
             )
+    if height_unit_m(f"crs {code!r}", whole) != 1.0:
+        raise ConfigError(
+            f"crs {code!r} ({whole.name}) counts heights in another unit than metres: export the list in a CRS with "
+            "heights in metres, or write the unit behind the column's name (z [us-ft])"
+        )
     authority = crs.to_authority()
     return ":".join(authority) if authority else code.strip()
+
+
+def parsed_crs(text: str) -> Any:
+    """The CRS of a code, a PROJ string, WKT or words ("WGS84", "WGS84 UTM 33N", "WGS 84 / UTM zone 33N"); that without
+    its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none."""
+    from pyproj import CRS
+
+    text = text.strip(" \t;,\"'")  # as spreadsheets leave it
+    utm = _UTM.fullmatch(text)
+    crs: Any = CRS.from_user_input(f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text)
+    return crs.source_crs if crs.is_bound else crs
+
+
+def is_local(text: str) -> bool:
+    """Whether WKT is that of a local frame."""
+    return text.strip().upper().startswith(_LOCAL_WKT)
+
+
+def local_unit_m(text: str) -> float:
+    """Metres of one unit of a local frame, by its WKT."""
+    unit = re.search(r'UNIT\["[^"]*",\s*([\d.]+)', text)
+    return float(unit[1]) if unit else 1.0
+
+
+def is_stretched(crs: Any) -> bool:
+    """Whether lengths in a projected CRS grow with the latitude, as in the web's maps."""
+    return crs.coordinate_operation is not None and "mercator" in crs.coordinate_operation.method_name.lower().replace(
+        "transverse mercator", ""
+    ).replace("oblique mercator", "")
+
+
+def height_unit_m(where: str, crs: Any) -> float:
+    """Metres of one unit of heights: that of the vertical axis, else of the projected CRS, else metres.
+
+    Raises ConfigError where the CRS counts depths. where: begins the message.
+    """
+    for axis in crs.axis_info:
+        if axis.direction.lower() == "down":
+            raise ConfigError(f"{where}: {crs.name} counts depths downwards: give heights")
+        if axis.direction.lower() == "up":
+            return float(axis.unit_conversion_factor)
+    return across_unit_m(crs)
+
+
+def across_unit_m(crs: Any) -> float:
+    """Metres of one unit of the horizontal axes, 1 where these are degrees."""
+    return float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected and crs.axis_info else 1.0
+
+
+def metric_crs(crs: Any) -> str:
+    """Code, else WKT, of the horizontal part of a projected CRS, or of the same grid in metres."""
+    from pyproj import CRS
+
+    horizontal = (crs.sub_crs_list[0] if crs.is_compound else crs).to_2d()
+    if across_unit_m(horizontal) != 1.0:
+        twin = _metric_twin(horizontal)
+        if twin:
+            return twin
+        tree = horizontal.to_json_dict()
+        for axis in tree["coordinate_system"]["axis"]:
+            axis["unit"] = "metre"
+        tree.pop("id", None)
+        tree["name"] = f"{horizontal.name}, metres"
+        horizontal = CRS.from_json_dict(tree)
+    authority = horizontal.to_authority(min_confidence=60)
+    return ":".join(authority) if authority else str(horizontal.to_wkt())
+
+
+def _metric_twin(crs: Any) -> str:
+    """Code of the CRS that has the name of one in feet without its unit, and the same places; "" for none."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    if crs.area_of_use is None or "(ft" not in crs.name:
+        return ""
+    try:
+        twin = CRS.from_user_input(crs.name.partition("(ft")[0].strip())
+    except CRSError:
+        return ""
+    area = crs.area_of_use
+    place = (area.west + area.east) / 2.0, (area.south + area.north) / 2.0
+    own, other = (
+        np.array(Transformer.from_crs(one.geodetic_crs, one, always_xy=True).transform(*place)) * across_unit_m(one)
+        for one in (crs, twin)
+    )
+    code = twin.to_authority()
+    fits = twin.is_projected and across_unit_m(twin) == 1.0 and crs.geodetic_crs == twin.geodetic_crs
+    return ":".join(code) if code and fits and float(np.abs(own - other).max()) < _SAME_M else ""
 
 
 def utm_crs(latitudes_deg: FloatArray, longitudes_deg: FloatArray) -> str:
@@ -79,7 +181,7 @@ def grid_from_geographic(crs: str, latitudes_deg: FloatArray, longitudes_deg: Fl
 
     if crs == LOCAL:
         raise ConfigError("latitudes and longitudes cannot be placed in a local frame: give a CRS, or auto, with --crs")
-    transformer = Transformer.from_crs("EPSG:4326", _crs(crs), always_xy=True)
+    transformer = Transformer.from_crs("EPSG:4326", _crs(crs).to_2d(), always_xy=True)
     xy_m = np.stack(transformer.transform(longitudes_deg, latitudes_deg), axis=-1).astype(np.float64).reshape(-1, 2)
     xy_m[~np.isfinite(xy_m).all(axis=1)] = np.nan
     return xy_m
@@ -89,7 +191,7 @@ def geographic_from_grid(crs: str, xy_m: FloatArray) -> FloatArray:
     """Latitude and longitude (N, 2) in degrees, WGS84, of eastings and northings (N, 2) in a CRS."""
     from pyproj import Transformer
 
-    transformer = Transformer.from_crs(_crs(crs), "EPSG:4326", always_xy=True)
+    transformer = Transformer.from_crs(_crs(crs).to_2d(), "EPSG:4326", always_xy=True)
     longitudes, latitudes = transformer.transform(xy_m[:, 0], xy_m[:, 1])
     return np.column_stack([latitudes, longitudes])
 
@@ -99,7 +201,7 @@ def outside_area(crs: str, xy_m: FloatArray) -> str:
     eastings begin with the number of the zone; "" where nothing is, and in a local frame."""
     if crs == LOCAL or not len(xy_m):
         return ""
-    known = _crs(crs)
+    known = _crs(crs).to_2d()
     x, y = np.nanmedian(xy_m, axis=0)
     zone = re.fullmatch(r"(\d{1,2})[NS]", known.utm_zone or "")
     if zone and x // _PREFIX_M == int(zone[1]):
@@ -128,7 +230,7 @@ def convergence_deg(crs: str, latitudes_deg: FloatArray, longitudes_deg: FloatAr
 
     if crs == LOCAL:
         return np.zeros(len(latitudes_deg))
-    factors = Proj(_crs(crs)).get_factors(np.asarray(longitudes_deg), np.asarray(latitudes_deg))
+    factors = Proj(_crs(crs).to_2d()).get_factors(np.asarray(longitudes_deg), np.asarray(latitudes_deg))
     return np.atleast_1d(np.asarray(factors.meridian_convergence, dtype=np.float64))
 
 
@@ -154,10 +256,10 @@ def choose_crs(given: str, stated: str | None, latitudes_deg: Sequence[float], l
 
 
 def _crs(code: str) -> Any:
-    from pyproj import CRS
+    """With its heights."""
     from pyproj.exceptions import CRSError
 
     try:
-        return CRS.from_user_input(code).to_2d()
+        return parsed_crs(code)
     except CRSError as error:
         raise ConfigError(f"crs {code!r} is unknown: give a code such as EPSG:32633, or auto, or local") from error

@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
+from aeromatch_cli.blocks.captures import numbers_of_exposures
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 
@@ -15,16 +16,19 @@ from aeromatch_cli.errors import ConfigError
 _DIGIT_GROUPS = 3
 
 
-def matched_rows(pose_list: PoseList, names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
+def matched_rows(
+    pose_list: PoseList, names: Sequence[str], source: str, times: Mapping[str, str] | None = None
+) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and remarks on lines without image and images without line.
 
     An exact relative path comes first; then the same path in another case, the bare file name, and the name without
     suffix (Metashape's labels); of several, the one whose folders are named, too. A path does not fall back
     to an image that has a line of its own, nor, where the list has several of its file name, to one of another folder.
-    Running numbers (DJI's MRK, PATB) stand in the names, of one folder. Raises ConfigError where two images fit a line,
+    Running numbers (PATB) stand in the names, of one folder; those of exposures with times (DJI's MRK) are matched by
+    order and time (`captures`). times: of the images, ISO text by name. Raises ConfigError where two images fit a line,
     or two lines an image.
     """
-    rows, absent = _matches(pose_list.rows, names, source)
+    rows, absent = _matches(pose_list.rows, names, source, times or {})
     if names and not rows:
         raise ConfigError(
             f"{source} names none of the {len(names)} images in the folder: it says {pose_list.rows[0].image}, the "
@@ -46,12 +50,20 @@ def matched_names(lines: Mapping[str, int], names: Sequence[str], source: str) -
     lines: name as the file has it -> the line where it stands first. Raises ConfigError as `matched_rows`.
     """
     written = [PoseRow(name, line, None, "grid", None, "none") for name, line in lines.items()]
-    rows, absent = _matches(written, names, source)
+    rows, absent = _matches(written, names, source, {})
     return {row.image: name for name, row in rows.items()}, absent
 
 
-def _matches(written: Sequence[PoseRow], names: Sequence[str], source: str) -> tuple[dict[str, PoseRow], list[str]]:
+def _matches(
+    written: Sequence[PoseRow], names: Sequence[str], source: str, times: Mapping[str, str]
+) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and names of lines that mean no image."""
+    exposures = {int(row.image): row for row in written if row.numbered and row.time_s is not None}
+    if exposures:
+        taken = numbers_of_exposures(names, times, {number: row.time_s or 0.0 for number, row in exposures.items()})
+        if taken:
+            rows = {name: exposures[number] for name, number in taken.items()}
+            return rows, [row.image for number, row in exposures.items() if number not in set(taken.values())]
     by_key: dict[str, list[str]] = defaultdict(list)
     for name in names:
         path = PurePosixPath(name)
@@ -60,7 +72,7 @@ def _matches(written: Sequence[PoseRow], names: Sequence[str], source: str) -> t
     by_number = _numbered(names, {int(float(row.image)) for row in written if row.numbered})
     alike = Counter(PurePosixPath(row.image.lower()).name for row in written)
     exact = set(names)
-    rows: dict[str, PoseRow] = {row.image: row for row in written if row.image in exact}
+    rows = {row.image: row for row in written if row.image in exact}
     absent: list[str] = []
     for row in written:
         if row.image in exact:

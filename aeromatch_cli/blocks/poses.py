@@ -15,6 +15,10 @@ Columns, in any order and case (aliases in brackets):
   sigma_omega_deg sigma_phi_deg sigma_kappa_deg   the largest counts
   frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
 
+Lengths are metres and angles degrees unless the name of the column says otherwise (`alt_ft`, `x [us-ft]`, `omega_gon`,
+`yaw (rad)`, `accuracy_mm`), or a comment above the header (`# angles in gon`, `# heights: feet`); a cell may have its
+own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and seconds.
+
 Beside x y or lat lon, a height under another name (altitude, ellipsoidal height, height, elevation) is taken and said;
 heights above ground (relative_altitude, agl) are refused.
 
@@ -30,12 +34,23 @@ import csv
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
+from aeromatch_cli.blocks.fields import with_name, words_of
+from aeromatch_cli.blocks.units import (
+    Kind,
+    degrees_of,
+    factor,
+    is_relative,
+    kind_of,
+    metres_of,
+    named_column,
+    stated_units,
+)
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -69,22 +84,43 @@ def _axis_names(column: str, *axes: str) -> dict[str, str]:
 
 
 _ALIASES = {
-    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename"), "image"),
+    **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename", "file_name"), "image"),
+    **dict.fromkeys(("photo_name", "sourcefile", "image_path", "picture"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
+    **{"gpslatitude": "lat", "gpslongitude": "lon", "gpsaltitude": "alt"},
+    **{"gps_latitude": "lat", "gps_longitude": "lon", "gps_altitude": "alt"},
+    **{"x/longitude": "lon", "y/latitude": "lat", "longitude/x": "lon", "latitude/y": "lat", "height/z": "alt"},
     **_axis_names("sigma_x_m", "x", "e", "easting"),
     **_axis_names("sigma_y_m", "y", "n", "northing"),
     **_axis_names("sigma_z_m", "z", "u", "elevation", "vertical", "vert", "altitude"),
     **_axis_names("sigma_xy_m", "xy", "horizontal", "horz"),
     **{"hrms": "sigma_xy_m", "vrms": "sigma_z_m", "gpsxyaccuracy": "sigma_xy_m", "gpszaccuracy": "sigma_z_m"},
     **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
+    **{"sigma_angle": "sigma_angle_deg"} | {f"sigma_{name}": f"sigma_{name}_deg" for name in ("omega", "phi", "kappa")},
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
 }
 # Columns that are taken for z or alt where there is none, the likeliest first.
 _OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "ellipsoidal_height", "ellipsoid_height", "orthometric_height",
-                  "height", "elevation", "h")  # fmt: skip
+                  "altitude_above_sealevel", "altitude_msl", "height", "elevation", "h")  # fmt: skip
+# Those that are taken beside heights above ground, too.
+_FROM_DATUM = _OTHER_HEIGHTS[2:-3]
 # Heights above ground, or above where the flight began.
-_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "rel_alt")
+_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "altitude_agl", "rel_alt", "salt", "height_above_ground",
+                     "height_above_takeoff", "altitude_above_ground", "altitude_above_takeoff")  # fmt: skip
+# What names the CRS of every line.
+_CRS_COLUMNS = ("crs", "srs", "epsg", "cs_name", "coordinate_system")
+_CRS_COMMENT = re.compile(
+    r"#\s*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=]\s*(?P<named>\S.*)"
+    r"|(?P<code>EPSG\s*:\s*\d+(?:\+\d+)?)\s*)",
+    re.IGNORECASE,
+)
+# Every name of a column, in lower case, and the one that it has here.
+_NAMES: Mapping[str, str] = {
+    **{name: name for name in (*_KNOWN, *_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS, *_CRS_COLUMNS)},
+    **_ALIASES,
+}
+_HEIGHTS = (*_OTHER_HEIGHTS, *_RELATIVE_HEIGHTS)
 _BLANKS = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})
 _LARGEST_LATITUDE_DEG = 90.0
 # So many latitudes that are none are no slip of the pen.
@@ -92,6 +128,8 @@ _CERTAINLY = 3
 # A latitude beyond 90 degrees may be a longitude: see _with_latitudes.
 _RANGES = {"lat": 180.0, "lon": 180.0, "qw": 1.05, "qx": 1.05, "qy": 1.05, "qz": 1.05}
 _LARGEST_ANGLE_DEG = 360.0
+# What a spreadsheet writes to say what separates.
+_SEPARATOR_LINE = re.compile(r"\"?sep=.\"?", re.IGNORECASE)
 _LINES_NAMED = 5  # of those with the same fault
 # Images by line, by what is wrong with it.
 _Faults = dict[str, dict[int, str]]
@@ -107,8 +145,8 @@ class PoseRow:
     says; None with "none". camera: "" where not given. forward: of yaw, pitch, roll, whether the optical axis is body x
     (gimbal) or down (nadir) at zero angles; None where the format leaves it open. true_north: angles and quaternions of
     grid positions count from true north instead of grid north; those of latitudes and longitudes, too. numbered: the
-    image is named by its running number alone. sigmas_m: standard deviations to the east, to the north and of the
-    height.
+    image is named by its running number alone. time_s: of the exposure, in GPS time. sigmas_m: standard deviations to
+    the east, to the north and of the height.
     """
 
     image: str
@@ -123,6 +161,7 @@ class PoseRow:
     forward: bool | None = None
     true_north: bool = False
     numbered: bool = False
+    time_s: float | None = None
 
     @property
     def sigma_position_m(self) -> float | None:
@@ -151,18 +190,34 @@ class _Layout:
     position_kind: PositionKind
     attitude_kind: AttitudeKind
     ignored: tuple[str, ...]
+    factors: Mapping[str, float]  # metres or degrees of one unit, by column
     height: str = ""  # the column that is taken for z or alt under another name
+    crs_column: int = -1
 
 
-def read_poses(path: Path) -> PoseList:
-    """Reads a pose list. Raises ConfigError with file, line and column where the list is malformed."""
-    lines = [line for line in enumerate(_text(path).splitlines(), start=1) if line[1].strip()]
+def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str | None = None) -> PoseList:
+    """Reads a pose list. Its `crs` is as the list states it, a code or other text.
+
+    usual_m: metres of one unit of x and y, and of heights, where the list names none. text: instead of the
+    file's. Raises ConfigError with file, line and column where the list is malformed.
+    """
+    text = _text(path) if text is None else text
+    lines = [line for line in enumerate(text.splitlines(), start=1) if line[1].strip()]
+    if lines and _SEPARATOR_LINE.fullmatch(lines[0][1].strip()):
+        lines = lines[1:]
     header, layout, records = _header(path, lines)
+    across_m, up_m = usual_m
+    usual = {"x": across_m, "y": across_m, "z": up_m, "alt": up_m}
+    layout = replace(layout, factors={**usual, **layout.factors})
+    systems: dict[str, int] = {}
     faults: _Faults = {}
     rows: list[PoseRow] = []
     lines_of: dict[str, int] = {}
     for number, line in records:
-        row = _row(path, number, _split(path, number, line, layout.separator), layout, faults)
+        cells = _split(path, number, line, layout)
+        row = _row(path, number, cells, layout, faults)
+        if layout.crs_column >= 0 and (text := cells[layout.crs_column].strip()):
+            systems.setdefault(f"EPSG:{text}" if text.isdigit() else text, number)
         if row.image in lines_of:
             raise ConfigError(
                 f"{path}, line {number}, column image: {row.image!r} stands in line {lines_of[row.image]} already: "
@@ -174,11 +229,46 @@ def read_poses(path: Path) -> PoseList:
         raise ConfigError(f"{path}: no line follows the header in line {header}: add one line per image")
     rows, exchanged = _with_latitudes(path, rows)
     ignored = [f"{path.name}: unknown columns ignored: {', '.join(layout.ignored)}"] if layout.ignored else []
+    datum = stated_units(line for _, line in lines).get("datum")
+    if datum:
+        ignored.append(
+            f"{path.name}: {datum!r}: heights are not converted; ground and control points must count from the same "
+            "zero"
+        )
     if layout.height:
         own = _POSITIONS[layout.position_kind][2]
         ignored.append(f"{path.name}: {layout.height} is taken for the height {own}, which counts from the datum")
     warnings = [_fault(path, fault, images) for fault, images in faults.items()]
-    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings))
+    if len(systems) > 1:
+        raise ConfigError(
+            f"{path}, line {max(systems.values())}: the list names {len(systems)} coordinate systems: one is needed"
+        )
+    crs = next(iter(systems), None) or stated_crs(text for _, text in lines)
+    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings), crs=crs)
+
+
+def stated_crs(lines: Iterable[str]) -> str | None:
+    """What a comment says of the CRS, None where none does."""
+    found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
+    return next(((match["named"] or match["code"]).strip() for match in found if match), None)
+
+
+def is_position(name: str, *, height: bool) -> bool:
+    """Whether a column of this name holds a coordinate. height: or a height that counts from a datum."""
+    column, _ = _canonical(name)
+    return column in ("x", "y", "lat", "lon") or (height and column in _OTHER_HEIGHTS)
+
+
+def has_header(lines: Sequence[str]) -> bool:
+    """Whether a comment names the columns of lines that could do without."""
+    for line in lines:
+        text = line.strip()
+        if text and not text.startswith("#"):
+            return False
+        _, columns, _ = _columns(text.lstrip("#").strip())
+        if "image" in columns and {*_POSITIONS["grid"][:2], *_POSITIONS["geographic"][:2]} & set(columns):
+            return True
+    return False
 
 
 def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], list[str]]:
@@ -239,10 +329,11 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
     # A header behind a comment mark counts only where the first plain line is none.
     for place in [*places, *range(first - 1, -1, -1)]:
         number, line = lines[place]
-        separator, columns = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
+        separator, columns, units = _columns(line.lstrip().lstrip("#").strip() if place < first else line.strip())
         if "image" in columns and len(columns) > 1:
             records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
-            return number, _layout(path, number, separator, columns), records
+            said = stated_units(text for _, text in lines)
+            return number, _layout(path, number, separator, columns, units, said), records
     number, line = lines[min(first, len(lines) - 1)]
     found = ", ".join(_columns(line.strip())[1])[:120]
     raise ConfigError(
@@ -251,51 +342,101 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
     )
 
 
-def _columns(line: str) -> tuple[str | None, tuple[str, ...]]:
-    """The separator under which most column names are known, and the canonical names."""
-    best: tuple[int, str | None, tuple[str, ...]] = (-1, None, ())
+def _columns(line: str) -> tuple[str | None, tuple[str, ...], tuple[str, ...]]:
+    """The separator under which most column names are known, the canonical names, and the units that they state."""
+    best: tuple[int, str | None, list[tuple[str, str]]] = (-1, None, [])
     for separator in (",", ";", "\t", None):
         cells = line.split(separator) if separator else line.split()
-        names = tuple(_canonical(cell) for cell in cells)
-        known = sum(name in _KNOWN for name in names)
+        columns = [_canonical(cell) for cell in cells]
+        known = sum(name in _KNOWN for name, _ in columns)
         if known > best[0]:
-            best = (known, separator, names)
-    return best[1], best[2]
+            best = (known, separator, columns)
+    return best[1], tuple(name for name, _ in best[2]), tuple(unit for _, unit in best[2])
 
 
-def _canonical(cell: str) -> str:
+def _canonical(cell: str) -> tuple[str, str]:
     if len(cell) > _LONGEST_NAME:
-        return cell[:_LONGEST_NAME]  # no name, and the pattern would take hours for a hundred thousand brackets
-    name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", cell.strip().strip("\"'").strip().lower())
-    name = re.sub(r"[\s-]+", "_", name)
-    return _ALIASES.get(name, name)
+        return cell[:_LONGEST_NAME], ""  # no name, and the pattern would take hours for a hundred thousand brackets
+    name, unit = named_column(cell, _NAMES)
+    return (_RELATIVE_HEIGHTS[0], "") if name in _OTHER_HEIGHTS and is_relative(unit) else (name, unit)
 
 
-def _layout(path: Path, number: int, separator: str | None, columns: tuple[str, ...]) -> _Layout:
+def _kind(column: str) -> Kind | None:
+    """Whether a column holds lengths or angles, None for neither."""
+    if column in ("lat", "lon") or column.endswith("_deg"):
+        return "angle"
+    return "length" if column in ("x", "y", *_HEIGHTS) or column in _ALL_SIGMAS else None
+
+
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Mapping[str, str]) -> dict[str, float]:
+    """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
+    found: dict[str, float] = {}
+    for column, unit in zip(columns, units, strict=True):
+        kind = _kind(column)
+        if kind is None:
+            continue
+        if column in _ALL_SIGMAS:
+            subjects: tuple[str, ...] = ("accuracies",)
+        elif column in _HEIGHTS:
+            subjects = ("heights", "coordinates", "units")
+        else:
+            subjects = ("coordinates", "units") if column in ("x", "y", "lat", "lon") else ("angles", "units")
+        stated = (said[subject] for subject in subjects if subject in said)
+        # Coordinates in degrees say nothing of heights, and one unit of all that is given nothing of the other kind.
+        others = (text for text in stated if kind_of(text) == kind or subjects[0] in said)
+        text = unit or next(others, "")
+        if text:
+            found[column] = factor(where, column, text, kind)
+    return found
+
+
+def _layout(
+    path: Path, number: int, separator: str | None, columns: tuple[str, ...], units: tuple[str, ...],
+    said: Mapping[str, str],
+) -> _Layout:  # fmt: skip
     where = f"{path}, line {number}"
+    first = columns.index("image")
+    columns = tuple("" if name == "image" and place != first else name for place, name in enumerate(columns))
     twice = sorted({name for name in columns if name and columns.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
+    factors = _factors(where, columns, units, said)
     columns, height = _with_height(columns)
-    unknown = tuple(name for name in columns if name and name not in _KNOWN)
+    if height in factors:
+        factors |= {own: factors[height] for own in ("z", "alt") if own in columns}
+    crs_column = next((place for place, name in enumerate(columns) if name in _CRS_COLUMNS), -1)
+    unknown = tuple(name for name in columns if name and name not in _KNOWN and name not in _CRS_COLUMNS)
     for name in unknown:
         near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
-        if near and len(name) > 2:
+        if near and len(name) > 2 and name not in _HEIGHTS:
             raise ConfigError(f"{where}: unknown column {name!r}: did you mean {near[0]!r}?")
     position = _form(where, "position", _POSITIONS, columns, unknown)
     if position is None:
         raise ConfigError(f"{where}: no position: add the columns x,y,z or lat,lon,alt")
+    if "relative" in said and _POSITIONS[cast(PositionKind, position)][2] in columns:
+        raise ConfigError(
+            f"{path}: {said['relative']!r} says that heights do not count from a datum: leave the column out, or give "
+            "heights above the ellipsoid or sea level"
+        )
     attitude = _form(where, "attitude", _ATTITUDES, columns, unknown)
     return _Layout(
-        separator, columns, cast(PositionKind, position), cast(AttitudeKind, attitude or "none"), unknown, height
+        separator,
+        columns,
+        cast(PositionKind, position),
+        cast(AttitudeKind, attitude or "none"),
+        unknown,
+        factors,
+        height,
+        crs_column,
     )
 
 
 def _with_height(columns: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
     """Columns in which z or alt stands for a height under another name, and that name, "" for none."""
     for across, own in ((("x", "y"), "z"), (("lat", "lon"), "alt")):
-        if set(across) <= set(columns) and own not in columns and not set(columns) & set(_RELATIVE_HEIGHTS):
-            other = next((name for name in _OTHER_HEIGHTS if name in columns), "")
+        if set(across) <= set(columns) and own not in columns:
+            relative = bool(set(columns) & set(_RELATIVE_HEIGHTS))
+            other = next((name for name in (_FROM_DATUM if relative else _OTHER_HEIGHTS) if name in columns), "")
             if other:
                 return tuple(own if name == other else name for name in columns), other
     return columns, ""
@@ -323,11 +464,13 @@ def _form(
     return str(present[0])
 
 
-def _split(path: Path, number: int, line: str, separator: str | None) -> list[str]:
-    if separator is None:
-        return line.split()
+def _split(path: Path, number: int, line: str, layout: _Layout) -> list[str]:
+    if layout.separator is None:
+        cells = words_of(line)
+        more = len(cells) - len(layout.columns)
+        return with_name(cells, layout.columns.index("image"), more + 1) if more > 0 else cells
     try:
-        return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        return next(csv.reader([line], delimiter=layout.separator, skipinitialspace=True))
     except (csv.Error, StopIteration) as error:
         raise ConfigError(f"{path}, line {number}: not a line of separated values ({error})") from error
 
@@ -347,7 +490,7 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
         raise ConfigError(f"{path}, line {number}, column image: empty: name the image")
 
     def numbers(names: tuple[str, ...]) -> tuple[float | None, ...]:
-        return tuple(_number(path, number, name, record[name]) for name in names)
+        return tuple(_number(path, number, name, record[name], layout.factors.get(name, 1.0)) for name in names)
 
     sigmas = [numbers((name,))[0] if name in record else None for name in _SIGMAS]
     x_m, y_m, z_m, across_m = (numbers((name,))[0] if name in record else None for name in _AXIS_SIGMAS)
@@ -391,17 +534,22 @@ def _row(path: Path, number: int, cells: list[str], layout: _Layout, faults: _Fa
     )
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float | None:
-    """The value of a cell, None where it is empty or NaN. Raises ConfigError where it is no number or out of range."""
+def _number(path: Path, line: int, column: str, cell: str, unit: float) -> float | None:
+    """The value of a cell in metres or degrees, None where it is empty or NaN. unit: one of the column's, in these.
+
+    Raises ConfigError where it is no number or out of range.
+    """
     where = f"{path}, line {line}, column {column}"
     if cell.lower() in _BLANKS:
         return None
-    if cell.count(",") == 1 and "." not in cell:  # beside commas as separators it stands in quotes
-        cell = cell.replace(",", ".")
-    try:
-        value = float(cell)
-    except ValueError as error:
-        raise ConfigError(f"{where}: {cell!r} is not a number") from error
+    kind = _kind(column)
+    if kind == "length":
+        value = metres_of(cell, unit)
+    else:
+        plain = degrees_of(cell, {"lat": "NS", "lon": "EW"}.get(column, ""))
+        value = None if plain is None else plain * unit
+    if value is None:
+        raise ConfigError(f"{where}: {cell!r} is not a number")
     if math.isnan(value):
         return None
     largest = _RANGES.get(column, _LARGEST_ANGLE_DEG if column.endswith("_deg") else math.inf)

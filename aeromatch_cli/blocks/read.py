@@ -15,7 +15,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from aeromatch_cli.blocks import pose_files
-from aeromatch_cli.blocks.agreement import agreed
+from aeromatch_cli.blocks.agreement import agreed, refuse_degrees
 from aeromatch_cli.blocks.camera_files import CameraFile, read_camera_file
 from aeromatch_cli.blocks.cameras import (
     CameraAssignment,
@@ -150,7 +150,8 @@ def block_inputs(
         facts = {name: fact for name, fact in facts.items() if name not in shots}
     rows: dict[str, PoseRow] = {}
     if lists.pose_list is not None:
-        rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}")
+        times = {name: fact.time for name, fact in facts.items()}
+        rows, remarks = matched_rows(lists.pose_list, list(headers), f"pose list {lists.poses}", times)
         warnings += [*lists.pose_list.warnings, *remarks]
     assignment = _assign_cameras(lists, facts, {name: row.camera for name, row in rows.items()})
     warnings += assignment.warnings
@@ -329,7 +330,9 @@ def _agreeing(
     """Those of a pose list, put right by the GPS of the images, and remarks."""
     if lists.pose_list is None:
         return observations, []
-    return agreed(observations, facts, crs, f"pose list {lists.poses}")
+    source = f"pose list {lists.poses}"
+    refuse_degrees(observations, crs, source)
+    return agreed(observations, facts, crs, source)
 
 
 def _stated_crs(lists: GivenLists, crs: str) -> str | None:

@@ -66,7 +66,8 @@ def from_yaw_pitch_roll(yaw_deg: float, pitch_deg: float, roll_deg: float, *, fo
 def from_quaternion(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
     """(3, 3) from a Hamilton quaternion, scalar first, normalised here. Raises ValueError on a zero quaternion."""
     q = np.array([qw, qx, qy, qz], dtype=np.float64)
-    norm = float(np.linalg.norm(q))
+    with np.errstate(over="ignore"):
+        norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-9:
         raise ValueError("a quaternion of length zero is no rotation")
     w, x, y, z = q / norm

@@ -1,7 +1,7 @@
 """OpenDroneMap's gcp_list.txt: coordinates and image measurements in one file.
 
 First line: the CRS of the coordinates, as a code (EPSG:32633), a PROJ string, or "WGS84 UTM 33N". Then one line for
-every point in every image, separated by blanks or tabs:
+every point in every image, separated by blanks, tabs, commas or semicolons:
 
   geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z [accuracy_px]]
 
@@ -17,7 +17,9 @@ from dataclasses import replace
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
-from aeromatch_cli.blocks.pose_files.source import Source, is_number, number
+from aeromatch_cli.blocks.fields import fields_of, with_name
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import Source, is_number, number, units_of_comments
 from aeromatch_cli.errors import ConfigError
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
@@ -30,10 +32,16 @@ def read_gcp_list(source: Source) -> Survey:
     records = list(source.records())
     if len(records) < 2:
         raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
+    said = units_of_comments(source)
+    factors = 1.0, 1.0, 1.0
+    if said.across_m or said.up_m:  # what comments state counts before the unit of the CRS
+        stated = described_crs(source.at(records[0][0]), records[0][1])
+        across, up = (said.across_m or stated.across_m) / stated.across_m, (said.up_m or stated.up_m) / stated.up_m
+        factors = across, across, up
     points: dict[str, SurveyedPoint] = {}
     marks: list[Mark] = []
     for line, record in records[1:]:
-        point, one = _row(source, line, record)
+        point, one = _row(source, line, record, factors)
         known = points.setdefault(point.name, point)
         if any(abs(a - b) > _SAME * max(1.0, abs(a)) for a, b in zip(known.position, point.position, strict=True)):
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
@@ -44,19 +52,27 @@ def read_gcp_list(source: Source) -> Survey:
     )
 
 
-def _row(source: Source, line: int, record: str) -> tuple[SurveyedPoint, Mark]:
-    cells = [cell.strip() for cell in record.split("\t")] if "\t" in record else record.split()
+def _row(source: Source, line: int, record: str, factors: tuple[float, float, float]) -> tuple[SurveyedPoint, Mark]:
+    fields, comma = fields_of(record)
+    while fields and not fields[-1]:
+        fields.pop()
+    cells = with_name(fields, 5)
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
-    x, y, z = (number(source.at(line, what), cell) for what, cell in zip(("x", "y", "z"), cells[:3], strict=True))
+    x, y, z = (
+        number(source.at(line, what), cell, decimal_comma=comma) * one
+        for what, cell, one in zip(("x", "y", "z"), cells[:3], factors, strict=True)
+    )
     named = len(cells) > 6 and not is_check(cells[6])
     name = cells[6] if named else " ".join(cells[:3])
     rest = [cell for cell in cells[7 if named else 6 :] if not is_check(cell)]
-    sigmas = [float(cell) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
+    sigmas = (
+        [float(cell.replace(",", ".")) for cell in rest] if all(map(is_number, rest)) and len(rest) in (2, 3) else []
+    )
     if not all(0.0 < sigma < float("inf") for sigma in sigmas):
         sigmas = []
     across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
     check = any(map(is_check, cells[6:]))
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
-    return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px)
+    return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px, comma=comma)

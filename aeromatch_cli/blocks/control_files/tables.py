@@ -4,7 +4,8 @@ Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_
 latitude stands first; a CRS is not stated, unless a .prj of the same name lies beside. With a header the columns go by
 their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
 `#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
-a check point. `type`: check points are named as such, all else is a control point.
+a check point. `type`: check points are named as such, all else is a control point. Names of columns and comments may
+state units, as in pose lists (`poses`).
 
 Image measurements, as Pix4D writes its marks: `image,label,x,y[,accuracy in pixels]`; or with a header that names these
 columns, in any order.
@@ -13,18 +14,32 @@ columns, in any order.
 from __future__ import annotations
 
 import csv
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
-from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, is_number, number
+from aeromatch_cli.blocks.fields import IMAGE
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import Source, is_number
+from aeromatch_cli.blocks.units import (
+    Kind,
+    degrees_of,
+    factor,
+    is_relative,
+    kind_of,
+    metres_of,
+    named_column,
+    stated_units,
+)
 from aeromatch_cli.errors import ConfigError
 
 _CRS = re.compile(r"#\s*coordinatesystem\s*:\s*(.*)", re.IGNORECASE)
 _LARGEST_LONGITUDE_DEG = 180.0
 # A mark that is less exact than this, in pixels, is none: Pix4D may write the zoom of the picture there.
 _LARGEST_SIGMA_PX = 10.0
+_PIXELS = frozenset(("", "px", "pix", "pixel", "pixels"))
 _SIDES = {"x": "x", "y": "y", "z": "z", "xy": "xy", "x/y": "xy", "xyz": "xyz", "x/y/z": "xyz", "horizontal": "xy",
           "horz": "xy", "vertical": "z", "vert": "z", "": "xyz"}  # fmt: skip
 _POINT_NAMES = ("label", "name", "point", "gcp", "gcp_name", "gcp_label", "point_name", "point_id", "marker", "id")
@@ -36,6 +51,8 @@ _COORDINATES: Mapping[str, str] = {
     **dict.fromkeys(("lat", "latitude"), "latitude"),
     **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "h", "up", "ellipsoidal_height"), "z"),
     **dict.fromkeys(("type", "role", "usage", "use"), "type"),
+    **dict.fromkeys(("cs_name", "crs", "srs", "epsg", "coordinate_system"), "crs"),
+    **{"easting_rms": "sigma_x", "northing_rms": "sigma_y", "elevation_rms": "sigma_z", "lateral_rms": "sigma_xy"},
     **dict.fromkeys(("enable", "enabled"), "enable"),
     **{f"accuracy_{name}".rstrip("_"): f"sigma_{side}" for name, side in _SIDES.items()},
     **{f"{name}_accuracy": f"sigma_{side}" for name, side in _SIDES.items() if name},
@@ -52,7 +69,7 @@ _MARKS: Mapping[str, str] = {
 
 def is_coordinates(source: Source) -> bool:
     """Whether a file is a table of points with three coordinates each."""
-    header, names = _header(source, _COORDINATES)
+    header, names, _ = _header(source, _COORDINATES)
     if header:
         return {"label", "z"} <= set(names) and ({"x", "y"} <= set(names) or {"longitude", "latitude"} <= set(names))
     cells = _first(source)
@@ -61,7 +78,7 @@ def is_coordinates(source: Source) -> bool:
 
 def is_marks(source: Source) -> bool:
     """Whether a file is a table of image measurements."""
-    header, names = _header(source, _MARKS)
+    header, names, _ = _header(source, _MARKS)
     if {"image", "label", "x", "y"} <= set(names):
         return True
     if header or _header(source, _COORDINATES)[0]:
@@ -74,11 +91,21 @@ def is_marks(source: Source) -> bool:
 
 def read_coordinates(source: Source) -> Survey:
     """Raises ConfigError with file and line."""
-    header, names = _header(source, _COORDINATES)
+    header, names, units = _header(source, _COORDINATES)
+    records = list(_rows(source, header))
     crs, crs_where = _stated_crs(source)
-    rows = [(line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells), comma)
-            for line, cells, comma in _rows(source, header)]  # fmt: skip
-    points = [_point(source, line, record, comma) for line, record, comma in rows]
+    crs = crs or _crs_of_column(source, names, records)
+    names, remarks = _one_form(source, names, crs)
+    factors = _factors(source, header, names, units)
+    if crs is not None and factors.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
+        stated = described_crs(crs_where, crs)
+        factors |= {name: factors.get(name, stated.across_m) / stated.across_m for name in "xy"}
+        factors["z"] = factors.get("z", stated.up_m) / stated.up_m
+    rows = [
+        (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
+        for line, cells, _ in records
+    ]
+    points = [_point(source, line, record, factors) for line, record in rows]
     if not points:
         raise ConfigError(f"{source.path}: no control points follow the header")
     twice = next((point for n, point in enumerate(points) if point.name in {one.name for one in points[:n]}), None)
@@ -87,12 +114,17 @@ def read_coordinates(source: Source) -> Survey:
     geographic = "latitude" in names or _in_degrees(points)
     if not header and crs is None and geographic:  # the latitude stands first
         points = [_exchanged(point) for point in points]
-    return Survey(tuple(points), (), crs, crs_where, geographic)
+    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
+        crs = None  # of coordinates that the file does not have
+    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
 
 
 def read_marks(source: Source) -> Survey:
     """Raises ConfigError with file and line."""
-    header, names = _header(source, _MARKS)
+    header, names, units = _header(source, _MARKS)
+    for name, unit in zip(names, units, strict=True):
+        if name in ("x", "y") and unit.strip(".") not in _PIXELS:
+            raise ConfigError(f"{source.at(header, name)}: image measurements in {unit!r}: pixels are needed")
     marks: list[Mark] = []
     for line, cells, comma in _rows(source, header):
         if header:
@@ -129,28 +161,53 @@ def _cells(record: str) -> tuple[list[str], bool]:
     return [cell.strip() for cell in cells], separator != ","
 
 
-def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str]]:
-    """Line of the header, 0 without one, and its columns by their names in `known`."""
+def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str], list[str]]:
+    """Line of the header, 0 without one, its columns by their names in `known`, and the units that they state."""
+    canonical = frozenset(known.values())
     for line, text in enumerate(source.lines, start=1):
         stripped = text.strip()
         if not stripped or _CRS.match(stripped):
             continue
         cells, _ = _cells(stripped.lstrip("#").strip())
-        names = [known.get(_column(cell), "") for cell in cells]
+        columns = [_column(cell, known) for cell in cells]
+        names = [name if name in canonical else "" for name, _ in columns]
         if len({name for name in names if name}) >= 4 and not any(map(is_number, cells)):
-            return line, names
+            return line, names, [unit for _, unit in columns]
         if not stripped.startswith("#"):
             break
-    return 0, []
+    return 0, [], []
 
 
-def _column(cell: str) -> str:
-    """x of `X/Easting`, longitude of `X/Longitude`, accuracy_x/y of `Accuracy_X/Y_(m)`, in lower case without units."""
+def _column(cell: str, known: Mapping[str, str]) -> tuple[str, str]:
+    """easting of `X/Easting`, longitude of `X/Longitude`, accuracy_x/y and m of `Accuracy_X/Y_(m)`."""
     if len(cell) > 100:
-        return ""  # no name
-    name = re.sub(r"[\s_]*[\[(].*?[\])]\s*$", "", cell.strip().lower())
-    name = re.sub(r"^[xyz]/([a-z]+)$", r"\1", re.sub(r"[\s-]+", "_", name))
-    return re.sub(r"_m$", "", name)
+        return "", ""  # no name
+    name, unit = named_column(re.sub(r"^\s*[xyz]/(?=[a-z]{2})", "", cell, flags=re.IGNORECASE), known)
+    return ("", "") if name == "z" and is_relative(unit) else (name, unit)
+
+
+def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[str]) -> dict[str, float]:
+    """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
+    said = stated_units(source.lines)
+    if "relative" in said:
+        raise ConfigError(
+            f"{source.path}: {said['relative']!r} says that heights do not count from a datum: give heights above the "
+            "ellipsoid or sea level"
+        )
+    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys(("x", "y", "z"), "")
+    found = {}
+    for name, unit in stated.items():
+        subjects: tuple[str, ...]
+        kind: Kind = "angle" if name in ("longitude", "latitude") else "length"
+        if name in ("longitude", "latitude", "x", "y", "z") or name.startswith("sigma_"):
+            subjects = ("heights", "coordinates", "units") if name == "z" else ("coordinates", "units")
+            if name.startswith("sigma_"):
+                subjects = ("accuracies",)
+            others = (text for subject in subjects if kind_of(text := said.get(subject, "")) == kind)
+            text = unit or next(others, "")
+            if text:
+                found[name] = factor(source.at(line), name, text, kind)
+    return found
 
 
 def _rows(source: Source, header: int) -> list[tuple[int, list[str], bool]]:
@@ -167,12 +224,19 @@ def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
     return record | (dict(zip(("sigma_xy", "sigma_z"), numbers, strict=False)) if len(numbers) == 2 else {})
 
 
-def _point(source: Source, line: int, record: Mapping[str, str], comma: bool) -> SurveyedPoint:
+def _point(source: Source, line: int, record: Mapping[str, str], factors: Mapping[str, float]) -> SurveyedPoint:
     def value(column: str) -> float:
-        cell = record.get(column, "")
+        cell, unit = record.get(column, ""), factors.get(column, 1.0)
         if not cell:
             raise ConfigError(f"{source.at(line, column)}: empty: a control point has three coordinates")
-        return number(source.at(line, column), cell, decimal_comma=comma)
+        if column in ("longitude", "latitude"):
+            degrees = degrees_of(cell, "EW" if column == "longitude" else "NS")
+            found = None if degrees is None else degrees * unit
+        else:
+            found = metres_of(cell, unit)
+        if found is None or not math.isfinite(found):
+            raise ConfigError(f"{source.at(line, column)}: {cell!r} is not a number")
+        return found
 
     name = record.get("label", "")
     if not name:
@@ -180,16 +244,15 @@ def _point(source: Source, line: int, record: Mapping[str, str], comma: bool) ->
     x, y = ("longitude", "latitude") if "latitude" in record else ("x", "y")
     disabled = record.get("enable", "1").lower() in ("0", "false", "no")
     check = disabled or is_check(record.get("type", ""))
-    return SurveyedPoint(name, source.at(line), (value(x), value(y), value("z")), _sigmas_m(record), check)
+    place = value(x), value(y), value("z")
+    return SurveyedPoint(name, source.at(line), place, _sigmas_m(record, factors), check)
 
 
-def _sigmas_m(record: Mapping[str, str]) -> Sigmas | None:
-    x, y, z, across, overall = (
-        float(text.replace(",", ".")) if is_number(text := record.get(f"sigma_{side}", "")) else None
-        for side in ("x", "y", "z", "xy", "xyz")
-    )
-    stated = [one if one is not None and one < float("inf") else None for one in (x, y, z, across, overall)]
-    return completed_sigmas_m(*stated[:3], across_m=stated[3], overall_m=stated[4])
+def _sigmas_m(record: Mapping[str, str], factors: Mapping[str, float]) -> Sigmas | None:
+    names = [f"sigma_{side}" for side in ("x", "y", "z", "xy", "xyz")]
+    values = [metres_of(record.get(name, ""), factors.get(name, 1.0)) for name in names]
+    x, y, z, across, overall = (one if one is not None and one < math.inf else None for one in values)
+    return completed_sigmas_m(x, y, z, across_m=across, overall_m=overall)
 
 
 def _stated_crs(source: Source) -> tuple[str | None, str]:
@@ -202,6 +265,34 @@ def _stated_crs(source: Source) -> tuple[str | None, str]:
     if beside is not None and beside.text.strip():
         return beside.text.strip(), str(beside.path)
     return None, str(source.path)
+
+
+def _crs_of_column(source: Source, names: Sequence[str], records: Sequence[tuple[int, list[str], bool]]) -> str | None:
+    """The CRS that a column names, None where there is none. Raises ConfigError where lines name several."""
+    if "crs" not in names:
+        return None
+    place = names.index("crs")
+    lines = {cells[place]: line for line, cells, _ in records if len(cells) > place and cells[place]}
+    if len(lines) > 1:
+        raise ConfigError(f"{source.at(max(lines.values()))}: the file names {len(lines)} coordinate systems")
+    text = next(iter(lines), None)
+    return f"EPSG:{text}" if text and text.isdigit() else text
+
+
+def _one_form(source: Source, names: Sequence[str], crs: str | None) -> tuple[list[str], tuple[str, ...]]:
+    """Columns with one form of coordinates, and what is said where there are grid coordinates and degrees: the former
+    count where their CRS is known. Of two heights the first goes with the grid, the last with the degrees."""
+    found = list(names)
+    both = {"x", "y", "longitude", "latitude"} <= set(names)
+    grid = ("x", "y") if not both or crs is not None else ()
+    heights = [place for place, name in enumerate(names) if name == "z"]
+    for place in heights[1:] if grid or not both else heights[:-1]:
+        found[place] = ""
+    if not both:
+        return found, ()
+    found = ["" if name in (("longitude", "latitude") if grid else ("x", "y")) else name for name in found]
+    words = f"easting and northing in {crs}" if grid else "latitude and longitude, since no CRS of the others is named,"
+    return found, (f"{source.path.name}: of two forms of coordinates {words} and the height beside them count",)
 
 
 def _in_degrees(points: list[SurveyedPoint]) -> bool:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, number, rotation_row
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
@@ -36,7 +36,7 @@ def read_blocks_exchange(source: Source) -> PoseList:
     systems = {srs.findtext("Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     rows: list[PoseRow] = []
     groups: list[str] = []
-    found: set[tuple[str | None, PositionKind]] = set()
+    found: dict[str, StatedCrs] = {}
     cameras = CameraShelf(source.path.name)
     unposed = 0
     for block in root.iter("Block"):
@@ -46,7 +46,7 @@ def read_blocks_exchange(source: Source) -> PoseList:
             cameras.add(key, _lens(group))
             identifier = group.findtext("SRSId") or block.findtext("SRSId")
             definition = systems.get(identifier, "") if identifier else ""
-            system = described_crs(str(source.path), definition) if definition else (None, "grid")
+            system = described_crs(str(source.path), definition) if definition else StatedCrs()
             axes = _cam_from_axes(source, group.findtext("CameraOrientation") or "XRightYDown")
             for photo in group.iter("Photo"):
                 path = (photo.findtext("ImagePath") or "").replace("\\", "/")
@@ -54,18 +54,20 @@ def read_blocks_exchange(source: Source) -> PoseList:
                 if center is None:
                     unposed += 1
                     continue
-                found.add(system)
-                x, y, z = (_value(source, path, center, key) for key in "xyz")
+                found[system.name] = system
+                at = system.position(
+                    f"{source.path}, photo {path}", *(_value(source, path, center, axis) for axis in "xyz")
+                )
                 rotation = _rotation(source, path, photo.find("Pose/Rotation"))
-                place = (y, x, z) if system[1] == "geographic" else (x, y, z)
                 cam = None if rotation is None else axes @ rotation
-                rows.append(rotation_row(_short(path), len(rows) + 1, place, cam, system[1], camera=cameras.key(key)))
+                rows.append(rotation_row(_short(path), len(rows) + 1, at, cam, system.kind, camera=cameras.key(key)))
     if len(found) > 1:
         raise ConfigError(f"{source.path}: photo groups are in different reference systems: export them in one")
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this BlocksExchange file has a pose")
-    crs, kind = found.pop()
-    remarks = [f"{source.path.name}: {unposed} photos have no pose there"] if unposed else []
+    _, system = found.popitem()
+    crs, kind = system.crs, system.kind
+    remarks = [*system.remarks, *([f"{source.path.name}: {unposed} photos have no pose there"] if unposed else [])]
     words = crs or ("degrees" if kind == "geographic" else "local frame")
     remarks += cameras.remarks
     return PoseList(tuple(rows), kind, tuple(remarks), f"BlocksExchange, {words}", crs, cameras.found)

@@ -1,4 +1,5 @@
-"""Tables of ExifTool: `exiftool -csv` and `exiftool -json`, with or without -n and group names (-G).
+"""Tables of ExifTool: `exiftool -csv` and `exiftool -json`, with or without -n and group names (-G), coordinates in any
+form that its option -c writes; also saved by a spreadsheet, with semicolons or tabs.
 
 The same tags as in the images themselves: GPSLatitude, GPSLongitude, GPSAltitude (DJI's AbsoluteAltitude before it),
 the angles of the camera (`xmp.xmp_angles`) and their accuracies.
@@ -16,11 +17,11 @@ from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import Source, image_name
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
+from aeromatch_cli.blocks.units import degrees_of
 from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
 from aeromatch_cli.errors import ConfigError
 
 _IMAGE = "SourceFile"
-_DEGREES = re.compile(r"(\d+(?:\.\d+)?)\s*deg\s*(\d+(?:\.\d+)?)'\s*(\d+(?:\.\d+)?)\"\s*([NSEWnsew]?)")
 # Groups whose tag counts before that of others: degrees with a sign.
 _FIRST = "Composite"
 # ExifTool names tags without their namespace: which maker's they are.
@@ -36,7 +37,11 @@ def is_exiftool(source: Source) -> bool:
         return bool(source.tree) and all(isinstance(item, dict) and _IMAGE in item for item in source.tree)
     if isinstance(source.tree, dict):
         return _IMAGE in source.tree
-    return bool(source.lines) and _IMAGE in source.lines[0].split(",")
+    return bool(source.lines) and _IMAGE in next(csv.reader(source.lines[:1], delimiter=_separator(source)), [])
+
+
+def _separator(source: Source) -> str:
+    return max(",;\t", key=source.lines[0].count)
 
 
 def read_exiftool(source: Source) -> PoseList:
@@ -62,7 +67,7 @@ def _records(source: Source) -> Iterator[tuple[int, Mapping[str, Any]]]:
         items = source.tree if isinstance(source.tree, list) else [source.tree]
         yield from enumerate(items, start=1)
         return
-    reader = csv.reader(source.lines)
+    reader = csv.reader(source.lines, delimiter=_separator(source))
     names = next(reader)
     for cells in reader:
         if cells:
@@ -97,25 +102,21 @@ def _row(line: int, record: Mapping[str, Any], said: Counter[str]) -> PoseRow:
 
 
 def _degrees(tags: Mapping[str, Any], name: str) -> float | None:
-    """Signed degrees of `52.5`, `52 deg 31' 11.64" N`; the reference tag counts where the value has no sign."""
-    value = tags.get(name)
-    match = _DEGREES.search(str(value))
-    if match:
-        degrees = float(match[1]) + float(match[2]) / 60.0 + float(match[3]) / 3600.0
-        side = match[4]
-    else:
-        number = tag_number(value)
-        if number is None:
-            return None
-        degrees, side = number, ""
-    side = (side or str(tags.get(f"{name}Ref", ""))[:1]).upper()
-    return -abs(degrees) if side in ("S", "W") else degrees
+    """Signed degrees of a tag; the reference tag counts where the value has no letter."""
+    value = str(tags.get(name, "")).strip()
+    sides = "NS" if name.endswith("Latitude") else "EW"
+    degrees = degrees_of(value, sides)
+    degrees = tag_number(value) if degrees is None else degrees
+    if degrees is None or not set(value.upper()).isdisjoint(sides):
+        return degrees
+    side = str(tags.get(f"{name}Ref", ""))[:1].upper()
+    return -abs(degrees) if side == sides[1] else degrees
 
 
 def _metres(value: Any, reference: Any) -> float:
     """Of `161.96`, `+161.96`, `161.96 m Above Sea Level`; NaN for none."""
     words = str(value).split()
-    number = tag_number(words[0]) if words else None
+    number = tag_number(words[0].replace(",", ".")) if words else None
     if number is None:
         return float("nan")
     below = "below" in str(value).lower() or str(reference).strip() == "1" or "below" in str(reference).lower()

@@ -1,49 +1,108 @@
-"""Geocentric and topocentric coordinates: geodetic latitude, longitude and ellipsoidal height of them."""
+"""What files state of their coordinates; geocentric and topocentric ones as latitude, longitude and height."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.crs import (
+    across_unit_m,
+    height_unit_m,
+    is_local,
+    is_stretched,
+    local_unit_m,
+    metric_crs,
+    parsed_crs,
+)
 from aeromatch_cli.blocks.poses import PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 
+_LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 
-def described_crs(where: str, text: str) -> tuple[str | None, PositionKind]:
-    """Code or text of a CRS and what coordinates in it are; None for a local one and for WGS84 degrees.
 
-    text: EPSG:code, PROJ or WKT; "WGS84 UTM 16N". Raises ConfigError where it is unknown or geocentric.
-    """
-    import re
+@dataclass(frozen=True)
+class StatedCrs:
+    """What a file states of its coordinates. crs: code or WKT of the grid in metres, None for a local one and for
+    degrees. name: for messages. across_m, up_m: metres of one unit of x and y, and of heights. to_degrees: transforms
+    x and y to WGS84 longitudes and latitudes where the file's are not such. remarks: for a person."""
 
-    utm = re.fullmatch(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", text.strip(), re.IGNORECASE)
-    code = f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text.strip()
-    if code.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
-        return None, "grid"
-    crs = _crs(where, code)
-    if crs.is_bound:  # a CRS that is written with its shift to WGS84 (TOWGS84)
-        crs = crs.source_crs
-    if crs.is_geographic:
-        return None, "geographic"
+    crs: str | None = None
+    kind: PositionKind = "grid"
+    name: str = ""
+    across_m: float = 1.0
+    up_m: float = 1.0
+    to_degrees: Any = None
+    remarks: tuple[str, ...] = ()
+
+    def position(self, where: str, x: float, y: float, z: float) -> tuple[float, float, float]:
+        """Position of a `PoseRow`, in metres and degrees, of easting or longitude, northing or latitude, and height.
+        Raises ConfigError for degrees that are none."""
+        height_m = z * self.up_m
+        if self.kind == "grid":
+            return x * self.across_m, y * self.across_m, height_m
+        if self.to_degrees is not None:
+            x, y = self.to_degrees.transform(x, y)
+        if abs(y) > _LARGEST_LATITUDE_DEG or abs(x) > _LARGEST_LONGITUDE_DEG:
+            raise ConfigError(
+                f"{where}: ({x:g}, {y:g}) are no longitude and latitude, in this order, in which {self.name} counts: "
+                "name the CRS of the coordinates, or exchange them"
+            )
+        return y, x, height_m
+
+
+def described_crs(where: str, text: str) -> StatedCrs:
+    """text: EPSG:code, PROJ, WKT, or words as in `crs.parsed_crs`. Raises ConfigError where it is unknown, geocentric
+    or vertical, or counts depths."""
+    text = text.strip()
+    if is_local(text):
+        one_m = local_unit_m(text)
+        return StatedCrs(name="a local CRS", across_m=one_m, up_m=one_m)
+    crs = _crs(where, text)
+    up_m = height_unit_m(where, crs)
     if crs.is_geocentric:
         raise ConfigError(f"{where}: geocentric coordinates ({crs.name}): export them in a projected CRS or in degrees")
-    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
-    authority = horizontal.to_authority(min_confidence=60)
-    return ":".join(authority) if authority else horizontal.to_wkt(), "grid"
+    if not (crs.is_geographic or crs.is_projected):
+        raise ConfigError(f"{where}: {crs.name} has no easting and northing: name a projected CRS, or one in degrees")
+    if crs.is_geographic or is_stretched(crs.to_2d()):
+        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=_to_degrees(where, crs))
+    return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, tuple(unit_remarks(where, crs)))
 
 
-def _crs(where: str, code: str) -> Any:
-    from pyproj import CRS
+def unit_remarks(where: str, crs: Any) -> list[str]:
+    """What is said where heights have the unit of a projected CRS that states nothing of them."""
+    if across_unit_m(crs) == 1.0 or any(axis.direction.lower() == "up" for axis in crs.axis_info):
+        return []
+    unit, name = crs.axis_info[0].unit_name, "the CRS" if crs.name == "unknown" else crs.name
+    return [
+        f"{where}: heights are read in {unit}, the unit of {name}; where they are metres, name a vertical CRS, "
+        "too, such as EPSG:2227+5703"
+    ]
+
+
+def _to_degrees(where: str, crs: Any) -> Any:
+    """None for WGS84 itself."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    flat = crs.to_2d()
+    try:
+        return None if flat == CRS("EPSG:4326") else Transformer.from_crs(flat, "EPSG:4326", always_xy=True)
+    except ProjError as error:
+        raise ConfigError(f"{where}: {crs.name} cannot be brought to WGS84: name another CRS") from error
+
+
+def _crs(where: str, text: str) -> Any:
     from pyproj.exceptions import CRSError
 
     try:
-        return CRS.from_user_input(code)
+        return parsed_crs(text)
     except CRSError as error:
         raise ConfigError(
-            f"{where}: the CRS {code[:60]!r} is unknown: give the list with a code such as EPSG:32633"
+            f"{where}: the CRS {text[:60]!r} is unknown: give the list with a code such as EPSG:32633"
         ) from error
 
 

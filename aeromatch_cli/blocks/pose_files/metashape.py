@@ -22,9 +22,10 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_metashape
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs, enu_from_geocentric, geodetic
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, enu_from_geocentric, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.units import factor, named_column
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
@@ -32,6 +33,7 @@ from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _ANGLES = (("yaw", "pitch", "roll"), ("omega", "phi", "kappa"), ("phi", "omega", "kappa"))
+_LONGEST_CODE = 20  # longer ones are WKT
 _ACCURACIES = ("accuracy_x", "accuracy_y", "accuracy_z", "accuracy_x/y", "accuracy_x/y/z")
 # Geocentric coordinates of a place on the ground, and of nothing else.
 _EARTH_M = (6.2e6, 6.6e6)
@@ -43,10 +45,10 @@ def is_reference(source: Source) -> bool:
 
 def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     """estimated: take the columns `_est` where a line has them. Raises ConfigError with line and column."""
-    crs: str | None = None
-    kind: PositionKind | None = None
-    system = ""
-    columns: list[str] = []
+    system: StatedCrs | None = None
+    stated_one = False
+    columns: Sequence[str] = ()
+    factors: Mapping[str, float] = {}
     rows: list[PoseRow] = []
     used_estimated = disabled = 0
     separator, angles = ",", _ANGLES[0]
@@ -54,12 +56,13 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
         stripped = text.strip()
         stated = re.match(r"#\s*coordinatesystem\s*:\s*(.*)", stripped, re.IGNORECASE)
         if stated:
-            crs, kind = described_crs(source.at(line), stated[1])
-            system = f", {crs or ('WGS84' if kind == 'geographic' else 'local')}"
+            system, stated_one = described_crs(source.at(line), stated[1]), True
         elif not columns and re.match(r"#?\s*label\b", stripped, re.IGNORECASE):
             separator = max(",;\t", key=stripped.count)
-            columns = [_column(cell) for cell in stripped.lstrip("#").split(separator)]
-            kind = kind or ("geographic" if "longitude" in stripped.lower() else "grid")
+            columns, units = zip(*map(_column, stripped.lstrip("#").split(separator)), strict=True)
+            if system is None:
+                system = StatedCrs(kind="geographic" if "longitude" in stripped.lower() else "grid", name="the list")
+            factors = _factors(source.at(line), columns, units, system)
             angles = _angle_columns(columns)
         elif stripped and not stripped.startswith("#"):
             if not columns:
@@ -68,7 +71,9 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             record = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
             if record.get("enable", "1").lower() in ("0", "false"):
                 disabled += 1
-            row, from_estimate = _row(source, line, record, angles, kind == "geographic", separator, estimated)
+            row, from_estimate = _row(
+                source, line, record, angles, system or StatedCrs(), separator, estimated, factors
+            )
             rows.append(row)
             used_estimated += from_estimate
     words = ["estimated"] if used_estimated else []
@@ -79,17 +84,33 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
             f"{source.path.name}: {len(rows) - used_estimated} of {len(rows)} images have no estimated position there; "
             "the given one is used"
         )
-    return PoseList(
-        tuple(rows), kind or "grid", tuple(remarks), f"Metashape reference, {', '.join(words)}{system}", crs
-    )
+    system = system or StatedCrs()
+    code = system.crs if system.crs and len(system.crs) < _LONGEST_CODE else system.name
+    words += [(code if system.crs else "WGS84" if system.kind == "geographic" else "local")] if stated_one else []
+    title = f"Metashape reference, {', '.join(words)}"
+    return PoseList(tuple(rows), system.kind, (*system.remarks, *remarks), title, system.crs)
 
 
-def _column(cell: str) -> str:
-    """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names."""
-    name = cell.strip().strip('"').lower()
+def _column(cell: str) -> tuple[str, str]:
+    """x, y, z, yaw, ..., x_est, accuracy_x, ... of Metashape's names, and the unit that they state."""
+    name, unit = named_column(cell, {})
     name = re.sub(r"^([xyz])/[a-z]+", r"\1", name)
-    name = re.sub(r"[\s_]*\((m|deg|pix)\)$", "", name)
-    return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", re.sub(r"\s+", "_", name))
+    return re.sub(r"^(.+)_accuracy$", r"accuracy_\1", name), unit
+
+
+def _factors(where: str, columns: Sequence[str], units: Sequence[str], system: StatedCrs) -> dict[str, float]:
+    """What numbers of the columns that state a unit are multiplied by: coordinates count in units of the CRS then, all
+    else in metres and degrees. Raises ConfigError naming the column."""
+    found = {}
+    geographic = system.kind == "geographic"
+    for name, unit in zip(columns, units, strict=True):
+        parts = set(name.removeprefix("accuracy_").removesuffix("_est").split("/"))
+        turns = bool(parts & set(_ANGLES[0] + _ANGLES[1])) or (geographic and name[:1] in "xy" and parts <= {"x", "y"})
+        if unit and (turns or parts <= {"x", "y", "z", "accuracy"}):
+            stem = name.removesuffix("_est")
+            one = system.up_m if stem == "z" else system.across_m if stem in ("x", "y") else 1.0
+            found[name] = factor(where, name, unit, "angle" if turns else "length") / one
+    return found
 
 
 def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
@@ -102,12 +123,14 @@ def _angle_columns(columns: Sequence[str]) -> tuple[str, str, str]:
 
 
 def _row(
-    source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], geographic: bool,
-    separator: str, estimated: bool,
+    source: Source, line: int, record: Mapping[str, str], angles: tuple[str, str, str], system: StatedCrs,
+    separator: str, estimated: bool, factors: Mapping[str, float],
 ) -> tuple[PoseRow, bool]:  # fmt: skip
     def value(name: str) -> float:
         cell = record.get(name, "")
-        return number(source.at(line, name), cell, decimal_comma=separator != ",") if cell else math.nan
+        if not cell:
+            return math.nan
+        return number(source.at(line, name), cell, decimal_comma=separator != ",") * factors.get(name, 1.0)
 
     def triple(names: Sequence[str]) -> tuple[tuple[float, ...], bool]:
         own = tuple(value(f"{name}_est") for name in names)
@@ -121,10 +144,10 @@ def _row(
     overall_m = overall_m if overall_m > 0.0 else value("accuracy")
     sigmas_m = completed_sigmas_m(x_m, y_m, z_m, across_m=across_m, overall_m=overall_m)
     turns = [v for name in (*angles, "/".join(angles)) if (v := value(f"accuracy_{name}")) > 0.0]
-    kind: PositionKind = "geographic" if geographic else "grid"
     row = PoseRow(
         image=image_name(record.get("label", "")), line=line,
-        position=((y, x, z) if geographic else (x, y, z)) if math.isfinite(x + y) else None, position_kind=kind,
+        position=system.position(source.at(line), x, y, z) if math.isfinite(x + y) else None,
+        position_kind=system.kind,
         attitude=attitude if whole else None, attitude_kind="none" if not whole else "yaw_pitch_roll",
         forward=False, true_north=angles[0] == "yaw",
         sigmas_m=None if from_estimate else sigmas_m,
@@ -135,7 +158,7 @@ def _row(
     if whole and angles == _ANGLES[2]:
         phi, omega, kappa = attitude
         photo = rotation_y(phi) @ rotation_x(omega) @ rotation_z(kappa)
-        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, kind)
+        turned = rotation_row(row.image, line, (0, 0, 0), CAM_FROM_PHOTO @ photo.T, system.kind)
         return replace(row, attitude=turned.attitude, attitude_kind="quaternion", forward=None), from_estimate
     return row, from_estimate
 

@@ -1,8 +1,9 @@
 """OpenDroneMap: geo.txt, and the shots.geojson that ODM and WebODM export.
 
-geo.txt (opendm/geo.py): the CRS in the first line, then `name x y [z] [yaw pitch roll] [h_acc v_acc] ...`; x is the
-easting or longitude in every CRS; angles where the line has seven fields and more, accuracies from nine on; yaw, pitch,
-roll are zero for a camera that looks straight down with the image's top to the north.
+geo.txt (opendm/geo.py): the CRS in the first line, then `name x y [z] [yaw pitch roll] [h_acc v_acc] ...`, between
+blanks or any other separator; x is the easting or longitude in every CRS; angles where the line has seven fields and
+more, accuracies from nine on; yaw, pitch, roll are zero for a camera that looks straight down with the image's top to
+the north.
 
 shots.geojson (opendm/shots.py): Point [lon, lat, alt]; `rotation` is the angle-axis vector of cam_from_world relative
 to the grid of the UTM zone.
@@ -11,20 +12,27 @@ to the grid of the UTM zone.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
+from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row
+from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row, units_of_comments
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import rotation_z
 
-_CRS = re.compile(r"(EPSG:\d+|.*\+proj=.*|WGS84\s+UTM\s+\d{1,2}\s*[NS])", re.IGNORECASE)
+# What names a CRS, and what no line of a list begins with.
+_CRS = re.compile(
+    r"((EPSG|ESRI|IGNF|OGC)\s*:\s*\S.*|.*\+(proj|init)=.*|(PROJ|GEOG|COMPD|GEOD|BOUND)(CS|CRS)\[.*"
+    r"|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
+    re.IGNORECASE,
+)
 _WITH_ANGLES, _WITH_ACCURACIES = 7, 9
 # Angles of all lines that are positive and below this, in degrees, may be standard deviations.
 _LIKE_SIGMAS = 1.0
@@ -39,41 +47,44 @@ def read_geo_txt(source: Source) -> PoseList:
     """Raises ConfigError with file, line and column."""
     records = list(source.records())
     head, text = records[0]
-    crs, kind = described_crs(source.at(head), text)
+    stated, said = described_crs(source.at(head), text), units_of_comments(source)
+    stated = replace(stated, across_m=said.across_m or stated.across_m, up_m=said.up_m or stated.up_m)
+    turn_deg = said.angle_deg or 1.0
     rows: list[PoseRow] = []
     for line, record in records[1:]:
-        fields = record.split()
+        cells, comma = fields_of(record)
+        fields = with_name(cells, 0)
         if len(fields) < 3:
             raise ConfigError(f"{source.at(line)}: {len(fields)} values: write `name x y [z] [yaw pitch roll] [h v]`")
-        values = [_value(source.at(line, f"{column}"), cell) for column, cell in enumerate(fields[1:9], start=2)]
+        values = [_value(source.at(line, f"{column}"), cell, comma) for column, cell in enumerate(fields[1:9], start=2)]
         x, y, z = [*values, np.nan, np.nan][:3]
-        angles = values[3:6] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
+        angles = [turn_deg * angle for angle in values[3:6]] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
         across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
-        place = (y, x, z) if kind == "geographic" else (x, y, z)
+        place = stated.position(source.at(line), x, y, z)
         whole = bool(np.isfinite(angles).all())
         rows.append(
             PoseRow(
                 image=image_name(fields[0]), line=line, position=place if np.isfinite(place[:2]).all() else None,
-                position_kind=kind, attitude=tuple(angles) if whole else None,
+                position_kind=stated.kind, attitude=tuple(angles) if whole else None,
                 attitude_kind="yaw_pitch_roll" if whole else "none", forward=False, true_north=True,
                 sigmas_m=completed_sigmas_m(z_m=up_m, across_m=across_m),
             )
         )  # fmt: skip
     given = [row.attitude for row in rows if row.attitude is not None]
     words = "yaw, pitch, roll" if given else "positions"
-    remarks: tuple[str, ...] = ()
+    remarks = stated.remarks
     if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
-        remarks = (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
-    return PoseList(tuple(rows), kind, remarks, f"ODM geo.txt, {text}, {words}", crs)
+        remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
+    return PoseList(tuple(rows), stated.kind, remarks, f"ODM geo.txt, {text}, {words}", stated.crs)
 
 
-def _value(where: str, cell: str) -> float:
-    return float("nan") if cell.lower() == "nan" else number(where, cell)
+def _value(where: str, cell: str, comma: bool) -> float:
+    return float("nan") if cell.lower() in ("nan", "") else number(where, cell, decimal_comma=comma)
 
 
 def is_shots(source: Source) -> bool:
     features = source.tree.get("features") if isinstance(source.tree, dict) else None
-    return bool(features) and isinstance(features, list) and "filename" in _properties(features[0])
+    return bool(features) and isinstance(features, list) and {"filename", "rotation"} <= _properties(features[0]).keys()
 
 
 def read_shots(source: Source) -> PoseList:

@@ -18,18 +18,18 @@ from functools import partial
 import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
+from aeromatch_cli.blocks.fields import IMAGE, fields_of
 from aeromatch_cli.blocks.pose_files.source import (
-    IMAGE,
     CameraShelf,
     Source,
-    cells_of,
     image_name,
     is_number,
     number,
     numbers,
     rotation_row,
+    units_of_comments,
 )
-from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import AttitudeKind, PoseList, PoseRow, PositionKind, has_header
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest, brown
 
@@ -38,24 +38,29 @@ _LINES_OF_IMAGE = 10
 
 
 def is_geolocation(source: Source) -> bool:
+    if has_header(source.lines):
+        return False
     record = next((line for _, line in source.records()), "")
     if "," not in record and ";" not in record:
         return False
-    cells = cells_of(record)
+    cells = fields_of(record)[0]
     return len(cells) in _COUNTS and bool(IMAGE.fullmatch(cells[0])) and all(map(is_number, cells[1:]))
 
 
 def read_geolocation(source: Source, angles: str = "") -> PoseList:
     """angles: "opk" or "ypr", "" to go by the numbers. Raises ConfigError with line and column."""
     table: list[tuple[int, str, list[float]]] = []
+    said = units_of_comments(source)
     for line, record in source.records():
-        cells = cells_of(record)
+        cells, comma = fields_of(record)
         if len(cells) not in _COUNTS:
             raise ConfigError(f"{source.at(line)}: {len(cells)} values, a line of Pix4D's geolocation has 4, 6, 7 or 9")
-        comma = ";" in record or "\t" in record
         values = [
             number(source.at(line, str(column)), cell, decimal_comma=comma) for column, cell in enumerate(cells[1:], 2)
         ]
+        across_m, up_m, angle_deg = (one or 1.0 for one in (said.across_m, said.up_m, said.angle_deg))
+        units = [across_m, across_m, up_m, *([angle_deg] * 3 if len(values) >= 6 else [])]
+        values[: len(units)] = [a * b for a, b in zip(values, units, strict=False)]
         table.append((line, cells[0], values))
     places = np.array([values[:2] for _, _, values in table])
     kind: PositionKind = "geographic" if np.abs(places).max() <= 180.0 else "grid"

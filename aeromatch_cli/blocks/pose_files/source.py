@@ -14,6 +14,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
+from aeromatch_cli.blocks.units import Kind, factor, kind_of, stated_units
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -22,8 +23,6 @@ from aeromatch_cli.geometry.rotations import to_quaternion
 
 # A file that is longer is no list of poses; a reconstruction with its points may be large.
 _LARGEST_BYTES = 2_000_000_000
-# A name that is an image's.
-IMAGE = re.compile(r".+\.(jpe?g|tiff?|jp2|j2k|png|dng|raw|arw|cr2|nef)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -121,6 +120,34 @@ class Source:
         return f"{self.path}, line {line}" + (f", column {column}" if column else "")
 
 
+@dataclass(frozen=True)
+class Units:
+    """Metres of one unit of x and y, and of a height, degrees of one unit of angles, None where nothing says so."""
+
+    across_m: float | None = None
+    up_m: float | None = None
+    angle_deg: float | None = None
+
+
+def units_of_comments(source: Source) -> Units:
+    """What the comments of a file without header say. Raises ConfigError where heights do not count from a datum."""
+    said = stated_units(source.lines)
+    if "relative" in said:
+        raise ConfigError(
+            f"{source.path}: {said['relative']!r} says that heights do not count from a datum: leave them out, or give "
+            "heights above the ellipsoid or sea level"
+        )
+
+    def of(kind: Kind, *subjects: str) -> float | None:
+        text = next((said[one] for one in subjects if kind_of(said.get(one, "")) == kind), "")
+        return factor(str(source.path), subjects[0], text, kind) if text else None
+
+    return Units(
+        of("length", "coordinates", "units"), of("length", "heights", "coordinates", "units"),
+        of("angle", "angles", "units"),
+    )  # fmt: skip
+
+
 @dataclass
 class CameraShelf:
     """Cameras of a pose file, by the names that its rows have. remarks: what is to be said of them, each once."""
@@ -142,14 +169,6 @@ class CameraShelf:
     def key(self, wanted: str) -> str:
         """The name for a row, "" where there is no such camera."""
         return wanted if wanted in self.found else ""
-
-
-def cells_of(line: str) -> list[str]:
-    """Values of a line without header: semicolons and tabs before commas before blanks."""
-    for separator in (";", "\t", ","):
-        if separator in line:
-            return [cell.strip().strip('"') for cell in line.split(separator)]
-    return line.split()
 
 
 def number(where: str, cell: str, *, decimal_comma: bool = False) -> float:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from aeromatch_cli.blocks.fields import IMAGE, fields_of
 from aeromatch_cli.blocks.pose_files import (
     blocks_exchange,
     colmap,
     dji,
     exiftool,
+    geojson,
     metashape,
     micmac,
     odm,
@@ -20,8 +23,9 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.source import IMAGE, Source, cells_of, is_number, world_beside
-from aeromatch_cli.blocks.poses import PoseList, read_poses
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.pose_files.source import Source, is_number, world_beside
+from aeromatch_cli.blocks.poses import PoseList, has_header, read_poses
 from aeromatch_cli.errors import ConfigError
 
 AUTO = "auto"
@@ -40,9 +44,44 @@ class PoseFormat:
 def _named_columns(source: Source) -> PoseList:
     """orientation.csv of this program counts in the CRS that its neighbours name."""
     found = read_poses(source.path)
+    if found.crs is not None:
+        return _in_stated_crs(source, found)
     crs, _ = world_beside(source)
     own = source.name == "orientation.csv" and found.position_kind == "grid" and crs is not None
     return replace(found, crs=crs, format="orientation.csv of aeromatch") if own else found
+
+
+def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
+    """Of a list whose comment, or a column, names the CRS."""
+    stated = described_crs(str(source.path), found.crs or "")
+    if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
+        return replace(found, crs=stated.crs)
+    if found.position_kind == "grid":  # what columns state counts before the unit of the CRS
+        found = read_poses(source.path, (stated.across_m, stated.up_m))
+    one = replace(stated, across_m=1.0, up_m=1.0)
+    rows = []
+    for row in found.rows:
+        if row.position is not None:
+            x, y, height_m = row.position
+            across = (x, y) if found.position_kind == "grid" else (y, x)
+            row = replace(row, position=one.position(source.at(row.line), *across, height_m), position_kind=one.kind)
+        rows.append(row)
+    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *found.warnings)
+    return replace(found, rows=tuple(rows), position_kind=one.kind, crs=one.crs, warnings=warnings, format=words)
+
+
+_MISSION_PLANNER = re.compile(r"#\s*name\s+latitude/y\s+longitude/x\b.*", re.IGNORECASE)
+
+
+def _is_mission_planner(source: Source) -> bool:
+    return any(_MISSION_PLANNER.match(line.strip()) for line in source.lines[:5])
+
+
+def _mission_planner(source: Source) -> PoseList:
+    """Angles are the aircraft's, below which the camera looks down; SAlt is the height above ground."""
+    found = read_poses(source.path)
+    rows = tuple(replace(row, forward=False) for row in found.rows)
+    return replace(found, rows=rows, format="Mission Planner location.txt")
 
 
 # In the order in which they are tried: those that nothing else looks like first.
@@ -63,11 +102,14 @@ POSE_FORMATS: Mapping[str, PoseFormat] = {
     ),
     "opensfm": PoseFormat("OpenSfM reconstruction.json", opensfm.read_reconstruction, opensfm.is_reconstruction),
     "odm-shots": PoseFormat("ODM and WebODM shots.geojson", odm.read_shots, odm.is_shots),
+    "geojson": PoseFormat("GeoJSON of points", geojson.read_points, geojson.is_points),
     "transforms": PoseFormat("NeRF transforms.json", scenes.read_transforms, scenes.is_transforms),
     "opensfm-exif": PoseFormat("OpenSfM exif_overrides.json", opensfm.read_overrides, opensfm.is_overrides),
     "exiftool": PoseFormat("ExifTool -csv or -json", exiftool.read_exiftool, exiftool.is_exiftool),
     "odm": PoseFormat("ODM geo.txt", odm.read_geo_txt, odm.is_geo_txt),
     "dji-mrk": PoseFormat("DJI *_Timestamp.MRK", dji.read_mrk, dji.is_mrk),
+    "mission-planner": PoseFormat("Mission Planner location.txt", _mission_planner, _is_mission_planner),
+    "bingo": PoseFormat("BINGO's records ORIA", tables.read_oria, tables.is_oria),
     "bundler": PoseFormat("Bundler .out with list.txt", scenes.read_bundler, scenes.is_bundler),
     "nvm": PoseFormat("VisualSFM .nvm", scenes.read_nvm, scenes.is_nvm),
     "inpho": PoseFormat("Inpho project .prj", tables.read_inpho, tables.is_inpho),
@@ -161,9 +203,11 @@ def _by_content(source: Source) -> str:
         if tree.get("type") == "FeatureCollection":
             return "GeoJSON: export its table as CSV with the image names and the coordinates"
     record = next((line for _, line in source.records()), "")
-    cells = cells_of(record) or [""]
+    cells = fields_of(record)[0] or [""]
     if cells[0].lower() == "track" or (len(cells) == 1 and cells[0].startswith("OPENSFM_TRACKS_VERSION")):
         return "a list of tracks, which are tie points: give the poses of the images"
+    if has_header(source.lines):
+        return ""
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
         return "ODM's geo.txt without its first line, which names the CRS, such as EPSG:32633 or EPSG:4326: add it"
     return ""

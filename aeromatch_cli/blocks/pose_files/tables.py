@@ -3,6 +3,8 @@
 Lines without header are `name x y z a1 a2 a3`. Nothing in them says what the angles are; omega, phi, kappa in degrees
 are taken unless one is beyond 360, which only gon are, and --pose-format opk-gon, pok or pok-gon say otherwise.
 
+BINGO's own records are `ORIA name x y z omega phi kappa`, in gon; others in the file are passed over.
+
 PATB (three records of fixed width): number, x, y, z; a11 to a22; a23 to a33. Programs write the matrix in one direction
 or the other: the one is taken by which the flight goes along a side of the images.
 
@@ -19,17 +21,19 @@ from pathlib import PureWindowsPath
 
 import numpy as np
 
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs
+from aeromatch_cli.blocks.fields import fields_of, with_name, words_of
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
 from aeromatch_cli.blocks.pose_files.source import (
     Source,
-    cells_of,
     image_name,
     is_number,
     number,
     numbers,
     rotation_row,
+    units_of_comments,
 )
-from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
+from aeromatch_cli.blocks.poses import PoseList, PoseRow, has_header
+from aeromatch_cli.blocks.units import factor
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
@@ -37,12 +41,15 @@ from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z
 
 _NAMES = ("name", "x", "y", "z", "a1", "a2", "a3")
 _GON_DEG = 0.9
+_ORIA = "ORIA"
 _FULL_DEG = 360.0
 
 
 def is_plain_table(source: Source) -> bool:
+    if has_header(source.lines):
+        return False
     records = [record for _, (_, record) in zip(range(3), source.records(), strict=False)]
-    tables = [cells_of(record) for record in records]
+    tables = [with_name(fields_of(record)[0], 0) for record in records]
     return bool(tables) and all(
         (len(cells) == len(_NAMES) and all(map(is_number, cells[1:])) and not is_number(cells[0]))
         or (len(cells) == len(_NAMES) and all(map(is_number, cells)))
@@ -54,31 +61,38 @@ def read_plain_table(source: Source, order: str = "", unit: str = "") -> PoseLis
     """order: "opk" or "pok". unit: "deg" or "gon". "" for what is usual. Raises ConfigError with line and column."""
     table = []
     for line, record in source.records():
-        cells = cells_of(record)
+        fields, comma = fields_of(record)
+        cells = with_name(fields, 0)
         if len(cells) != len(_NAMES):
             raise ConfigError(f"{source.at(line)}: {len(cells)} values instead of {', '.join(_NAMES)}")
-        comma = ";" in record or "\t" in record
         values = [
             number(source.at(line, name), cell, decimal_comma=comma)
             for name, cell in zip(_NAMES[1:], cells[1:], strict=True)
         ]
         table.append((line, cells[0], values))
     angles = np.array([values[3:] for _, _, values in table])
+    said = units_of_comments(source)
     gon = unit == "gon" or (not unit and bool(len(angles)) and float(np.abs(angles).max()) > _FULL_DEG)
-    angles = angles * (_GON_DEG if gon else 1.0)
+    one_deg = _GON_DEG if gon else 1.0
+    if not unit and said.angle_deg is not None:
+        one_deg = said.angle_deg
+    angles = angles * one_deg
+    metres = (said.across_m or 1.0, said.across_m or 1.0, said.up_m or 1.0)
+    table = [(line, name, [a * b for a, b in zip(values, metres, strict=False)]) for line, name, values in table]
     rows = []
     for (line, name, values), (first, second, kappa) in zip(table, angles, strict=True):
         numbered = is_number(name)
         if order == "pok":
             photo = rotation_y(first) @ rotation_x(second) @ rotation_z(kappa)
-            row = rotation_row(name, line, values[:3], CAM_FROM_PHOTO @ photo.T)
+            row = rotation_row(name, line, values, CAM_FROM_PHOTO @ photo.T)
         else:
             row = PoseRow(
                 image=image_name(name), line=line, position=(values[0], values[1], values[2]), position_kind="grid",
                 attitude=(float(first), float(second), float(kappa)), attitude_kind="omega_phi_kappa",
             )  # fmt: skip
         rows.append(replace(row, numbered=numbered))
-    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {'gon' if gon else 'degrees'}"
+    unit_words = {_GON_DEG: "gon", 1.0: "degrees"}.get(one_deg, "radians")
+    words = f"{'phi, omega, kappa' if order == 'pok' else 'omega, phi, kappa'} in {unit_words}"
     remarks: tuple[str, ...] = ()
     if not (order or unit):
         remarks = (
@@ -96,6 +110,33 @@ read_pok, read_pok_gon = (
     partial(read_plain_table, order="pok", unit="deg"),
     partial(read_plain_table, order="pok", unit="gon"),
 )
+
+
+def is_oria(source: Source) -> bool:
+    return any(
+        record.split(maxsplit=1)[0] == _ORIA for _, (_, record) in zip(range(100), source.records(), strict=False)
+    )
+
+
+def read_oria(source: Source) -> PoseList:
+    """Raises ConfigError with line and column."""
+    rows, more = [], False
+    for line, record in source.records():
+        cells = words_of(record)
+        if cells[0] != _ORIA:
+            continue
+        values = numbers(source.at(line), cells[2:], ("x", "y", "z", "omega", "phi", "kappa"))
+        more |= len(cells) > 2 + len(values)
+        omega, phi, kappa = (_GON_DEG * angle for angle in values[3:])
+        rows.append(
+            PoseRow(
+                image=image_name(cells[1]), line=line, position=(values[0], values[1], values[2]),
+                position_kind="grid", attitude=(omega, phi, kappa), attitude_kind="omega_phi_kappa",
+                numbered=is_number(cells[1]),
+            )
+        )  # fmt: skip
+    remarks = (f"{source.path.name}: what stands behind kappa in {_ORIA} is not read",) if more else ()
+    return PoseList(tuple(rows), "grid", remarks, f"BINGO, {_ORIA}, omega, phi, kappa in gon")
 
 
 def is_patb(source: Source) -> bool:
@@ -151,11 +192,14 @@ def is_inpho(source: Source) -> bool:
 def read_inpho(source: Source) -> PoseList:
     """Raises ConfigError with file and line."""
     turns = dict(_mounts(source.lines))
-    crs: str | None = None
-    kind: PositionKind = "grid"
+    system = StatedCrs()
     stated = re.search(r"\$COORDINATE_SYSTEM\s*:\s*(\S.*)", source.text)
     if stated and stated[1].strip().upper().startswith(("PROJCS", "PROJCRS", "EPSG", "GEOGCS", "GEOGCRS", "COMPD")):
-        crs, kind = described_crs(str(source.path), stated[1])
+        system = described_crs(str(source.path), stated[1])
+    unit = re.search(r"\$LINEAR_UNITS_OBJECT\s*:\s*(\S.*)", source.text)
+    if unit:
+        one_m = factor(str(source.path), "$LINEAR_UNITS_OBJECT", unit[1].strip(), "length")
+        system = replace(system, across_m=one_m, up_m=one_m)
     rows: list[PoseRow] = []
     name, camera = "", ""
     lines = list(source.records("%"))
@@ -176,13 +220,14 @@ def read_inpho(source: Source) -> PoseList:
             following = [(n, numbers(source.at(n), t.split(), ("value",) * 3)) for n, t in lines[place + 2 : place + 5]]
             center = numbers(source.at(lines[place + 1][0]), lines[place + 1][1].split(), ("focal", "x", "y", "z"))[1:]
             photo_from_world = rotation_z(-turns.get(camera, 0.0)) @ np.array([values for _, values in following])
-            at = (center[1], center[0], center[2]) if kind == "geographic" else center
-            rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, kind))
+            at = system.position(source.at(line), *center)
+            rows.append(rotation_row(name, line, at, CAM_FROM_PHOTO @ photo_from_world, system.kind))
         elif key == "$END":
             name = ""
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this Inpho project has $EXT_ORI: export it after orientation")
-    return PoseList(tuple(rows), kind, (), f"Inpho project, {crs or 'its coordinate system is not stated'}", crs)
+    words = system.name or "its coordinate system is not stated"
+    return PoseList(tuple(rows), system.kind, system.remarks, f"Inpho project, {words}", system.crs)
 
 
 def _mounts(lines: Sequence[str]) -> Iterator[tuple[str, float]]:
