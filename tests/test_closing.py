@@ -60,7 +60,7 @@ def test_a_block_against_which_nothing_speaks_is_good() -> None:
         ),
         ({"adjust": {"groups": [LEVEL] * 3, "positions_given": 0}}, ["bad: 3 parts whose scale", "--poses"]),
         ({"adjust": {"groups": [LEVEL], "positions_given": 0}}, ["doubtful: shape only: nothing ties the block"]),
-        ({"adjust": {"groups": [PLACED] * 2}}, ["good: all 4 images are connected and oriented"]),
+        ({"adjust": {"groups": [PLACED] * 2}}, ["doubtful: 2 parts (4, 4 images) share too few points"]),
         ({"adjust": {"images": 0}}, ["good: all 4 images are connected", "not checked: orientation: orient=none"]),
         (
             {"adjust": {"images": 0, "remarks": ["not done: no image is oriented"]}},
