@@ -86,7 +86,8 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     network, start = _without_far_positions(network, start)
     network, state = _with_image_sigma(network, start, options.tolerance)
     if options.final:
-        held = _hold_undetermined(network, state, covariance(network, state)) if options.choose else network
+        known = covariance(network, state, of_poses=False) if options.choose else None
+        held = network if known is None else _hold_undetermined(network, state, known)
         if held is not network:
             state = replace(state, lens=np.where(held.lens_sigmas > 0.0, state.lens, held.lens_prior))
             network, state = _with_image_sigma(held, state, options.tolerance)
@@ -197,7 +198,7 @@ def _worth(
     gain = 2.0 * (without.cost - solved.cost)
     if gain < _WORTH_SQUARES * _count(unknowns):
         return None
-    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state), unknowns)
+    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state, of_poses=False), unknowns)
     return (gain, tried, solved.state) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
 
 

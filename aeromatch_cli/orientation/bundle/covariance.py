@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 # More unknowns than this would need too much memory for a full inverse: each image is taken by itself then, its
 # neighbours as known, which gives too small deviations; calibrations are exact all the same.
 _MAX_TOGETHER = 9600
+# Where poses are not wanted, fewer unknowns than this are inverted as a whole.
+_MAX_SMALL = 1200
 # A movement of the whole block by its extent, or by a radian, that observations other than image points know to less
 # than this is free.
 _FREE_INFORMATION = 1e-2
@@ -64,13 +66,17 @@ class Covariance:
         return np.asarray(own + moved.T @ self.whole @ moved)
 
 
-def covariance(network: Network, state: Unknowns) -> Covariance:
-    """Of the unknowns at a solution, for residuals as large as the standard deviations of the network."""
+def covariance(network: Network, state: Unknowns, *, of_poses: bool = True) -> Covariance:
+    """Of the unknowns at a solution, for residuals as large as the standard deviations of the network.
+
+    of_poses: whether those of images are wanted; without them a block of many images takes far less time, and those of
+    lenses, mounts and flights are the same.
+    """
     layout = Layout.of(network)
     normals = reduced(equations(network, state))
     size, held = 6 * layout.blocks, normals.held
     first = 6 * layout.images
-    if size <= _MAX_TOGETHER:
+    if size <= (_MAX_TOGETHER if of_poses else _MAX_SMALL):
         whole = _inverse(normals.matrix.toarray(), _free_movements(network, state, normals), _in_world(network))
         whole *= ~(held[:, None] | held)
         blocks = np.array([whole[k : k + 6, k : k + 6] for k in range(0, size, 6)])
