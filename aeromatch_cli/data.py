@@ -95,6 +95,11 @@ class AdjustedBlock:
         """Of no image, where none could be adjusted."""
         return cls({}, {}, np.zeros((0, 3)), np.zeros(0), {})
 
+    def cameras_of(self, block: Block) -> dict[str, Camera]:
+        """image_id -> its camera as adjusted, else as the block has it."""
+        lenses = {**block.cameras, **self.cameras}
+        return {image.image_id: lenses[image.camera_id] for image in block.images}
+
     @property
     def observations(self) -> int:
         """Of points by images."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.orientation.bundle.adjust import Adjusted, Options, adjust
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, SLOPES, UNCORRECTED_M, Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, SLOPES, Network, Unknowns, drift_of
 from aeromatch_cli.orientation.bundle.of_model import (
     Lenses,
     image_numbers,
@@ -257,12 +257,11 @@ def _with_drifts(network: Network) -> Network:
     """The network with unknown slopes of the heights of flights whose receivers had no corrections: errors at two ends
     of the block are as large as stated and have little in common, and would tilt it against all measured angles."""
     drifts = network.flight_sigmas.copy()
-    arms_m = np.linalg.norm(network.arms_m, axis=1)
+    arms_m = network.arms_m
     for flight in range(network.flights):
         own = network.located & (network.flight == flight)
         sigma_m = float(np.median(network.position_sigmas_m[own, 2])) if own.any() else 0.0
-        if sigma_m > UNCORRECTED_M and arms_m[own].any():
-            drifts[flight, SLOPES] = sigma_m / (np.sqrt(2.0) * arms_m[own].max())
+        drifts[flight, SLOPES] = drift_of(sigma_m, arms_m[own])
     return replace(network, flight_sigmas=drifts)
 
 

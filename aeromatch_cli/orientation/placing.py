@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.orientation.bundle.network import UNCORRECTED_M
+from aeromatch_cli.orientation.bundle.network import drift_of
 
 # Without positions the median flying height becomes this many units.
 LOCAL_FLYING_HEIGHT = 100.0
@@ -122,10 +122,9 @@ def place(
     stated_m = float(np.median(sigmas_m[agreeing]))
     sigma_m = _sigma_m(found, found.points(centers[agreeing]) - used_m, used_m, stated_m)
     found = replace(found, sigma_factor=sigma_m / max(stated_m, 1e-9))
-    arms_m = np.linalg.norm(used_m[:, :2] - used_m[:, :2].mean(axis=0), axis=1)
     measured = _Measured(centers[agreeing], used_m, max(sigma_m, 1e-9))
     # Against the terrain alone positions are as exact as they agree with each other.
-    drift = stated_m / (np.sqrt(2.0) * arms_m.max()) if stated_m > UNCORRECTED_M and arms_m.any() else 0.0
+    drift = drift_of(stated_m, used_m[:, :2] - used_m[:, :2].mean(axis=0))
     drifting = replace(measured, drift=drift)
     # Tilts that the terrain agrees with are no error of the mounting, however steeply such positions rise.
     confirmed = drift > 0.0 and _agree(by_terrain, vertical)

@@ -206,9 +206,7 @@ def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock |
     def keypoints_px(image_id: str) -> FloatArray:
         return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
-    lenses = {**context.block.cameras, **adjusted.cameras}
-    cameras = {image.image_id: lenses[image.camera_id] for image in context.block.images}
-    seen_px = at_once(adjusted, cameras, keypoints_px)
+    seen_px = at_once(adjusted, adjusted.cameras_of(context.block), keypoints_px)
     return camera_sections(adjustment.facts, adjusted, context.block.images, seen_px)
 
 

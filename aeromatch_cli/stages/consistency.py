@@ -69,8 +69,7 @@ def run(context: Context) -> StageReport:
         with translated_os_errors(stale):
             stale.unlink(missing_ok=True)
     with context.executor.step("consistency"):
-        of_ids = {**context.block.cameras, **adjusted.cameras}
-        cameras = {image.image_id: of_ids[image.camera_id] for image in context.block.images}
+        cameras = adjusted.cameras_of(context.block)
         entries = [(pair, entry) for pair, entry in verified_pairs(context) if entry.verdict.state == "verified"]
         keypoints_px = contents_of(context, adjusted).keypoints_px
         pairs = [_matched(context, adjusted, keypoints_px, pair.image_id0, entry) for pair, entry in entries]

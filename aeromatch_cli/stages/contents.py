@@ -77,8 +77,7 @@ def _contents(
 
     known = None if block.crs == LOCAL else geographic
     if adjusted is not None:
-        lenses = {**block.cameras, **adjusted.cameras}
-        keypoints_px = at_once(adjusted, {i.image_id: lenses[i.camera_id] for i in block.images}, keypoints_px)
+        keypoints_px = at_once(adjusted, adjusted.cameras_of(block), keypoints_px)
     path = context.workspace.residuals
     residuals = read_residuals(path, block.images) if adjusted is not None and path.is_file() else {}
     return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals)

@@ -16,7 +16,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.orientation.bundle.covariance import Covariance, covariance
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, UNCORRECTED_M, Network, Unknowns
+from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns, is_uncorrected
 from aeromatch_cli.orientation.bundle.normal_equations import off_by_flight_m, residuals_in_sigmas
 from aeromatch_cli.orientation.bundle.projection import project_with_derivatives
 from aeromatch_cli.orientation.bundle.shared import FlightLens, lenses_by_flight
@@ -107,7 +107,7 @@ def _with_common_errors(network: Network, stated: Network) -> Network:
     common = network.flight_sigmas.copy()
     for flight in range(network.flights):
         sigmas_m = stated.position_sigmas_m[network.located & (network.flight == flight)]
-        if len(sigmas_m) and np.median(sigmas_m) > UNCORRECTED_M:
+        if len(sigmas_m) and is_uncorrected(float(np.median(sigmas_m))):
             common[flight, :3] = np.maximum(common[flight, :3], np.median(sigmas_m, axis=0))
     return replace(network, flight_sigmas=common)
 

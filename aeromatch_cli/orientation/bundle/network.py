@@ -27,7 +27,21 @@ SLOPES = slice(FLIGHT.index("slope_x"), FLIGHT.index("slope_y") + 1)
 
 # Errors of a receiver without corrections are the same for seconds and drift within minutes: where less exact positions
 # than this were stated, metres.
-UNCORRECTED_M = 0.5
+_UNCORRECTED_M = 0.5
+
+
+def drift_of(sigma_m: float, arms_m: FloatArray) -> float:
+    """Standard deviation of the slope of heights stated to sigma_m, metres per metre; 0 of a receiver with corrections.
+
+    Errors at two ends of the block have nothing in common. arms_m: (N, 2) from the middle of the positions, in plan.
+    """
+    reach_m = float(np.linalg.norm(arms_m, axis=1).max(initial=0.0))
+    return sigma_m / (np.sqrt(2.0) * reach_m) if is_uncorrected(sigma_m) and reach_m > 0.0 else 0.0
+
+
+def is_uncorrected(sigma_m: float) -> bool:
+    """Whether a receiver whose positions are stated to sigma_m had no corrections."""
+    return sigma_m > _UNCORRECTED_M
 
 
 @dataclass(frozen=True, eq=False)
