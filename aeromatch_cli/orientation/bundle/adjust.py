@@ -25,6 +25,9 @@ from aeromatch_cli.orientation.bundle.solve import solve
 # The standard deviation of image points is estimated again until it changes by less than this share.
 _SETTLED, _MAX_ROUNDS = 0.1, 5
 _ROUGH, _ROUGH_ROUNDS = 1e-3, 2
+# Poses and calibration that move by less than so many of their standard deviations together stand still: of the final
+# adjustment, and of those before it.
+_STILL, _ROUGH_STILL = 0.2, 1.0
 # No coordinate of an image point is measured more exactly, pixels; where poses are rough, none counts as worse.
 _LEAST_SIGMA_PX, _MOST_SIGMA_PX = 0.05, 20.0
 # Distances of normally distributed residuals in the plane have this mean, in standard deviations of a coordinate. Those
@@ -64,6 +67,10 @@ class Options:
     choose: bool = True
     readout: bool = True
 
+    @property
+    def still_sigmas(self) -> float:
+        return _STILL if self.final else _ROUGH_STILL
+
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
@@ -84,16 +91,16 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     """The block that fits its observations best, from `start`, whose image points may be off by many pixels."""
     stated = network
     network, start = _without_far_positions(network, start)
-    network, state = _with_image_sigma(network, start, options.tolerance)
+    network, state = _with_image_sigma(network, start, options)
     if options.final:
-        known = covariance(network, state, of_poses=False) if options.choose else None
+        known = covariance(network, state) if options.choose else None
         held = network if known is None else _hold_undetermined(network, state, known)
         if held is not network:
             state = replace(state, lens=np.where(held.lens_sigmas > 0.0, state.lens, held.lens_prior))
-            network, state = _with_image_sigma(held, state, options.tolerance)
+            network, state = _with_image_sigma(held, state, options)
         explained, state = _explained(network, state, options)
         if explained is not network:
-            network, state = _with_image_sigma(explained, state, options.tolerance)
+            network, state = _with_image_sigma(explained, state, options)
     network, state, factors = _with_position_sigmas(network, state, options)
     if not options.final:
         return Adjusted(network, state, network.tie_sigma_px, factors, None, stated)
@@ -112,7 +119,7 @@ def _with_common_errors(network: Network, stated: Network) -> Network:
     return replace(network, flight_sigmas=common)
 
 
-def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tuple[Network, Unknowns]:
+def _with_image_sigma(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
     """The network with the accuracy of tie points that their residuals show, and its solution.
 
     Positions weigh no more meanwhile than what they are off by allows: with too much weight they bend the block, and
@@ -121,7 +128,8 @@ def _with_image_sigma(network: Network, state: Unknowns, tolerance: float) -> tu
     sigma_px = _sigma_px(network, state, redundant=False)
     for number in range(_MAX_ROUNDS):
         network = _of_sigma(network, sigma_px)
-        state = solve(_loosened(network, state), state, _ROUGH if number == 0 else tolerance, near=number > 0).state
+        ends = (_ROUGH, _ROUGH_STILL) if number == 0 else (options.tolerance, options.still_sigmas)
+        state = solve(_loosened(network, state), state, ends[0], near=number > 0, still_sigmas=ends[1]).state
         before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
         if number and abs(sigma_px / before - 1.0) < _SETTLED:
             break
@@ -198,7 +206,7 @@ def _worth(
     gain = 2.0 * (without.cost - solved.cost)
     if gain < _WORTH_SQUARES * _count(unknowns):
         return None
-    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state, of_poses=False), unknowns)
+    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state), unknowns)
     return (gain, tried, solved.state) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
 
 
@@ -275,7 +283,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
     """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
     they are less exact than stated, horizontally and vertically."""
     stated, factors = network, np.asarray([1.0, 1.0])
-    tight = solve(stated, state, options.tolerance, near=True).state
+    tight = solve(stated, state, options.tolerance, near=True, still_sigmas=options.still_sigmas).state
     bent = _sigma_px(stated, tight, redundant=True) > _BENT * stated.tie_sigma_px
     network, state = (_loosened(stated, state), state) if bent else (stated, tight)
     settled = network is stated
@@ -286,7 +294,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
             break
         factors, stated, settled = new, _without(stated, wrong), True
         network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
-        state = solve(network, state, options.tolerance, near=True).state
+        state = solve(network, state, options.tolerance, near=True, still_sigmas=options.still_sigmas).state
     return network, state, factors
 
 

@@ -10,24 +10,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
+from aeromatch_cli.orientation.bundle.factors import Factors
 from aeromatch_cli.orientation.bundle.network import LENS, Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, equations, reduced
-from aeromatch_cli.orientation.bundle.solve import factorised
 
-if TYPE_CHECKING:
-    from scipy import sparse
-
-# More unknowns than this would need too much memory for a full inverse: each image is taken by itself then, its
-# neighbours as known, which gives too small deviations; calibrations are exact all the same.
-_MAX_TOGETHER = 9600
-# Where poses are not wanted, fewer unknowns than this are inverted as a whole.
-_MAX_SMALL = 1200
+# Up to so many images all are eliminated together.
+_TOGETHER = 60
+# So many images, all over the block, hold what observations leave free while others are eliminated.
+_HOLDING = 12
 # A movement of the whole block by its extent, or by a radian, that observations other than image points know to less
 # than this is free.
 _FREE_INFORMATION = 1e-2
@@ -36,18 +31,29 @@ _UNDETERMINED_DEG = 45.0
 
 
 @dataclass(frozen=True, eq=False)
+class _Frame:
+    """In which errors count. free: (6 B, D) movements of the whole block that no observation sees; onto: (D, 6 B) how
+    much of each a change of the unknowns has; known: whether the movements are known as far as they can be.
+    """
+
+    free: FloatArray
+    onto: FloatArray
+    known: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Covariance:
     """images: (N, 6, 6) of a turn about the camera's axes, radians, and of the centre, metres. lens: (K, 12, 12),
-    mount: (K, 6, 6), flight: (F, 6, 6); what is held has zeros. whole: (6 B, 6 B) of all unknowns but points, None for
-    large blocks. normals: what they come from.
+    mount: (K, 6, 6), flight: (F, 6, 6); what is held has zeros.
     """
 
     images: FloatArray
     lens: FloatArray
     mount: FloatArray
     flight: FloatArray
-    whole: FloatArray | None
-    normals: Reduced
+    _normals: Reduced
+    _factors: Factors
+    _frame: _Frame
 
     @property
     def lens_sigmas(self) -> FloatArray:
@@ -55,41 +61,42 @@ class Covariance:
         return np.sqrt(np.maximum(np.diagonal(self.lens, axis1=1, axis2=2), 0.0))
 
     def of_points(self, rows: IntArray) -> FloatArray:
-        """(3 R, 3 R) of some points together; of large blocks with all images as they are."""
+        """(3 R, 3 R) of some points together."""
         from scipy import linalg
 
-        own = np.asarray(linalg.block_diag(*self.normals.inverses[rows]))
-        if self.whole is None:
-            return own
+        normals, frame = self._normals, self._frame
+        own = np.asarray(linalg.block_diag(*normals.inverses[rows]))
         columns = (3 * rows[:, None] + np.arange(3)).ravel()
-        moved = self.normals.coupling.tocsc()[:, columns].toarray() @ own
-        return np.asarray(own + moved.T @ self.whole @ moved)
+        moved = (normals.coupling.tocsc()[:, columns].toarray() @ own) * ~normals.held[:, None]
+        free = frame.free.T @ moved
+        moved -= frame.onto.T @ free
+        by_images = moved.T @ self._factors.solve(moved)
+        return np.asarray(own + by_images + (np.pi**2 * free.T @ free if frame.known else 0.0))
 
 
-def covariance(network: Network, state: Unknowns, *, of_poses: bool = True) -> Covariance:
-    """Of the unknowns at a solution, for residuals as large as the standard deviations of the network.
-
-    of_poses: whether those of images are wanted; without them a block of many images takes far less time, and those of
-    lenses, mounts and flights are the same.
-    """
+def covariance(network: Network, state: Unknowns) -> Covariance:
+    """Of the unknowns at a solution, for residuals as large as the standard deviations of the network."""
     layout = Layout.of(network)
     normals = reduced(equations(network, state))
-    size, held = 6 * layout.blocks, normals.held
+    frame = _frame(network, state, normals)
+    factors = _factors(state, normals, frame)
+    images, rest = factors.inverse_blocks(layout.images)
+    # Of all inverses that the free movements leave, that in the frame.
+    by_frame = factors.solve(frame.onto.T)
+    among = frame.onto @ by_frame + (np.pi**2 if frame.known else 0.0) * np.eye(frame.free.shape[1])
     first = 6 * layout.images
-    if size <= (_MAX_TOGETHER if of_poses else _MAX_SMALL):
-        whole = _inverse(normals.matrix.toarray(), _free_movements(network, state, normals), _in_world(network))
-        whole *= ~(held[:, None] | held)
-        blocks = np.array([whole[k : k + 6, k : k + 6] for k in range(0, size, 6)])
-        rest = whole[first:, first:]
-    else:
-        whole, rows = None, normals.matrix.tocsr()
-        blocks = np.array([np.linalg.pinv(rows[k : k + 6, k : k + 6].toarray()) for k in range(0, size, 6)])
-        rest = _of_last(rows, first) * ~(held[first:, None] | held[first:])
+    shape = layout.images, 6, -1
+    if frame.free.size:
+        images += _moved(frame.free[:first].reshape(shape), by_frame[:first].reshape(shape), among)
+        rest += _moved(frame.free[first:], by_frame[first:], among)
+    held = normals.held
+    rest *= ~(held[first:, None] | held[first:])
+    images *= ~(held[:first].reshape(-1, 6, 1) | held[:first].reshape(-1, 1, 6))
     cameras = layout.cameras
     lens = _diagonal(rest[: 12 * cameras], 12)
     mount = _diagonal(rest[12 * cameras : 18 * cameras, 12 * cameras :], 6)
     flight = _diagonal(rest[18 * cameras :, 18 * cameras :], 6)
-    return Covariance(blocks[: layout.images], lens, mount, flight, whole, normals)
+    return Covariance(images, lens, mount, flight, normals, factors, frame)
 
 
 def pose_sigmas(network: Network, state: Unknowns, found: Covariance) -> tuple[FloatArray, FloatArray]:
@@ -124,17 +131,6 @@ def _diagonal(matrix: FloatArray, size: int) -> FloatArray:
     count = len(matrix) // size
     parts = [matrix[k : k + size, k : k + size] for k in range(0, count * size, size)]
     return np.array(parts).reshape(-1, size, size)
-
-
-def _of_last(matrix: sparse.csr_matrix, first: int) -> FloatArray:
-    """The inverse's last rows and columns, from `first` on."""
-    from scipy import sparse
-
-    scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-    scaled = sparse.diags(scale) @ matrix @ sparse.diags(scale) + 1e-12 * sparse.identity(len(scale))
-    columns = np.zeros((len(scale), len(scale) - first))
-    columns[first:] = np.diag(scale[first:])
-    return np.asarray(scale[first:, None] * factorised(scaled).solve(columns)[first:])
 
 
 def _in_world(network: Network) -> bool:
@@ -174,30 +170,39 @@ def _of_control(network: Network, state: Unknowns, extent_m: float) -> FloatArra
     return np.asarray(observed.T @ observed)
 
 
-def _inverse(normal: FloatArray, free: FloatArray, in_world: bool) -> FloatArray:
-    """Covariance of normal equations; with movements that they leave free, that of a free network, or of one whose
-    frame is known as far as it is."""
-    from scipy import linalg
+def _frame(network: Network, state: Unknowns, normals: Reduced) -> _Frame:
+    """That of a free network, or of the world, whose frame is known as far as it is."""
+    free = _free_movements(network, state, normals)
+    if _in_world(network):
+        # Apart from the free movements, as unknowns in units of what observations know of each.
+        diagonal = normals.matrix.diagonal()
+        scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))[:, None]
+        return _Frame(free, np.asarray(np.linalg.pinv(scale * free) * scale.T), known=True)
+    at_centers = np.zeros((len(free), 1))
+    at_centers.reshape(-1, 6)[: network.images, 3:] = 1.0
+    return _Frame(free, np.asarray(np.linalg.pinv(at_centers * free)), known=False)
 
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # radians, metres and pixels alike
-    basis = np.linalg.qr(free / scale[:, None])[0]
-    scaled = scale[:, None] * normal * scale + basis @ basis.T
-    try:
-        factor = linalg.cho_factor(scaled, lower=True, check_finite=False)
-        inverse = linalg.cho_solve(factor, np.eye(len(normal)), check_finite=False)
-    except linalg.LinAlgError:  # an image that its points do not determine
-        inverse = np.linalg.pinv(scaled, hermitian=True)
-    covariance = scale[:, None] * (inverse - basis @ basis.T) * scale
-    if not free.shape[1]:
-        return np.asarray(covariance)
-    if in_world:
-        return np.asarray(covariance + (np.pi * free) @ (np.pi * free).T)
-    # From the shape that fits best in the scaled unknowns to that in the projection centres.
-    at_centers = np.zeros(len(normal))
-    at_centers.reshape(-1, 6)[:, 3:] = free.reshape(-1, 6, free.shape[1])[:, 3:].any(axis=2)
-    onto = np.linalg.pinv(free * at_centers[:, None]) * at_centers
-    half = covariance - free @ (onto @ covariance)
-    return np.asarray(half - (half @ onto.T) @ free.T)
+
+def _factors(state: Unknowns, normals: Reduced, frame: _Frame) -> Factors:
+    """Of the normal equations, free movements held at some images: one of the inverses that they leave."""
+    from scipy import sparse
+
+    images, diagonal = len(state.centers_m), normals.matrix.diagonal()
+    seen = np.flatnonzero(diagonal[: 6 * images].reshape(-1, 6).all(axis=1))
+    some = np.linspace(0, len(seen) - 1, min(len(seen), _HOLDING)).astype(int)
+    holding = seen[some] if images > _TOGETHER else np.arange(images)
+    scale = np.zeros((len(diagonal), 1))
+    at = (6 * holding[:, None] + np.arange(6)).ravel()
+    scale[at, 0] = np.sqrt(diagonal[at])
+    held = sparse.csr_matrix(scale * np.linalg.qr(scale * frame.free)[0])
+    return Factors((normals.matrix + held @ held.T).tocsr(), state.centers_m[:, :2], holding)
+
+
+def _moved(free: FloatArray, by_frame: FloatArray, among: FloatArray) -> FloatArray:
+    """What the frame adds to blocks (..., r, r) of the inverse on its diagonal, from rows (..., r, D) of the free
+    movements and of the inverse by the frame, and from the inverse among the movements (D, D)."""
+    crossed = free @ by_frame.swapaxes(-1, -2)
+    return np.asarray(free @ among @ free.swapaxes(-1, -2) - crossed - crossed.swapaxes(-1, -2))
 
 
 def _angles_of_turns(rotation: FloatArray) -> FloatArray:
