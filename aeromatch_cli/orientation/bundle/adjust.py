@@ -91,7 +91,7 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     """The block that fits its observations best, from `start`, whose image points may be off by many pixels."""
     stated = network
     network, start = _without_far_positions(network, start)
-    network, state = _with_image_sigma(network, start, options)
+    network, state = _with_image_sigma(network, start, options, near=False)
     if options.final:
         known = covariance(network, state) if options.choose else None
         held = network if known is None else _hold_undetermined(network, state, known)
@@ -119,21 +119,30 @@ def _with_common_errors(network: Network, stated: Network) -> Network:
     return replace(network, flight_sigmas=common)
 
 
-def _with_image_sigma(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
+def _with_image_sigma(
+    network: Network, state: Unknowns, options: Options, *, near: bool = True
+) -> tuple[Network, Unknowns]:
     """The network with the accuracy of tie points that their residuals show, and its solution.
 
     Positions weigh no more meanwhile than what they are off by allows: with too much weight they bend the block, and
-    image points would seem inexact.
+    image points would seem inexact. near: whether that accuracy and the solution are known but for some unknowns.
     """
-    sigma_px = _sigma_px(network, state, redundant=False)
-    for number in range(_MAX_ROUNDS):
+    if not near:
+        network = _of_sigma(network, _sigma_px(network, state, redundant=False))
+        state = solve(_loosened(network, state), state, _ROUGH, still_sigmas=_ROUGH_STILL).state
+        network = _of_sigma(network, _sigma_px(network, state, redundant=True))
+    for _ in range(_MAX_ROUNDS):
+        state = _solved(_loosened(network, state), state, options)
+        before, sigma_px = network.tie_sigma_px, _sigma_px(network, state, redundant=True)
         network = _of_sigma(network, sigma_px)
-        ends = (_ROUGH, _ROUGH_STILL) if number == 0 else (options.tolerance, options.still_sigmas)
-        state = solve(_loosened(network, state), state, ends[0], near=number > 0, still_sigmas=ends[1]).state
-        before, sigma_px = sigma_px, _sigma_px(network, state, redundant=True)
-        if number and abs(sigma_px / before - 1.0) < _SETTLED:
+        if abs(sigma_px / before - 1.0) < _SETTLED:
             break
-    return _of_sigma(network, sigma_px), state
+    return network, state
+
+
+def _solved(network: Network, state: Unknowns, options: Options) -> Unknowns:
+    """The solution near `state`."""
+    return solve(network, state, options.tolerance, near=True, still_sigmas=options.still_sigmas).state
 
 
 def _loosened(network: Network, state: Unknowns) -> Network:
@@ -283,7 +292,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
     """The network solved with the accuracy of positions that their residuals show, without wrong ones; and by how much
     they are less exact than stated, horizontally and vertically."""
     stated, factors = network, np.asarray([1.0, 1.0])
-    tight = solve(stated, state, options.tolerance, near=True, still_sigmas=options.still_sigmas).state
+    tight = _solved(stated, state, options)
     bent = _sigma_px(stated, tight, redundant=True) > _BENT * stated.tie_sigma_px
     network, state = (_loosened(stated, state), state) if bent else (stated, tight)
     settled = network is stated
@@ -294,7 +303,7 @@ def _with_position_sigmas(network: Network, state: Unknowns, options: Options) -
             break
         factors, stated, settled = new, _without(stated, wrong), True
         network = replace(stated, position_sigmas_m=stated.position_sigmas_m * factors[[0, 0, 1]])
-        state = solve(network, state, options.tolerance, near=True, still_sigmas=options.still_sigmas).state
+        state = _solved(network, state, options)
     return network, state, factors
 
 

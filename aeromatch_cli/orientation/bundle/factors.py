@@ -92,11 +92,12 @@ class Factors:
             border = by_part.pop(id(part))
             by_border = linalg.solve_triangular(part.root, part.coupled, lower=True, trans=1, check_finite=False)
             between = -by_border @ border
-            own = linalg.lapack.dpotri(part.root, lower=1)[0]
+            own = linalg.lapack.dpotri(part.root, lower=1)[0] if len(part.root) else part.root
             own = np.tril(own) + np.tril(own, -1).T - between @ by_border.T
             whole = np.block([[own, between], [between.T, border]])
             numbers = part.own[::_SIZE] // _SIZE
-            found[numbers] = np.array([own[k : k + _SIZE, k : k + _SIZE] for k in range(0, len(own), _SIZE)])
+            blocks = [own[k : k + _SIZE, k : k + _SIZE] for k in range(0, len(own), _SIZE)]
+            found[numbers] = np.array(blocks).reshape(-1, _SIZE, _SIZE)
             place[part.unknowns] = np.arange(len(whole))
             for inner in part.parts:
                 by_part[id(inner)] = whole[np.ix_(place[inner.border], place[inner.border])]

@@ -16,7 +16,7 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e6
 _EASED, _RAISED = 0.2, 6.0
 # Near the solution steps begin with less; only with less than this does a small step mean that it is reached: damping
 # holds back what the observations hardly tell apart, such as affinity and rolling shutter, or focal length and height.
-_NEAR_DAMPING, _FREE_DAMPING = 1e-7, 1e-6
+_NEAR_DAMPING, _FREE_DAMPING, _STILL_DAMPING = 1e-8, 1e-6, 1e-8
 _MAX_STEPS = 60
 
 
@@ -52,8 +52,9 @@ def solve(
         assert tried is not None
         step += 1
         gain, best, state = 1.0 - found / best, found, tried
-        settled = gain < tolerance or moved_sigmas < still_sigmas
-        if settled and damping <= _FREE_DAMPING:
+        still = moved_sigmas < still_sigmas
+        settled = gain < tolerance or still
+        if settled and damping <= (_STILL_DAMPING if still else _FREE_DAMPING):
             break
         damping = max((_EASED**2 if settled else _EASED) * damping, _LEAST_DAMPING)
     return Solved(state, best, step)
