@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,7 @@ from aeromatch_cli.synthetic.render import render_image
 from aeromatch_cli.synthetic.sensor import Development
 from aeromatch_cli.synthetic.shade import Stage
 from aeromatch_cli.synthetic.solids import Material
-from aeromatch_cli.synthetic.stations import Exterior
+from aeromatch_cli.synthetic.stations import Exterior, Station, taken_s
 from aeromatch_cli.synthetic.terrain import Area, Flat, sample_terrain
 
 pytestmark = pytest.mark.slow
@@ -383,6 +384,24 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_rolling_shutter_needs_a_speed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="give --speed"):
         render_block(tmp_path, "suburb", seed=3, width_px=WIDTH, height_px=HEIGHT, images=2, readout_ms=40.0)
+
+
+def test_pictures_of_a_moving_aircraft_state_when_they_were_taken(rolling: Path) -> None:
+    names = ["suburb_0001.jpg", "suburb_0002.jpg"]
+    stamps = [datetime.fromisoformat(read_exif(rolling / "images" / name).time) for name in names]
+    centers_m = [pose.center_m for pose in load_truth(rolling).poses.values()]
+    expected_s = np.linalg.norm((centers_m[1] - centers_m[0])[:2]) / 25.0
+    assert (stamps[1] - stamps[0]).total_seconds() == pytest.approx(expected_s, abs=1e-3)
+
+
+def test_times_of_two_strips_have_a_turn_between_them() -> None:
+    """A rig takes two pictures at once; then 50 m at 10 m/s, and a turn of 15 s to the next strip, 40 m aside."""
+
+    def station(x_m: float, y_m: float, heading_deg: float) -> Station:
+        return Station(Exterior(x_m, y_m, 100.0, 0.0, 0.0, 0.0), "one", 0, 100.0, heading_deg)
+
+    flown = [station(0, 0, 0.0), station(0, 0, 0.0), station(0, 50, 0.0), station(40, 50, 180.0), station(40, 0, 180.0)]
+    assert taken_s(flown, 10.0) == pytest.approx([0.0, 0.0, 5.0, 24.0, 29.0])
 
 
 def test_every_row_shows_what_its_own_projection_centre_sees(rolling: Path) -> None:

@@ -27,7 +27,7 @@ from aeromatch_cli.synthetic.render import View, look_at, render_image
 from aeromatch_cli.synthetic.scene import SCENE_VERSION, Scene, build_scene, scene_digest
 from aeromatch_cli.synthetic.sensor import Development, meter
 from aeromatch_cli.synthetic.shade import Stage
-from aeromatch_cli.synthetic.stations import Station
+from aeromatch_cli.synthetic.stations import Station, taken_s
 from aeromatch_cli.synthetic.terrain import Area
 from aeromatch_cli.synthetic.write import read_raster
 
@@ -84,7 +84,7 @@ class _Taking:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """One picture to take. moment: its number in the block."""
+    """One picture to take. moment: its number in the block. taken_s: since the first one, None without a speed."""
 
     out: Path
     name: str
@@ -95,6 +95,7 @@ class _Shot:
     moment: int
     settings: Development
     taking: _Taking
+    taken_s: float | None
 
 
 def render_block(
@@ -121,7 +122,8 @@ def render_block(
     each camera, whose pictures state its focal length in EXIF. height_m: flying height above the datum instead of the
     preset's. sun_deg: azimuth and elevation of the first sortie's sun instead of the seed's. texture: folder of
     pictures to lay over the ground. readout_ms, speed_m_s: of a rolling shutter, from the first row to the last, while
-    the aircraft flies along; poses are those of the middle of a picture. An interrupted call goes on where it was.
+    the aircraft flies along; poses are those of the middle of a picture. With a speed pictures state when they were
+    taken. An interrupted call goes on where it was.
     Raises ConfigError on an unknown name, an impossible size or number, or a folder that holds another block;
     WorkspaceError where `out` cannot be written.
     """
@@ -231,12 +233,14 @@ def _shots(
         sortie: _metered(key, lights[sortie], flight, [s for s in flight.stations if s.sortie == sortie])
         for sortie in sorted({s.sortie for s in flight.stations})
     }
+    speed_m_s = taking.speed_m_s
+    times_s = taken_s(flight.stations, speed_m_s) if speed_m_s else [None] * len(names)
     return [
         _Shot(
             out, name, key, lights[station.sortie], flight, station, i,
-            presets.development(key.seed, i, station.sortie, metered[station.sortie]), taking,
+            presets.development(key.seed, i, station.sortie, metered[station.sortie]), taking, time_s,
         )
-        for i, (name, station) in enumerate(zip(names, flight.stations, strict=True))
+        for i, (name, station, time_s) in enumerate(zip(names, flight.stations, times_s, strict=True))
     ]  # fmt: skip
 
 
@@ -284,9 +288,11 @@ def _take(shot: _Shot) -> FloatArray:
 
 
 def _headed(shot: _Shot, jpeg: bytes) -> bytes:
-    """Pictures of real lenses say what real ones do."""
+    """Pictures of real lenses and of a moving aircraft say what real ones do."""
     camera_id = shot.station.camera_id
-    return write.with_focal_length(jpeg, shot.flight.cameras[camera_id], camera_id) if shot.taking.header else jpeg
+    camera = shot.flight.cameras[camera_id] if shot.taking.header else None
+    headed = camera is not None or shot.taken_s is not None
+    return write.with_header(jpeg, camera_id, camera, shot.taken_s) if headed else jpeg
 
 
 def _heights(scene: Scene, surface: NDArray[np.uint32]) -> FloatArray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -48,6 +50,25 @@ class Station:
         """(3,) of level flight."""
         heading = np.deg2rad(self.heading_deg)
         return speed_m_s * np.array([np.sin(heading), np.cos(heading), 0.0])
+
+
+# Between two strips, and between two sorties, seconds.
+_TURN_S, _PAUSE_S = 15.0, 3600.0
+# A strip ends where the next picture lies further off its line than this, degrees.
+_ALONG_DEG = 30.0
+
+
+def taken_s(stations: Sequence[Station], speed_m_s: float) -> list[float]:
+    """(N,) seconds from the first picture to each, at one speed along strips; cameras of a rig take theirs at once."""
+    times_s = [0.0]
+    for before, now in pairwise(stations):
+        way_m = np.array([now.exterior.x_m - before.exterior.x_m, now.exterior.y_m - before.exterior.y_m])
+        length_m = float(np.hypot(*way_m))
+        ahead = way_m @ before.velocity_m_s(1.0)[:2] >= np.cos(np.deg2rad(_ALONG_DEG)) * length_m
+        turned = now.heading_deg != before.heading_deg or not ahead
+        pause_s = _PAUSE_S if now.sortie != before.sortie else _TURN_S * turned
+        times_s.append(times_s[-1] + length_m / speed_m_s + pause_s)
+    return times_s
 
 
 # Angle from the axis of a fisheye's corners at most.

@@ -23,6 +23,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from aeromatch_cli.synthetic.terrain import GroundGrid
 TRUTH_FORMAT = "aeromatch rendered block"
 POSE_COLUMNS = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "camera")
 IN_SHADOW_BELOW = 128
+_FIRST_TAKEN = datetime(2026, 6, 1, 10, 0, tzinfo=UTC)
 
 
 def depth_path(out: Path, name: str) -> Path:
@@ -150,14 +152,21 @@ def position_table(
     return ("\n".join(rows) + "\n").encode()
 
 
-def with_focal_length(jpeg: bytes, camera: Camera, camera_id: str) -> bytes:
-    """The picture with a header as a camera writes it: make, model and the 35-mm equivalent in whole millimetres."""
+def with_header(jpeg: bytes, camera_id: str, camera: Camera | None, taken_s: float | None) -> bytes:
+    """The picture with a header as a camera writes it: make, model, of a camera that is given the 35-mm equivalent of
+    its focal length in whole millimetres, and the time, to the millisecond, so long after the first picture."""
     from PIL import ExifTags, Image
 
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "aeromatch", f"rendered {camera_id}"
     details = exif.get_ifd(ExifTags.IFD.Exif)
-    details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm(camera)
+    if camera is not None:
+        details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm(camera)
+    if taken_s is not None:
+        taken = _FIRST_TAKEN + timedelta(milliseconds=round(1000.0 * taken_s))
+        details[ExifTags.Base.DateTimeOriginal] = f"{taken:%Y:%m:%d %H:%M:%S}"
+        details[ExifTags.Base.SubsecTimeOriginal] = f"{taken.microsecond // 1000:03d}"
+        details[ExifTags.Base.OffsetTimeOriginal] = "+00:00"
     content = exif.tobytes()
     segment = b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content
     return jpeg[:2] + segment + jpeg[2:]
