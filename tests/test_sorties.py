@@ -116,12 +116,17 @@ def strips(interval_s: float, speed_m_s: float) -> list[Capture]:
     return captures(times_s, center_m=places)
 
 
-def test_velocity_along_a_strip_and_none_where_the_track_turns() -> None:
+def test_velocity_along_strips_up_to_their_ends_and_none_at_a_corner() -> None:
     images = strips(2.5, 8.0)
     found = velocities(images, flights(images))
-    assert sorted(found) == sorted(f"i{n}" for n in (1, 2, 3, 4, 7, 8, 9, 10))
-    np.testing.assert_allclose(found["i2"], [8.0, 0.0, 0.0])
-    np.testing.assert_allclose(found["i8"], [-8.0, 0.0, 0.0])
+    assert sorted(found) == sorted(f"i{n}" for n in range(12))
+    for n in range(12):
+        np.testing.assert_allclose(found[f"i{n}"], [8.0 if n < 6 else -8.0, 0.0, 0.0])
+    places = [np.array([20.0 * min(n, 4), 20.0 * max(n - 4, 0), 100.0]) for n in range(9)]
+    cornered = captures([2.5 * n for n in range(9)], center_m=places)
+    found = velocities(cornered, flights(cornered))
+    assert sorted(found) == sorted(f"i{n}" for n in range(9) if n != 4)
+    np.testing.assert_allclose(found["i5"], [0.0, 8.0, 0.0])
 
 
 def test_whole_seconds_need_a_longer_way() -> None:

@@ -252,7 +252,8 @@ def _time_s(one: Capture) -> float:
 
 
 def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
-    """Velocities of images that have neighbours on both sides of one straight line."""
+    """Velocities of images on straight lines, by their neighbours on both sides; the last ones of a line fly as their
+    neighbours do."""
     track = sorted((one for one in group if one.time_s is not None and one.center_m is not None), key=_time_s)
     if len(track) < 3:
         return {}
@@ -267,8 +268,8 @@ def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
     ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
     straight = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])
     reach = _REACH if (times_s % 1.0).any() else _REACH_WHOLE_SECONDS
-    found = {}
-    for row in np.flatnonzero(straight):
+    found: dict[int, FloatArray] = {}
+    for row in np.flatnonzero(straight).tolist():
         first, last = row - 1, row + 1
         while straight[first] and row - first < reach:
             first -= 1
@@ -276,5 +277,10 @@ def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
             last += 1
         velocity = (centers_m[last] - centers_m[first]) / (times_s[last] - times_s[first])
         if np.linalg.norm(velocity) <= _FASTEST_M_S:
-            found[track[row].image_id] = velocity
-    return found
+            found[row] = velocity
+    inner = sorted(found)
+    for row, beside in [(r - 1, r) for r in inner] + [(r + 1, r) for r in inner]:
+        lines = {other for other in (row - 1, row + 1) if other in inner}
+        if not straight[row] and lines == {beside}:  # at a corner two lines meet
+            found[row] = found[beside]
+    return {track[row].image_id: velocity for row, velocity in found.items()}
