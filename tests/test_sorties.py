@@ -127,6 +127,8 @@ def test_velocity_along_strips_up_to_their_ends_and_none_at_a_corner() -> None:
     found = velocities(cornered, flights(cornered))
     assert sorted(found) == sorted(f"i{n}" for n in range(9) if n != 4)
     np.testing.assert_allclose(found["i5"], [0.0, 8.0, 0.0])
+    two = images[:8]  # the second strip has two images
+    np.testing.assert_allclose(velocities(two, flights(two))["i7"], [-8.0, 0.0, 0.0])
 
 
 def test_whole_seconds_need_a_longer_way() -> None:

@@ -252,8 +252,7 @@ def _time_s(one: Capture) -> float:
 
 
 def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
-    """Velocities of images on straight lines, by their neighbours on both sides; the last ones of a line fly as their
-    neighbours do."""
+    """Velocities of images on straight lines, by the images before and after them on the same line."""
     track = sorted((one for one in group if one.time_s is not None and one.center_m is not None), key=_time_s)
     if len(track) < 3:
         return {}
@@ -266,21 +265,20 @@ def _along_track(group: Sequence[Capture]) -> dict[str, FloatArray]:
     near = (gaps_s > 0.0) & (gaps_s <= _NEAR_INTERVALS * np.median(gaps_s[gaps_s > 0.0])) & (lengths_m > 0.0)
     along = (ways_m[1:, :2] * ways_m[:-1, :2]).sum(axis=1)
     ahead = along >= math.cos(math.radians(_TURN_DEG)) * lengths_m[1:] * lengths_m[:-1]
-    straight = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])
+    on = np.concatenate([[False], near[1:] & near[:-1] & ahead, [False]])  # at an image the line goes on
+    beside = np.concatenate([[False], near[:-1]]) | np.concatenate([near[1:], [False]])
+    flown = near & (on[:-1] | on[1:] | ~beside)  # from image to image: not on the way to another line
     reach = _REACH if (times_s % 1.0).any() else _REACH_WHOLE_SECONDS
-    found: dict[int, FloatArray] = {}
-    for row in np.flatnonzero(straight).tolist():
-        first, last = row - 1, row + 1
-        while straight[first] and row - first < reach:
+    found = {}
+    for row in range(len(track)):
+        first = last = row
+        while first > 0 and flown[first - 1] and (on[first] or first == row) and row - first < reach:
             first -= 1
-        while straight[last] and last - row < reach:
+        while last < len(flown) and flown[last] and (on[last] or last == row) and last - row < reach:
             last += 1
+        if first == last or (first < row < last and not on[row]):  # at a corner two lines meet
+            continue
         velocity = (centers_m[last] - centers_m[first]) / (times_s[last] - times_s[first])
         if np.linalg.norm(velocity) <= _FASTEST_M_S:
-            found[row] = velocity
-    inner = sorted(found)
-    for row, beside in [(r - 1, r) for r in inner] + [(r + 1, r) for r in inner]:
-        lines = {other for other in (row - 1, row + 1) if other in inner}
-        if not straight[row] and lines == {beside}:  # at a corner two lines meet
-            found[row] = found[beside]
-    return {track[row].image_id: velocity for row, velocity in found.items()}
+            found[track[row].image_id] = velocity
+    return found
