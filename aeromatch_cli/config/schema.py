@@ -166,6 +166,12 @@ class AdjustSettings(_Section):
         description="Whether the read-out time of cameras is an unknown where the block determines it.",
     )
 
+    @model_validator(mode="after")
+    def _free_or_held(self) -> AdjustSettings:
+        if both := [name for name in self.free if name in self.hold]:
+            raise ValueError(f"free and hold both name {', '.join(both)}: leave it out of one of them")
+        return self
+
 
 class RunSettings(_Section):
     """How it is run; nothing here changes a result."""

@@ -22,6 +22,7 @@ from aeromatch_cli.orientation.bundle.normal_equations import cost
 from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.calibration import camera_of
 from aeromatch_cli.orientation.control import intersected
+from aeromatch_cli.orientation.control_faults import fault_of_list
 
 # Control points farther from the block than this, metres, are in another coordinate system.
 _FAR_M = 300.0
@@ -69,8 +70,9 @@ def with_control(
 ) -> tuple[Outcome, dict[str, Any]]:
     """The block adjusted once more with control points, where that makes held-out points better; and what was found.
 
-    Facts: "used", "wrong", "exchanged": names; "held_out_rms_m", "without_rms_m": root mean square (x, y, z) of points
-    that took no part, with and without control; "kept".
+    Facts: "used", "wrong", "exchanged": names; "fault": what is wrong with the list as a whole, "" for nothing;
+    "held_out_rms_m", "without_rms_m": root mean square (x, y, z) of points that took no part, with and without control;
+    "kept".
     """
     images = set(outcome.images)
     base = _Block(outcome.result.network, outcome.result.state, outcome)
@@ -80,15 +82,17 @@ def with_control(
         return outcome, {}
     without_m = np.array([base.error_m(point) for point in seen])
     offset_m = np.median(without_m, axis=0)
-    if not control or float(np.abs(offset_m).max()) > _FAR_M:
+    stated_m = np.array([point.position_m for point in seen])
+    fault = fault_of_list(stated_m + without_m, stated_m)
+    if not control or fault or float(np.abs(offset_m).max()) > _FAR_M:
         as_it_is = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
         found = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": not control}
-        return outcome, found | {"held_out_rms_m": as_it_is, "without_rms_m": as_it_is}
+        return outcome, found | {"fault": fault, "held_out_rms_m": as_it_is, "without_rms_m": as_it_is}
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
     while True:
-        solved = base.adjusted(work, used)
+        solved = base.moved(-offset_m).adjusted(work, used)
         rests = [solved.without([other for other in used if other is not point]) for point in used]
         worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
         if worst is None:
@@ -98,11 +102,13 @@ def with_control(
     held_out = checks or (used if len(used) > 1 else [])
     held_out_m = np.array([solved.error_m(point) for point in checks]) if checks else errors_m
     before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
-    kept = not held_out or _size(held_out_m) <= _size(before_m)
+    sound = bool(np.isfinite(solved.state.centers_m).all())
+    kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
     facts = {
         "used": [point.name for point in used] if kept else [],
         "wrong": wrong,
         "exchanged": exchanged,
+        "fault": "",
         "held_out": "check points" if checks else "leave one out",
         "held_out_rms_m": _rms(held_out_m) if held_out else None,
         "without_rms_m": _rms(before_m) if held_out else None,
@@ -126,6 +132,13 @@ class _Block:
     @property
     def solution(self) -> tuple[Network, Unknowns]:
         return self.network, self.state
+
+    def moved(self, by_m: FloatArray) -> _Block:
+        """The block as a whole elsewhere, as far from its positions: an adjustment starts best where control is."""
+        state, flight = self.state, self.state.flight.copy()
+        flight[:, :3] -= by_m
+        centers_m, points_m = state.centers_m + by_m, state.points_m + by_m
+        return replace(self, state=replace(state, centers_m=centers_m, points_m=points_m, flight=flight))
 
     def with_points(self, points: Sequence[Surveyed]) -> tuple[Network, Unknowns]:
         """The network of tie points with these control points instead of what it has."""

@@ -414,7 +414,8 @@ def _control(evidence: Evidence) -> _Found:
         return
     inside = [group["control"] for group in evidence.groups if group.get("control")]
     unlike = sorted({*(n for one in inside for n in (*one["wrong"], *one["exchanged"])), *control.get("doubtful", ())})
-    count = max(control["control"] + control["check"], 1)
+    left_out = {n for one in inside if one["kept"] for n in (*one["wrong"], *one["exchanged"])}
+    count = max(control["control"] + control["check"] + len(left_out), 1)
     words = f"{len(unlike)} of {count} surveyed points contradict the others"
     remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
     yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
@@ -453,8 +454,10 @@ def _refused(control: Mapping[str, Any], stated_m: FloatArray) -> Finding:
         words = f"control points agree with the block to {_axes(without_m)} m and were not needed"
         return Finding("control points", sigmas, limit, "good", words)
     words = (
-        "the control points do not make points better that took no part, and were left out: check their coordinate "
-        "system, their heights and where they were measured"
+        f"the control points fit the block if {control['fault']}; they were left out: correct the list"
+        if control.get("fault")
+        else "the control points do not make points better that took no part, and were left out: check their "
+        "coordinate system, their heights and where they were measured"
     )
     return Finding("control points", sigmas if np.isfinite(sigmas) else None, limit, "doubtful", words)
 
@@ -512,13 +515,22 @@ def _calibration(evidence: Evidence) -> _Found:
                 readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
                 yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
             changes = {name: change for name, change in changes.items() if name not in held}
+            if "f" in changes and parameters["f"][1] == 0.0:
+                words = (
+                    f"camera {camera_id} keeps its focal length of {_number(parameters['f'][0])} px: matches would put it "
+                    "where no lens is, though their residuals hardly tell. Moving trees, a rolling shutter or wrong "
+                    "distortion do that: a calibration of the camera, or another flying height, helps"
+                )
+                yield Finding("focal length", None, None, "doubtful", words)
             affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
             if affinity:
                 name = max(affinity, key=lambda key: affinity[key])
                 words = _change(camera_id, name, parameters[name], affinity[name])
-                remedy = (
-                    "pixels of sensors are square: a rolling shutter looks like that where images have no velocities; "
-                    "give capture times or a shorter exposure"
+                remedy = "pixels of sensors are square: " + (
+                    "a part of the rolling shutter may be in it, which looks the same"
+                    if read_out and read_out[1] > 0.0
+                    else "a rolling shutter looks like that where images have no velocities; give capture times or a "
+                    "shorter exposure"
                 )
                 yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
             if not changes:
@@ -615,7 +627,10 @@ def _deformation(evidence: Evidence) -> _Found:
     worst = max(placed, key=_tilt_deg)
     angle = _tilt_deg(worst)
     words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
-    remedy = "one strip does not tell; a second one beside it, measured angles, or three control points do"
+    remedy = (
+        "its positions are not exact enough over its extent: exacter ones, a second strip beside a single one, "
+        "measured angles, or three control points tell"
+    )
     yield _finding("tilt", angle, _TILT_DEG, words, remedy)
     placed = [group for group in placed if group.get("positions")]
     if placed:

@@ -193,6 +193,8 @@ def control_words(control: Mapping[str, Any] | None, adjusted: Sequence[Mapping[
         return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
     apart = control.get("rays_do_not_meet")  # of earlier versions not
     wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
+    if once := control["not_measured_in_two_images"]:
+        wrong.append(f"warning: points that are not measured in two oriented images are left out: {_listed(once)}")
 
     def shown(errors_m: list[float]) -> str:
         return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
@@ -216,6 +218,8 @@ def _adjusted_words(control: Sequence[Mapping[str, Any]], shown: Callable[[list[
     """What control points did in the adjustment."""
     words = []
     for one in control:
+        if one.get("fault"):
+            words.append(f"warning: the control points fit the block if {one['fault']}: correct the list")
         if one["exchanged"]:
             words.append(f"names of control points that are exchanged: {_listed(one['exchanged'])}; they were left out")
         if one["wrong"]:

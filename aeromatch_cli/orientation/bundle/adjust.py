@@ -17,7 +17,7 @@ import numpy as np
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.orientation.bundle.covariance import Covariance, covariance
 from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns, is_uncorrected
-from aeromatch_cli.orientation.bundle.normal_equations import off_by_flight_m, residuals_in_sigmas
+from aeromatch_cli.orientation.bundle.normal_equations import cost, off_by_flight_m, residuals_in_sigmas
 from aeromatch_cli.orientation.bundle.projection import project_with_derivatives
 from aeromatch_cli.orientation.bundle.shared import FlightLens, lenses_by_flight
 from aeromatch_cli.orientation.bundle.solve import solve
@@ -48,9 +48,15 @@ _BENT = 1.1
 # the block has told less than half of what was not known of it, or it moves no image point by so much of the standard
 # deviation of one.
 _SIGNIFICANT_SIGMAS, _DETERMINED, _SEEN_SIGMAS = 3.0, 0.5, 0.5
+# A focal length that would be so many standard deviations from what is known of it, though the sum of squares rises by
+# less than this share with it held, is a fault of the image points: moving tree tops and a rolling shutter put that of
+# the real block brighton 18 % away, where a twentieth of the squares tells it.
+_IMPLAUSIBLE_SIGMAS, _TELLING_SHARE = 3.0, 0.1
 # Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
 # their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
 _UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
+# None is taken that is so many times as large as what is usual: an antenna of 3 m hides a wrong focal length.
+_BELIEVED_SIGMAS = 5.0
 # Standard deviations of what may explain residuals, before the block is asked: shifts of a flight's positions, metres;
 # their delay, seconds; the lever arm, metres; the read-out of a shutter, seconds.
 _SHIFT_M, _LAG_S, _LEVER_M, _READOUT_S = 20.0, 1.0, 0.5, 0.03
@@ -92,6 +98,7 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     stated = network
     network, start = _without_far_positions(network, start)
     network, state = _with_image_sigma(network, start, options, near=False)
+    network, state = _with_plausible_focal_lengths(network, state, options)
     if options.final:
         known = covariance(network, state) if options.choose else None
         held = network if known is None else _hold_undetermined(network, state, known)
@@ -181,6 +188,23 @@ def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> 
     return replace(network, lens_sigmas=np.where(held, 0.0, prior)) if held.any() else network
 
 
+def _with_plausible_focal_lengths(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
+    """The network with focal lengths held that go where no lens is though the residuals hardly tell, and its solution;
+    the same where there are none."""
+    row = LENS.index("f")
+    prior, sigmas = network.lens_prior[:, row], network.lens_sigmas[:, row]
+    far = np.abs(state.lens[:, row] - prior) > _IMPLAUSIBLE_SIGMAS * np.where(sigmas > 0.0, sigmas, np.inf)
+    if not far.any():
+        return network, state
+    held, lens = network.lens_sigmas.copy(), state.lens.copy()
+    held[far, row], lens[far, row] = 0.0, prior[far]
+    tried = replace(network, lens_sigmas=held)
+    solved = solve(tried, replace(state, lens=lens), options.tolerance, still_sigmas=options.still_sigmas)
+    if solved.cost > (1.0 + _TELLING_SHARE) * cost(network, state):
+        return network, state
+    return _with_image_sigma(tried, solved.state, options)
+
+
 def _moved_px(network: Network, state: Unknowns, change: FloatArray) -> FloatArray:
     """(K, 12) by how much a change of the unknowns of lenses (K, 12) moves an image point at most, pixels."""
     by_lens = np.nan_to_num(np.abs(project_with_derivatives(network, state).by_lens).max(axis=1))
@@ -215,8 +239,13 @@ def _worth(
     gain = 2.0 * (without.cost - solved.cost)
     if gain < _WORTH_SQUARES * _count(unknowns):
         return None
-    values, sigmas = _values(solved.state, unknowns), _sigmas(covariance(fair, solved.state), unknowns)
-    return (gain, tried, solved.state) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
+    after = solved.state
+    values = _chosen((after.lens, after.mount, after.flight), unknowns)
+    usual = _chosen((tried.lens_sigmas, tried.mount_sigmas, tried.flight_sigmas), unknowns)
+    if (np.abs(values) > _BELIEVED_SIGMAS * usual).any():
+        return None
+    sigmas = _sigmas(covariance(fair, after), unknowns)
+    return (gain, tried, after) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
 
 
 def _explanations(network: Network, state: Unknowns, options: Options) -> list[Network]:
@@ -256,10 +285,9 @@ def _count(freed: _Freed) -> int:
     return int(sum(part.sum() for part in freed))
 
 
-def _values(state: Unknowns, freed: _Freed) -> FloatArray:
-    return np.concatenate(
-        [part[which] for part, which in zip((state.lens, state.mount, state.flight), freed, strict=True)]
-    )
+def _chosen(parts: tuple[FloatArray, FloatArray, FloatArray], freed: _Freed) -> FloatArray:
+    """(U,) values of those unknowns. parts: of lenses, mounts and flights."""
+    return np.concatenate([part[which] for part, which in zip(parts, freed, strict=True)])
 
 
 def _sigmas(found: Covariance, freed: _Freed) -> FloatArray:
