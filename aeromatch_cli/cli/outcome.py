@@ -23,8 +23,8 @@ class OrientFacts(Facts):
 
     poses_from: str | None = Field(None, description="Where the poses of the block come from, in words.")
     frame: Literal["world", "own"] | None = Field(None, description="own: no position was given; metres mean nothing.")
-    wrong_attitudes: dict[str, float] = Field({}, description="image_id -> degrees off.")
-    wrong_positions: dict[str, float] = Field({}, description="image_id -> metres off.")
+    wrong_attitudes: dict[str, float] = Field({}, description="Image -> degrees off.")
+    wrong_positions: dict[str, float] = Field({}, description="Image -> metres off.")
     outside: list[str] = Field([], description="Images that the pictures could not orient.")
 
 

@@ -39,6 +39,7 @@ from aeromatch_cli.stages.changes import changed_words
 from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
+from aeromatch_cli.stages.naming import facts_named, item_named
 from aeromatch_cli.stages.quality import facts_told, quality_of
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
@@ -360,12 +361,13 @@ def _result(
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
     facts = {
         "workspace": str(workspace.root),
-        "stages": _stage_facts(reports),
+        "stages": facts_named(_stage_facts(reports), names),
         "failures": len(failures),
     }
     if quality is not None:
         facts["quality"] = quality.as_facts()
-    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict)
+    shown = tuple((stage, item_named(item, names), reason) for stage, item, reason in failures)
+    return Result(tuple(lines), facts, shown, None if quality is None else quality.verdict)
 
 
 def _quality(
