@@ -254,7 +254,7 @@ def test_a_pair_that_a_step_cannot_verify_is_a_failure_that_the_next_run_mends(
     monkeypatch.setattr(filter, "_judge", broken)
     outcome = site("run", *settings)
     assert outcome.code == 1, outcome.stderr
-    assert {item.partition(" ")[0] for stage, item in site.failures() if stage == "match"} == {"suburb_0001_jpg"}
+    assert {item.partition(" ")[0] for stage, item in site.failures() if stage == "match"} == {"suburb_0001.jpg"}
     assert "on purpose" in outcome.stderr
     monkeypatch.undo()
     mended = site("run", *settings)

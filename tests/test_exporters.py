@@ -310,7 +310,7 @@ def test_openmvg_refuses_two_images_of_one_name(truth: Truth, tmp_path: Path) ->
         EXPORTERS["openmvg"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "v")  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("name", ["bundler", "openmvg", "alicevision", "hloc", "colmap"])
+@pytest.mark.parametrize("name", ["bundler", "openmvg", "alicevision", "hloc", "colmap", "ply"])
 def test_formats_without_a_crs_say_what_they_count_from(contents, tmp_path: Path, name: str) -> None:
     EXPORTERS[name]()(contents(), tmp_path / name)  # type: ignore[operator]
     world = json.loads((tmp_path / name / "world.json").read_text())

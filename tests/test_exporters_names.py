@@ -16,7 +16,7 @@ from test_export_colmap import Truth, make_truth
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.strategies.exporters import EXPORTERS, ExportContents
-from aeromatch_cli.strategies.exporters.bingo import rows_of_images
+from aeromatch_cli.strategies.exporters.solution import rows_of_images
 
 
 @pytest.fixture(scope="module")

@@ -154,7 +154,7 @@ def test_a_third_of_the_attitudes_wrong_settles_in_one_run(site: Site, rendered:
     outcome = site("run")
     assert outcome.code == 0
     named = outcome.facts["stages"]["orient"]["facts"]["wrong_attitudes"]
-    assert sorted(named) == [site.names()[number].replace(".", "_") for number in wrong]
+    assert sorted(named) == [site.names()[number] for number in wrong]
     assert max(attitude_errors(site, rendered)) < 1.0
     verified = outcome.facts["stages"]["filter"]["facts"]["pairs"]["verified"]
     with sqlite3.connect(site.work / "export" / "colmap" / "database.db") as database:

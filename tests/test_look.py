@@ -158,6 +158,7 @@ def test_compare_names_what_differs(done_site: Site) -> None:
     assert invoke("run", "baseline", *done_site.options("--set", "match.ratio=0.5", "--workspace", other)).code == 0
     outcome = invoke("compare", done_site.work, other, "--json")
     assert outcome.facts["settings"] == ["match.ratio: 0.8 and 0.5"]
+    assert outcome.facts["better"] == "first"
     first, second = outcome.facts["matches"]
     assert 0 < second < first
     assert f"matches     {first:,} and {second:,} ({100 * (second / first - 1):+.1f} %)" in outcome.stdout

@@ -202,15 +202,16 @@ def turned(rows, which):
 
 
 def test_a_wrong_attitude_is_corrected_once_and_the_second_run_does_nothing(done_site):
-    image_id = done_site.names()[1].replace(".", "_")
+    name = done_site.names()[1]
+    image_id = name.replace(".", "_")
     before = pair_prints(done_site)
     done_site.rewrite_poses(lambda rows: turned(rows, {1}))
     outcome = done_site("run")
     assert outcome.code == 0
     facts = outcome.facts["stages"]["orient"]["facts"]
     assert facts["poses_from"] == "given poses"
-    assert facts["corrected"] == [image_id]
-    assert facts["wrong_attitudes"] == {image_id: pytest.approx(180, abs=2)}
+    assert facts["corrected"] == [name]
+    assert facts["wrong_attitudes"] == {name: pytest.approx(180, abs=2)}
     # The others keep their poses to the last bit: nothing of theirs is made again.
     assert kept_pairs(before, pair_prints(done_site)) == {pair for pair in before if image_id not in pair}
     assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}

@@ -96,7 +96,7 @@ def compare(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare two workspaces: settings, pairs, matches, time."""
+    """Compare two workspaces of the same images: settings, pairs, matches, time, and which is better."""
 
     def call() -> Result:
         from aeromatch_cli.report.compare import compare as compared

@@ -23,8 +23,8 @@ class OrientFacts(Facts):
 
     poses_from: str | None = Field(None, description="Where the poses of the block come from, in words.")
     frame: Literal["world", "own"] | None = Field(None, description="own: no position was given; metres mean nothing.")
-    wrong_attitudes: dict[str, float] = Field({}, description="image_id -> degrees off.")
-    wrong_positions: dict[str, float] = Field({}, description="image_id -> metres off.")
+    wrong_attitudes: dict[str, float] = Field({}, description="Image -> degrees off.")
+    wrong_positions: dict[str, float] = Field({}, description="Image -> metres off.")
     outside: list[str] = Field([], description="Images that the pictures could not orient.")
 
 
@@ -267,6 +267,17 @@ class Shown(Line):
     quality: Quality | None = Field(None, description="Of a workspace.")
 
 
+class Criterion(BaseModel):
+    """One thing that two workspaces are compared by."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    what: str
+    first: str = Field(description="As it is shown, of the first workspace.")
+    second: str
+    better: Literal["first", "second", "neither"]
+
+
 class Compared(Line):
     """Of `compare`; lists have the first workspace's figure and the second's."""
 
@@ -275,6 +286,8 @@ class Compared(Line):
     pairs: list[int]
     verified: list[int]
     matches: list[int]
+    better: Literal["first", "second", "neither"] = Field(description="By the first criterion that tells them apart.")
+    criteria: list[Criterion] = Field(description="The gravest first.")
 
 
 class Configured(Line):

@@ -313,7 +313,7 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 ### failures.csv
 
-`stage`, `item`, `reason`: every image or pair that failed.
+`stage`, `item`, `reason`: every image or pair that failed, by the names of the files, a pair as `NAME0 and NAME1`.
 
 ### .lock
 

@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray
+from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, FloatArray, Image
 from aeromatch_cli.formats.archives import load_arrays, save_arrays
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
@@ -25,6 +25,11 @@ _REST = (
     "cameras",
     "params",
 )
+# Columns of orientation.csv.
+ORIENTATION = (
+    "image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m",
+    "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame", "unit",
+)  # fmt: skip
 
 
 def write_adjusted(stream: BinaryIO, adjusted: AdjustedBlock) -> None:
@@ -75,35 +80,38 @@ def read_adjusted(path: Path) -> AdjustedBlock:
 
 
 def orientation_text(adjusted: AdjustedBlock, block: Block) -> str:
-    """orientation.csv: one line per image of known place, in the block's CRS.
+    """orientation.csv: one line per image of known place, by name."""
+    found = (orientation_fields(adjusted, block, image) for image in sorted(block.images, key=lambda one: one.name))
+    return csv_text(ORIENTATION, [tuple(one.values()) for one in found if one is not None])
+
+
+def orientation_fields(adjusted: AdjustedBlock, block: Block, image: Image) -> dict[str, str | float] | None:
+    """A line of orientation.csv, in the block's CRS, NaN for what is not known; None where no place is.
 
     x, y, z: projection centre, metres. omega, phi, kappa: degrees, photogrammetric, against the grid of the CRS.
     sigma_*: their standard deviations. unit: of all lengths of the line, "m", or "arbitrary" in a frame whose scale is.
-    frame: "world"; "own N" of images in a frame of their own, whose place, north
-    and scale are arbitrary; "predicted" of images that are not oriented, by the pose that is known of them.
+    frame: "world"; "own N" of images in a frame of their own, whose place, north and scale are arbitrary; "predicted"
+    of images that are not oriented, by the pose that is known of them.
     """
-    header = ("image", "x", "y", "z", "omega_deg", "phi_deg", "kappa_deg", "sigma_x_m", "sigma_y_m", "sigma_z_m")
-    rows = []
-    for image in sorted(block.images, key=lambda image: image.name):
-        pose, known = adjusted.poses.get(image.image_id), block.poses.get(image.image_id)
-        rotation: FloatArray | None
-        if pose is not None:
-            number = adjusted.frames.get(image.image_id)
-            frame, sigmas = f"own {number}" if number else "world", [*pose.sigmas_m, *pose.sigmas_deg]
-            center_m, rotation = pose.center_m, pose.rotation
-        elif known is not None:
-            frame, sigmas = "predicted", [known.sigma_position_m] * 3 + [known.sigma_angle_deg] * 3
-            center_m, rotation = known.center_m, known.world_rotation
-        else:
-            continue
-        place = [round(float(v), 4) for v in center_m + np.array(block.origin_m)]
-        angles = ["", "", ""] if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
-        metric = block.metric and not frame.startswith("own")
-        known_of = [metric] * 3 + [rotation is not None] * 3
-        deviations = [float(f"{v:.3g}") if known else "" for v, known in zip(sigmas, known_of, strict=True)]
-        unit = "m" if metric else "arbitrary"
-        rows.append((image.name, *place, *angles, *deviations, image.camera_id, frame, unit))
-    return csv_text((*header, "sigma_omega_deg", "sigma_phi_deg", "sigma_kappa_deg", "camera", "frame", "unit"), rows)
+    pose, known = adjusted.poses.get(image.image_id), block.poses.get(image.image_id)
+    rotation: FloatArray | None
+    if pose is not None:
+        number = adjusted.frames.get(image.image_id)
+        frame, sigmas = f"own {number}" if number else "world", [*pose.sigmas_m, *pose.sigmas_deg]
+        center_m, rotation = pose.center_m, pose.rotation
+    elif known is not None:
+        frame, sigmas = "predicted", [known.sigma_position_m] * 3 + [known.sigma_angle_deg] * 3
+        center_m, rotation = known.center_m, known.world_rotation
+    else:
+        return None
+    place = [round(float(v), 4) for v in center_m + np.array(block.origin_m)]
+    angles = [np.nan] * 3 if rotation is None else [round(float(v), 6) for v in to_omega_phi_kappa(rotation)]
+    metric = block.metric and not frame.startswith("own")
+    known_of = [metric] * 3 + [rotation is not None] * 3
+    deviations = [float(f"{v:.3g}") if known else np.nan for v, known in zip(sigmas, known_of, strict=True)]
+    unit = "m" if metric else "arbitrary"
+    values: tuple[str | float, ...] = (image.name, *place, *angles, *deviations, image.camera_id, frame, unit)
+    return dict(zip(ORIENTATION, values, strict=True))
 
 
 def _rows(values: list[FloatArray]) -> FloatArray:

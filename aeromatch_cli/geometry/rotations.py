@@ -63,6 +63,18 @@ def from_yaw_pitch_roll(yaw_deg: float, pitch_deg: float, roll_deg: float, *, fo
     return cam_from_body @ ned_from_body.T @ NED_FROM_ENU
 
 
+def to_yaw_pitch_roll(world_rotation: FloatArray, *, forward: bool) -> tuple[float, float, float]:
+    """Inverse of `from_yaw_pitch_roll`; degrees, yaw in [0, 360), pitch in [-90, 90]."""
+    cam_from_body = CAM_FROM_BODY_FORWARD if forward else CAM_FROM_BODY_DOWN
+    m = NED_FROM_ENU @ world_rotation.T @ cam_from_body
+    yaw = np.arctan2(m[1, 0], m[0, 0])
+    pitch = np.arctan2(-m[2, 0], np.hypot(m[0, 0], m[1, 0]))
+    # From what yaw leaves over, as kappa of `to_omega_phi_kappa`.
+    side = np.cos(yaw) * m[1] - np.sin(yaw) * m[0]
+    roll = np.arctan2(-side[2], side[1])
+    return float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))
+
+
 def from_quaternion(qw: float, qx: float, qy: float, qz: float) -> FloatArray:
     """(3, 3) from a Hamilton quaternion, scalar first, normalised here. Raises ValueError on a zero quaternion."""
     q = np.array([qw, qx, qy, qz], dtype=np.float64)

@@ -1,8 +1,8 @@
-"""Two workspaces side by side: settings that differ, pairs, matches, images and poses."""
+"""Two workspaces side by side: settings that differ, pairs, matches, images and poses, and which is better."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,33 +10,47 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.config import differing, load
+from aeromatch_cli.data import Image
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.rows import read_verified_row
-from aeromatch_cli.formats.tables import read_images, read_pairs
+from aeromatch_cli.formats.tables import read_csv, read_images, read_pairs
+from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
 from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
+from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import facts_on_file
-from aeromatch_cli.workspace import opened_workspace
+from aeromatch_cli.workspace import Workspace, opened_workspace
 
 _LISTED = 10
 # Settings that change no result.
 _OUTWARD = ("workspace", "run")
+# Of the images of the larger block: with fewer in common two blocks have nothing to be compared by.
+_LEAST_COMMON = 0.5
+_UNORIENTED = "predicted"
 
 
 @dataclass(frozen=True)
 class _Side:
-    """matches: verified ones by pair of image names. seconds: by stage. facts: of the adjustment."""
+    """images: by name. matches: verified ones by pair of image names. seconds: by stage. adjusted, consistent: facts of
+    these stages. oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its
+    stages have not run."""
 
     settings: Mapping[str, Any]
-    images: frozenset[str]
+    images: Mapping[str, Image]
     matches: Mapping[tuple[str, str], int]
     seconds: Mapping[str, float]
     adjusted: Mapping[str, Any]
+    consistent: Mapping[str, Any]
+    oriented: frozenset[str] | None
+    verdict: str | None
 
 
 def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
-    """In words, and as facts. Raises InputError where a folder is no workspace."""
+    """In words, and as facts. Raises InputError where a folder is no workspace, ConfigError where their images are not
+    the same."""
     one, two = _side(first), _side(second)
+    _check_images(first, second, one, two)
     lines = [f"first       {first}", f"second      {second}"]
     apart = differing(one.settings, two.settings)
     changed = [
@@ -45,35 +59,94 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
         if key.partition(".")[0] not in _OUTWARD
     ]
     lines += [f"setting     {words}" for words in changed] or ["settings    the same"]
-    lines.append(_counts("images", len(one.images), len(two.images)))
-    for words, names in (
-        ("only in the first", one.images - two.images),
-        ("only in the second", two.images - one.images),
-    ):
-        if names:
-            lines.append(f"            {words}: {', '.join(sorted(names)[:_LISTED])}")
-    verified = [{pair for pair, count in side.matches.items() if count} for side in (one, two)]
-    lines.append(_counts("pairs", len(one.matches), len(two.matches)))
-    lines.append(_counts("verified", len(verified[0]), len(verified[1])))
-    for words, pairs in (("lost", verified[0] - verified[1]), ("gained", verified[1] - verified[0])):
-        if pairs:
-            shown = "; ".join(" and ".join(pair) for pair in sorted(pairs)[:_LISTED])
-            lines.append(f"            {len(pairs)} {words}: {shown}")
-    totals = [sum(side.matches.values()) for side in (one, two)]
-    lines.append(_counts("matches", *totals))
-    both = sorted(verified[0] & verified[1])
-    ratios = [two.matches[pair] / one.matches[pair] for pair in both]
-    if ratios:
-        lines.append(f"            of {len(both)} pairs in both: {np.median(ratios):.2f} x as many (median)")
+    lines += [*_image_lines(one, two), *_match_lines(one, two)]
     for key, words in (("images", "oriented"), ("points", "points"), ("reprojection_error_px", "error px")):
         first_value, second_value = one.adjusted.get(key), two.adjusted.get(key)
         if first_value is not None and second_value is not None:
             lines.append(_counts(words, first_value, second_value))
     for stage in (stage for stage in STAGE_ORDER if stage in one.seconds and stage in two.seconds):
         lines.append(f"seconds     {stage}: {one.seconds[stage]:.1f} and {two.seconds[stage]:.1f}")
-    facts = {"settings": changed, "pairs": [len(one.matches), len(two.matches)], "verified": list(map(len, verified)),
-             "matches": totals}  # fmt: skip
-    return lines, facts
+    common = one.images.keys() & two.images.keys()
+    found = criteria(_standing(one, common), _standing(two, common))
+    facts = {"settings": changed, "pairs": [len(one.matches), len(two.matches)],
+             "verified": [len(_verified(one)), len(_verified(two))],
+             "matches": [sum(side.matches.values()) for side in (one, two)], **as_facts(found)}  # fmt: skip
+    return lines + verdict_lines(found), facts
+
+
+def _check_images(first: Path, second: Path, one: _Side, two: _Side) -> None:
+    common = sorted(one.images.keys() & two.images.keys())
+    if len(common) < _LEAST_COMMON * max(len(one.images), len(two.images)):
+        told = "; ".join(
+            f"{len(names)} only in {root}: {_listed(names)}"
+            for root, names in ((first, one.images.keys() - common), (second, two.images.keys() - common))
+            if names
+        )
+        raise ConfigError(
+            f"{first} and {second} are workspaces of different images, {len(common)} have one name in both ({told}): "
+            "compare two workspaces of the same images"
+        )
+    others = [name for name in common if not _same(one.images[name], two.images[name])]
+    if others:
+        raise ConfigError(
+            f"{first} and {second} are workspaces of different images: those named {_listed(others)} have another size "
+            "or time of capture in each; compare two workspaces of the same images"
+        )
+
+
+def _same(image: Image, other: Image) -> bool:
+    """As far as tables tell: a copy of a file has other times of its own."""
+    sizes = (image.width_px, image.height_px) == (other.width_px, other.height_px)
+    return sizes and (not image.time or not other.time or image.time == other.time)
+
+
+def _listed(names: Any) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(sorted(names)[:_LISTED]) + more
+
+
+def _image_lines(one: _Side, two: _Side) -> Iterator[str]:
+    yield _counts("images", len(one.images), len(two.images))
+    for words, names in (
+        ("only in the first", one.images.keys() - two.images.keys()),
+        ("only in the second", two.images.keys() - one.images.keys()),
+    ):
+        if names:
+            yield f"            {words}: {_listed(names)}"
+
+
+def _match_lines(one: _Side, two: _Side) -> Iterator[str]:
+    verified = _verified(one), _verified(two)
+    yield _counts("pairs", len(one.matches), len(two.matches))
+    yield _counts("verified", len(verified[0]), len(verified[1]))
+    for words, pairs in (("lost", verified[0] - verified[1]), ("gained", verified[1] - verified[0])):
+        if pairs:
+            shown = "; ".join(" and ".join(pair) for pair in sorted(pairs)[:_LISTED])
+            yield f"            {len(pairs)} {words}: {shown}"
+    yield _counts("matches", sum(one.matches.values()), sum(two.matches.values()))
+    both = sorted(verified[0] & verified[1])
+    ratios = [two.matches[pair] / one.matches[pair] for pair in both]
+    if ratios:
+        yield f"            of {len(both)} pairs in both: {np.median(ratios):.2f} x as many (median)"
+
+
+def _verified(side: _Side) -> set[tuple[str, str]]:
+    return {pair for pair, count in side.matches.items() if count}
+
+
+def _standing(side: _Side, common: Any) -> Standing:
+    """common: names of the images in both."""
+    control = side.adjusted.get("control") or {}
+    rmse_m, spread = control.get("check_rmse_m"), side.consistent.get("spread", {})
+    names = {image.image_id: name for name, image in side.images.items()}
+    return Standing(
+        verdict=side.verdict,
+        oriented=None if side.oriented is None else len(side.oriented & common),
+        check_m=None if rmse_m is None else float(np.linalg.norm(rmse_m)),
+        checks=frozenset(control.get("checks") or ()),
+        empty=sum(row[1] for i, row in spread.items() if names.get(i) in common) if spread else None,
+        matches=sum(count for pair, count in side.matches.items() if common.issuperset(pair)),
+    )
 
 
 def _counts(words: str, first: float, second: float) -> str:
@@ -84,21 +157,37 @@ def _counts(words: str, first: float, second: float) -> str:
 
 def _side(root: Path) -> _Side:
     workspace = opened_workspace(root)
-    names = {image.image_id: image.name for image in read_images(workspace.images)}
+    images = read_images(workspace.images)
+    names = {image.image_id: image.name for image in images}
+    quality = quality_on_file(workspace, names)
+    return _Side(
+        settings=load(str(workspace.config)).model_dump(mode="json"),
+        images={image.name: image for image in images},
+        matches=_matches(workspace, names),
+        seconds=seconds_by_stage(workspace),
+        adjusted=facts_on_file(workspace, "adjust"),
+        consistent=facts_on_file(workspace, "consistency"),
+        oriented=_oriented(workspace),
+        verdict=None if quality is None else quality.verdict,
+    )
+
+
+def _matches(workspace: Workspace, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
     final = FinalEntries(workspace)
     matches: dict[tuple[str, str], int] = {}
-    rows: dict[str, Any] = {}
+    row_id, row = "", dict[str, Any]()
     for pair in read_pairs(workspace.pairs) if workspace.pairs.is_file() else []:
-        if pair.image_id0 not in rows:
-            rows = {pair.image_id0: read_verified_row(workspace.verified(pair.image_id0))}
-        found = rows[pair.image_id0].get(pair.image_id1)
+        if pair.image_id0 != row_id:
+            row_id, row = pair.image_id0, read_verified_row(workspace.verified(pair.image_id0))
+        found = row.get(pair.image_id1)
         entry = None if found is None else final(pair.image_id0, found)
         good = entry is not None and entry.verdict.state == "verified"
         matches[names[pair.image_id0], names[pair.image_id1]] = len(entry.matches.indices) if good and entry else 0
-    return _Side(
-        settings=load(str(workspace.config)).model_dump(mode="json"),
-        images=frozenset(names.values()),
-        matches=matches,
-        seconds=seconds_by_stage(workspace),
-        adjusted=facts_on_file(workspace, "adjust"),
-    )
+    return matches
+
+
+def _oriented(workspace: Workspace) -> frozenset[str] | None:
+    path = workspace.orientation / "orientation.csv"
+    if not path.is_file():
+        return None
+    return frozenset(row["image"] for row in read_csv(path) if row["frame"] != _UNORIENTED)

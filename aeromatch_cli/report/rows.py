@@ -16,6 +16,7 @@ from typing import Any
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
@@ -170,14 +171,12 @@ def _number(value: float | str) -> str:
 
 
 def failure_rows(context: Context) -> list[dict[str, str]]:
-    """Rows of failures.csv: stage, item, reason; the items, where they are images or pairs, by their files' names."""
-    path, images = context.workspace.failures, context.image_by_id
+    """Rows of failures.csv: stage, item, reason."""
+    path = context.workspace.failures
+    names = {image.image_id: image.name for image in context.block.images}
     rows = read_csv(path) if path.is_file() else []
-    for row in rows:
-        ids = row["item"].split(" ")
-        if all(image_id in images for image_id in ids):
-            row["item"] = " – ".join(images[image_id].name for image_id in ids)
-    return rows
+    # Those of an earlier version have ids.
+    return [{**row, "item": item_named(row["item"], names)} for row in rows]
 
 
 def evaluation_figures(workspace: Workspace) -> EvaluationFigures | None:

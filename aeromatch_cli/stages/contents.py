@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
@@ -9,15 +10,20 @@ import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Pair
-from aeromatch_cli.errors import BrokenFileError, InputError
+from aeromatch_cli.errors import BrokenFileError, InputError, ItemError
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
+from aeromatch_cli.images.depth import sample_colours
+from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of
 from aeromatch_cli.strategies.exporters import ExportContents, PairContents
+from aeromatch_cli.strategies.exporters.contents import Colours
+
+log = logging.getLogger("aeromatch")
 
 _Verified = Callable[[Context], Judged]
 
@@ -75,12 +81,25 @@ def _contents(
         places_m = world_m + np.array(block.origin_m)
         return np.column_stack([geographic_from_grid(block.crs, places_m[:, :2]), places_m[:, 2]])
 
-    known = None if block.crs == LOCAL else geographic
+    as_stored_px = keypoints_px
+
+    def colours(image_id: str) -> Colours | None:
+        try:
+            pixels = read_pixels(context.image_path(context.image_by_id[image_id]), colour=True)
+        except ItemError as error:
+            log.warning("warning: export: the points of an image stay grey: %s", error)
+            return None
+        places_px = as_stored_px(image_id)
+        return sample_colours(pixels, places_px, np.ones(len(places_px)))
+
     if adjusted is not None:
         keypoints_px = at_once(adjusted, adjusted.cameras_of(block), keypoints_px)
     path = context.workspace.residuals
     residuals = read_residuals(path, block.images) if adjusted is not None and path.is_file() else {}
-    return ExportContents(block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals)
+    known = None if block.crs == LOCAL else geographic
+    return ExportContents(
+        block, keypoints_px, pairs, context.guessed_cameras, given, adjusted, known, residuals, colours
+    )
 
 
 def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairContents]:

@@ -13,6 +13,7 @@ from aeromatch_cli.errors import BrokenFileError, WorkspaceError
 from aeromatch_cli.executor import guarded
 from aeromatch_cli.formats.features import known_fingerprint
 from aeromatch_cli.formats.rows import UNKNOWN, MatchEntry, VerifiedEntry
+from aeromatch_cli.stages.naming import names_on_file
 from aeromatch_cli.workspace import Workspace
 
 
@@ -101,8 +102,9 @@ def check_features(
     """Raises WorkspaceError where an entry's matches point into features that are no longer there. features: as
     `stale_image` has them, by default from their files."""
     if image_id := stale_image(image_id0, entry, features or partial(features_on_file, workspace)):
+        name = names_on_file(workspace).get(image_id, image_id)
         raise WorkspaceError(
-            f"{workspace.root}: the keypoints of {image_id} were found again with other settings or inputs after it "
+            f"{workspace.root}: the keypoints of {name} were found again with other settings or inputs after it "
             "was matched, so that its matches no longer hold: run `aeromatch match` and then `aeromatch filter`, or "
             "`aeromatch run`"
         )

@@ -39,6 +39,7 @@ from aeromatch_cli.stages.changes import changed_words
 from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
+from aeromatch_cli.stages.naming import facts_named, item_named, names_on_file
 from aeromatch_cli.stages.quality import facts_told, quality_of
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
@@ -100,13 +101,13 @@ def execute(
             inputs = unchanged.state_of_inputs(settings) if whole else {}
             before = None if overwrite else unchanged.unchanged_reports(Workspace(root), inputs)
             if before is not None:
-                return _unchanged(settings, before, _Said(say))
+                return _named(_unchanged(settings, before, _Said(say)), root)
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 result = _repairing(command, settings, executor, part, overwrite, _Said(say))
             if whole and not result.failures:
                 unchanged.remember(Workspace(root), inputs, result.facts["stages"])
-            return result
+            return _named(result, root)
         except BaseException as error:
             # Workers are stopped in the middle of what they write.
             if command != "check":
@@ -115,6 +116,13 @@ def execute(
                 words = f"cannot read {error.filename} ({error.strerror}): check its permissions"
                 raise WorkspaceError(words) from error
             raise
+
+
+def _named(result: Result, root: Path) -> Result:
+    """The same as people and other programs get it: with names of files in place of image ids."""
+    names = names_on_file(Workspace(root))
+    failures = tuple((stage, item_named(item, names), reason) for stage, item, reason in result.failures)
+    return replace(result, facts=facts_named(result.facts, names), failures=failures)
 
 
 def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> Result:

@@ -15,6 +15,7 @@ from aeromatch_cli.executor import Outcome
 from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.naming import item_named, names_on_file
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.workspace import Workspace
 
@@ -72,8 +73,10 @@ class StageReport:
         if not self._says_nothing_new(path) or (shard is None and _shard_failed_since(path)):
             write_json(path, value)
         gather_failures(context_workspace)
-        for item, reason in self.failures if self.stage != "orient" else ():  # its first pass has named them
-            log.warning("%s: %s: %s", self.stage, item, reason)
+        if self.failures and self.stage != "orient":  # its first pass has named them
+            names = names_on_file(context_workspace)
+            for item, reason in self.failures:
+                log.warning("%s: %s: %s", self.stage, item_named(item, names), reason)
         return self
 
     def _says_nothing_new(self, path: Path) -> bool:
@@ -104,7 +107,8 @@ def _shard_failed_since(path: Path) -> bool:
 
 
 def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
-    """failures.csv anew from the reports of all stages; returns its rows (stage, item, reason).
+    """failures.csv anew from the reports of all stages; returns its rows (stage, item, reason), with ids as reports
+    have them, where the file has names.
 
     What a later report of the same stage covers (the whole block, or a shard that owns the item) supersedes what an
     earlier one says of that item.
@@ -122,7 +126,9 @@ def gather_failures(workspace: Workspace) -> list[tuple[str, str, str]]:
             label = path.stem.partition(".")[2]
             later.append(Shard.parse(label.replace("-of-", "/")) if label else None)
     ordered = sorted(once(rows))
-    write_text(workspace.failures, csv_text(("stage", "item", "reason"), ordered))
+    names = names_on_file(workspace) if ordered else {}
+    shown = [(stage, item_named(item, names), reason) for stage, item, reason in ordered]
+    write_text(workspace.failures, csv_text(("stage", "item", "reason"), shown))
     return ordered
 
 

@@ -20,6 +20,7 @@ from aeromatch_cli.blocks.crs import (
 from aeromatch_cli.blocks.poses import PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric, geocentric
 
 _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 
@@ -106,14 +107,6 @@ def _crs(where: str, text: str) -> Any:
         ) from error
 
 
-def geocentric(geodetic: FloatArray) -> FloatArray:
-    """(N, 3) metres of latitude, longitude (degrees) and ellipsoidal height (N, 3), WGS84."""
-    from pyproj import Transformer
-
-    forward = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
-    return np.column_stack(forward.transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2]))
-
-
 def geodetic(geocentric_m: FloatArray) -> FloatArray:
     """Latitude, longitude (degrees) and ellipsoidal height (N, 3) of geocentric metres (N, 3), WGS84."""
     from pyproj import Transformer
@@ -122,13 +115,6 @@ def geodetic(geocentric_m: FloatArray) -> FloatArray:
     x, y, z = geocentric_m.T
     longitude, latitude, height = backward.transform(x, y, z)
     return np.column_stack([latitude, longitude, height])
-
-
-def enu_from_geocentric(latitude_deg: float, longitude_deg: float) -> FloatArray:
-    """(3, 3) from geocentric axes to east, north and up of a place."""
-    latitude, longitude = np.deg2rad(latitude_deg), np.deg2rad(longitude_deg)
-    sf, cf, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
-    return np.array([[-sl, cl, 0.0], [-sf * cl, -sf * sl, cf], [cf * cl, cf * sl, sf]])
 
 
 def from_topocentric(

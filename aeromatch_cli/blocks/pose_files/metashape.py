@@ -22,12 +22,13 @@ import numpy as np
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.lenses import of_metashape
-from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, enu_from_geocentric, geodetic
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, geodetic
 from aeromatch_cli.blocks.pose_files.source import CameraShelf, Source, image_name, number, rotation_row
 from aeromatch_cli.blocks.poses import PoseList, PoseRow, PositionKind
 from aeromatch_cli.blocks.units import factor, named_column
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric
 from aeromatch_cli.geometry.frames import CAM_FROM_PHOTO
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.geometry.rotations import rotation_x, rotation_y, rotation_z

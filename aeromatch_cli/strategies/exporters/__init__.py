@@ -21,6 +21,7 @@ from aeromatch_cli.strategies.exporters.hloc import Hloc
 from aeromatch_cli.strategies.exporters.micmac import MicMac
 from aeromatch_cli.strategies.exporters.openmvg import OpenMvg
 from aeromatch_cli.strategies.exporters.opensfm import OpenSfm
+from aeromatch_cli.strategies.exporters.ply import Ply
 from aeromatch_cli.strategies.exporters.tracks import Tracks
 
 EXPORTERS: Mapping[str, type[Strategy]] = {
@@ -35,6 +36,7 @@ EXPORTERS: Mapping[str, type[Strategy]] = {
     "hloc": Hloc,
     "geojson": GeoJson,
     "geopackage": GeoPackage,
+    "ply": Ply,
     "tracks": Tracks,
 }
 

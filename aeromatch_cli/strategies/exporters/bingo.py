@@ -14,12 +14,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, normalise, parameters
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.solution import Solution, matched, rows_of_images, summary_of, write
 
 _MM_PER_UM = 1e-3
 _END = "-99\n"
@@ -74,12 +74,6 @@ class Bingo(Strategy):
                 f"{values['cy']:.3f} px from the middle of the first pixel\n"
             )
         return lines
-
-
-def rows_of_images(image_idx: IntArray, count: int) -> list[IntArray]:
-    """The rows of (N,) that are of each of so many images, in order: sorted once, not looked for by every image."""
-    order = np.argsort(image_idx, kind="stable")
-    return np.split(order, np.searchsorted(image_idx[order], np.arange(1, count)))
 
 
 def _exterior(solution: Solution, origin_m: FloatArray) -> Iterator[str]:

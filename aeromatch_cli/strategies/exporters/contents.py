@@ -8,8 +8,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from aeromatch_cli.data import AdjustedBlock, Block, FloatArray, IntArray, Pair, Pose, PoseResidual
 from aeromatch_cli.errors import WorkspaceError
+
+Colours = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,8 @@ class ExportContents:
     guessed_cameras: camera_ids whose focal length is a guess and not a value from the user or from EXIF.
     positions: image_id -> position as it was given, with its standard deviation; None: those of the block. adjusted:
     the block after bundle adjustment, or None. geographic: world (N, 3) -> WGS84 latitude, longitude in degrees and
-    height (N, 3); None in a local frame. residuals: of the adjusted images, by image_id.
+    height (N, 3); None in a local frame. residuals: of the adjusted images, by image_id. colours: image_id -> RGB
+    (K, 3) of its picture at the keypoints, for which it is decoded; None where that fails.
     """
 
     block: Block
@@ -47,6 +53,7 @@ class ExportContents:
     adjusted: AdjustedBlock | None = None
     geographic: Callable[[FloatArray], FloatArray] | None = None
     residuals: Mapping[str, PoseResidual] = field(default_factory=dict)
+    colours: Callable[[str], Colours | None] = lambda image_id: None
 
 
 @dataclass(frozen=True)

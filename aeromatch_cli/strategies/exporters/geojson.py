@@ -13,10 +13,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.links import WEAK_MATCHES, Links
+from aeromatch_cli.strategies.exporters.links import Links, camera_fields, footprint_fields
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of, write
 from aeromatch_cli.strategies.exporters.styles import qml
 
@@ -24,10 +23,10 @@ _LOCAL_FRAME = 'LOCAL_CS["local frame of the block",UNIT["metre",1]]'
 
 
 class GeoJson(Strategy):
-    """Writes cameras.geojson, footprints.geojson and pairs.geojson with counts of verified matches, and beside each its
-    style for QGIS."""
+    """Writes cameras.geojson (angles, standard deviations and residuals of every image, times, counts of verified
+    matches), footprints.geojson and pairs.geojson, and beside each its style for QGIS."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     name: Literal["geojson"] = "geojson"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -37,7 +36,7 @@ class GeoJson(Strategy):
         with whole_folder(folder) as partial:
             found = matched(contents)
             graph = Links.of(contents, solution, found)
-            ties, positions = graph.ties, graph.positions
+            positions = graph.positions
             links = [
                 _feature(
                     "LineString", _places(contents, np.array([positions[a], positions[b]]))[:, :2].tolist(),
@@ -46,16 +45,12 @@ class GeoJson(Strategy):
                 for (a, b), count in graph.lines
             ]  # fmt: skip
             cameras = [
-                _feature(
-                    "Point", _places(contents, center_m[None])[0].tolist(),
-                    {"image": names[i], "matches": ties[i], "weak": ties[i] < WEAK_MATCHES,
-                     "oriented": i in solution.poses},
-                )
-                for i, center_m in sorted(positions.items())
-            ]  # fmt: skip
+                _feature("Point", _places(contents, positions[i][None])[0].tolist(), fields)
+                for i, fields in camera_fields(contents, solution, graph)
+            ]
             areas = [
-                _feature("Polygon", [_ring(contents, footprint.polygon_m)], {"image": names[i], "matches": ties[i]})
-                for i, footprint in sorted(block_footprints(contents.block).items())
+                _feature("Polygon", [_ring(contents, footprint.polygon_m)], fields)
+                for footprint, fields in footprint_fields(contents, solution, graph)
             ]
             head: dict[str, Any] = {"type": "FeatureCollection"}
             if contents.geographic is None:
@@ -86,4 +81,6 @@ def _ring(contents: ExportContents, polygon_m: FloatArray) -> list[list[float]]:
 
 def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
     geometry = {"type": kind, "coordinates": coordinates}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+    # JSON has no NaN.
+    known = {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in properties.items()}
+    return {"type": "Feature", "geometry": geometry, "properties": known}

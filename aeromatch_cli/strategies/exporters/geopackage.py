@@ -6,18 +6,18 @@ The table layer_styles holds their styles, as QGIS keeps them in a database.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.formats.residuals import fields_of
-from aeromatch_cli.geometry.footprints import block_footprints
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.links import WEAK_MATCHES, Links
+from aeromatch_cli.strategies.exporters.links import Links, camera_fields, footprint_fields
 from aeromatch_cli.strategies.exporters.solution import Solution, matched, summary_of
 from aeromatch_cli.strategies.exporters.styles import qml
 
@@ -27,10 +27,10 @@ _MADE = "2000-01-01T00:00:00.000Z"
 
 
 class GeoPackage(Strategy):
-    """Writes block.gpkg: camera positions with the residuals of an adjusted block, footprints and pairs with their
-    verified matches, and styles for QGIS; needs pyogrio."""
+    """Writes block.gpkg: camera positions with angles, standard deviations, residuals and times, footprints and pairs
+    with their verified matches, and styles for QGIS; needs pyogrio."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     name: Literal["geopackage"] = "geopackage"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
@@ -46,16 +46,15 @@ class GeoPackage(Strategy):
             found = matched(contents)
             links = Links.of(contents, solution, found)
             path = partial / "block.gpkg"
-            ids = sorted(links.positions)
+            cameras = camera_fields(contents, solution, links)
             write_layer(
-                path, "cameras", [Point(links.positions[i] + origin_m) for i in ids], "Point Z", crs,
-                {"image": [names[i] for i in ids], "matches": [links.ties[i] for i in ids],
-                 "weak": [links.ties[i] < WEAK_MATCHES for i in ids], **_residual_fields(contents, ids)},
+                path, "cameras", [Point(links.positions[i] + origin_m) for i, _ in cameras], "Point Z", crs,
+                _columns([fields for _, fields in cameras]),
             )  # fmt: skip
-            areas = sorted(block_footprints(block).items())
+            areas = footprint_fields(contents, solution, links)
             write_layer(
-                path, "footprints", [Polygon(f.polygon_m[:, :2] + origin_m[:2]) for _, f in areas], "Polygon", crs,
-                {"image": [names[i] for i, _ in areas], "matches": [links.ties[i] for i, _ in areas]},
+                path, "footprints", [Polygon(f.polygon_m[:, :2] + origin_m[:2]) for f, _ in areas], "Polygon", crs,
+                _columns([fields for _, fields in areas]),
             )  # fmt: skip
             write_layer(
                 path, "pairs",
@@ -69,12 +68,9 @@ class GeoPackage(Strategy):
             return summary_of(folder, partial, contents, len(solution.poses), count, found.counts)
 
 
-def _residual_fields(contents: ExportContents, ids: Sequence[str]) -> dict[str, list[Any]]:
-    """Columns of residuals.csv for the layer of cameras, none of a block that is not adjusted."""
-    if not contents.residuals:
-        return {}
-    rows = [fields_of(contents.residuals.get(image_id)) for image_id in ids]
-    return {name: [row[name] for row in rows] for name in fields_of(None)}
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Of the same attributes of all features."""
+    return {key: [row[key] for row in rows] for key in rows[0]} if rows else {}
 
 
 def write_styles(path: Path, layers: Sequence[str]) -> None:
@@ -95,6 +91,14 @@ def write_styles(path: Path, layers: Sequence[str]) -> None:
     )  # fmt: skip
 
 
+def _typed(name: str, values: Sequence[Any]) -> NDArray[Any]:
+    """Texts as objects; times as such, by which QGIS animates a layer: as the camera's clock showed them."""
+    if name == "time":
+        times = [datetime.fromisoformat(text).replace(tzinfo=None) if text else None for text in values]
+        return np.array(times, dtype="datetime64[ms]")
+    return np.array(values, dtype=object if isinstance(values[0], str) else None)
+
+
 def _writer() -> Any:
     try:
         from pyogrio import raw, set_gdal_config_options
@@ -109,7 +113,7 @@ def _writer() -> Any:
     ) -> None:
         if not geometries:  # without ground there are no footprints
             return
-        columns = [np.array(values, dtype=object if isinstance(values[0], str) else None) for values in fields.values()]
+        columns = [_typed(name, values) for name, values in fields.items()]
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*crs.*was not provided", UserWarning)  # a local block has none
             raw.write(

@@ -1,12 +1,20 @@
-"""What the exporters of maps draw of a block: where images were taken, and how they hang together."""
+"""What the exporters of maps draw of a block: where images were taken, what is known of them, and how they hang
+together."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from aeromatch_cli.data import FloatArray
+import numpy as np
+
+from aeromatch_cli.data import AdjustedBlock, FloatArray
+from aeromatch_cli.formats.adjusted import orientation_fields
+from aeromatch_cli.formats.residuals import fields_of
+from aeromatch_cli.geometry.footprints import Footprint, block_footprints
+from aeromatch_cli.geometry.rotations import to_yaw_pitch_roll
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 from aeromatch_cli.strategies.exporters.solution import Matched, Solution, unplaced
 
@@ -33,3 +41,45 @@ class Links:
             ties.update({id0: len(rows), id1: len(rows)})
         placed = [((a, b), len(rows)) for a, b, rows in found.pairs if a in positions and b in positions]
         return cls(positions, ties, placed)
+
+
+def camera_fields(contents: ExportContents, solution: Solution, links: Links) -> list[tuple[str, dict[str, Any]]]:
+    """image_id and attributes of every image that has a place, by image_id: those of orientation.csv and, of an
+    adjusted block, of residuals.csv, with yaw, pitch and roll (0, 0, 0 looks straight down, its top to the north of the
+    grid). Every image has the same attributes; NaN stands for what is not known, None for
+    an unknown time."""
+    block, adjusted = contents.block, contents.adjusted or AdjustedBlock.empty()
+    found = []
+    for image in sorted(block.images, key=lambda one: one.image_id):
+        image_id = image.image_id
+        known = orientation_fields(adjusted, block, image)
+        if known is None or image_id not in links.positions:
+            continue
+        rotation = solution.poses[image_id][0] if image_id in solution.poses else block.poses[image_id].world_rotation
+        turned = [np.nan] * 3 if rotation is None else np.round(to_yaw_pitch_roll(rotation, forward=False), 6).tolist()
+        fields = {
+            **known, **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turned, strict=True)), "time": image.time or None,
+            "oriented": image_id in solution.poses, "matches": links.ties[image_id],
+            "weak": links.ties[image_id] < WEAK_MATCHES,
+        }  # fmt: skip
+        if contents.residuals:
+            fields |= fields_of(contents.residuals.get(image_id))
+        found.append((image_id, fields))
+    return found
+
+
+def footprint_fields(
+    contents: ExportContents, solution: Solution, links: Links
+) -> list[tuple[Footprint, dict[str, Any]]]:
+    """Footprints and their attributes, by image_id."""
+    images = {image.image_id: image for image in contents.block.images}
+    found = []
+    for image_id, footprint in sorted(block_footprints(contents.block).items()):
+        image = images[image_id]
+        fields = {
+            "image": image.name, "camera": image.camera_id, "time": image.time or None,
+            "oriented": image_id in solution.poses, "matches": links.ties[image_id],
+            "gsd_m": round(footprint.gsd_m, 6), "tilt_deg": round(footprint.tilt_deg, 4),
+        }  # fmt: skip
+        found.append((footprint, fields))
+    return found

@@ -2,7 +2,8 @@
 
 Cameras are `brown` or `fisheye_opencv`, which hold all but b2. Pixels (opensfm/features.py): u = (x + 0.5 - w / 2) /
 max(w, h) of x from the centre of the first pixel; the same for v. tracks.csv is version 2
-(src/map/src/tracks_manager.cc). Matches are pickled under numpy 1's module names, which both OpenSfM and ODM's fork
+(src/map/src/tracks_manager.cc); of an adjusted block it has the tracks of its points, by whose names
+reconstruction.json calls them. Matches are pickled under numpy 1's module names, which both OpenSfM and ODM's fork
 load. GPS positions are those that were given.
 """
 
@@ -11,51 +12,66 @@ from __future__ import annotations
 import gzip
 import json
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray, Image
-from aeromatch_cli.geometry.cameras import is_fisheye, parameters
-from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
+from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
-from aeromatch_cli.strategies.exporters.solution import Matched, Solution, called, held, matched, summary_of, write
+from aeromatch_cli.strategies.exporters.contents import Colours, ExportContents, ExportSummary, whole_folder
+from aeromatch_cli.strategies.exporters.opensfm_model import Project, capture_time, lla, reconstructions
+from aeromatch_cli.strategies.exporters.solution import (
+    Matched,
+    Solution,
+    called,
+    colours_of,
+    held,
+    matched,
+    summary_of,
+    track_colours,
+    write,
+)
 
 _TRACKS_HEAD = "OPENSFM_TRACKS_VERSION_v2\n"
 _FEATURES_VERSION = 3
 # The size of a keypoint is not handed on; nothing after matching reads it.
 _SIZE_PX = 4.0
-_GREY = 128
 _CONFIG = "# Features, matches and tracks are those of aeromatch.\nmin_track_length: 2\n"
 
 
 class OpenSfm(Strategy):
     """Writes features, matches, tracks.csv, exif, camera_models.json, reference_lla.json and config.yaml of an OpenSfM
-    project; put the images beside them as `images`. OpenSfM calls images by their file names, without folders."""
+    project, and reconstruction.json of an adjusted block, with colours; put the images beside them as `images`. OpenSfM
+    calls images by their file names, without folders."""
 
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     name: Literal["opensfm"] = "opensfm"
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ItemError where file names are not different."""
         solution = Solution.of(contents)
         names = called(solution.images, lambda name: PurePosixPath(name).name, "OpenSfM calls images by file names")
+        lenses, remarks = held(solution, "OpenSfM", in_colmap)  # what it holds of lenses is what COLMAP holds
+        project = Project.of(contents, solution, names, lenses)
         with whole_folder(folder) as partial:
-            found = matched(contents)
+            # Points of a reconstruction are found by the names of their tracks.
+            found = matched(contents, adjusted_tracks=True)
             places = {i.image_id: _normalised(contents, i) for i in solution.images}
+            colours = colours_of(contents, places)
             for image in solution.images:
-                _write_features(
-                    partial / "features" / f"{names[image.image_id]}.features.npz", places[image.image_id], image
-                )
+                path = partial / "features" / f"{names[image.image_id]}.features.npz"
+                _write_features(path, places[image.image_id], colours[image.image_id], image)
             _write_matches(partial / "matches", found, names)
-            write(partial / "tracks.csv", _tracks_text(found, solution, places, names))
+            write(partial / "tracks.csv", _tracks_text(found, solution, places, colours, names))
             write(partial / "image_list.txt", "".join(f"images/{image.name}\n" for image in solution.images))
             write(partial / "config.yaml", _CONFIG)
-            remarks = _write_metadata(partial, contents, solution, names)
+            _write_metadata(partial, project)
+            if contents.adjusted is not None:
+                parts = reconstructions(project, found, track_colours(found, colours))
+                write(partial / "reconstruction.json", json.dumps(parts) + "\n")
             keypoints = sum(map(len, places.values()))
             return summary_of(folder, partial, contents, len(solution.poses), keypoints, found.counts, remarks)
 
@@ -66,13 +82,13 @@ def _normalised(contents: ExportContents, image: Image) -> FloatArray:
     return np.asarray((places + 0.5 - size / 2.0) / size.max())
 
 
-def _write_features(path: Path, places: FloatArray, image: Image) -> None:
+def _write_features(path: Path, places: FloatArray, colours: Colours, image: Image) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     size = np.full(len(places), _SIZE_PX / max(image.width_px, image.height_px))
     points = np.column_stack([places, size, np.zeros(len(places))]).astype(np.float32)
     np.savez_compressed(
         path, points=points, descriptors=np.zeros((len(places), 1), np.uint8),
-        colors=np.full((len(places), 3), _GREY, np.uint8), segmentations=np.zeros(0), instances=np.zeros(0),
+        colors=colours, segmentations=np.zeros(0), instances=np.zeros(0),
         segmentation_labels=np.zeros(0), OPENSFM_FEATURES_VERSION=_FEATURES_VERSION,
     )  # fmt: skip
 
@@ -90,67 +106,35 @@ def _write_matches(folder: Path, found: Matched, names: dict[str, str]) -> None:
         path.write_bytes(gzip.compress(raw, mtime=0))
 
 
-def _tracks_text(found: Matched, solution: Solution, places: dict[str, FloatArray], names: dict[str, str]) -> str:
+def _tracks_text(
+    found: Matched,
+    solution: Solution,
+    places: Mapping[str, FloatArray],
+    colours: Mapping[str, Colours],
+    names: Mapping[str, str],
+) -> str:
     lines = [_TRACKS_HEAD]
     longer = [max(image.width_px, image.height_px) for image in solution.images]
     for track, image_idx, keypoint in zip(found.track, found.image_idx, found.keypoint, strict=True):
         image = solution.images[image_idx]
         x, y = places[image.image_id][keypoint]
         scale = _SIZE_PX / longer[image_idx]
-        colour = f"{_GREY}\t{_GREY}\t{_GREY}"
+        colour = "\t".join(map(str, colours[image.image_id][keypoint]))
         lines.append(f"{names[image.image_id]}\t{track}\t{keypoint}\t{x:.9g}\t{y:.9g}\t{scale:.9g}\t{colour}\t-1\t-1\n")
     return "".join(lines)
 
 
-def _write_metadata(
-    partial: Path, contents: ExportContents, solution: Solution, names: dict[str, str]
-) -> Sequence[str]:
-    """Returns remarks on cameras that OpenSfM cannot hold."""
-    cameras, remarks = held(solution, "OpenSfM", in_colmap)  # what it holds of lenses is what COLMAP holds
-    models = {camera_id: camera_model(cameras[camera_id]) for camera_id in solution.cameras}
-    keys = {
-        camera_id: f"v2 aeromatch {camera_id} {m['width']} {m['height']} {m['projection_type']}"
-        for camera_id, m in models.items()
-    }
-    write(partial / "camera_models.json", _json({keys[camera_id]: model for camera_id, model in models.items()}))
-    given = contents.block.poses if contents.positions is None else contents.positions
-    gps: dict[str, dict[str, float]] = {}
-    if contents.geographic is not None and given:
-        ids = sorted(given)
-        for image_id, (latitude, longitude, height) in zip(
-            ids, contents.geographic(np.array([given[i].center_m for i in ids])).tolist(), strict=True
-        ):
-            sigma = given[image_id].sigma_position_m
-            gps[image_id] = {"latitude": latitude, "longitude": longitude, "altitude": height, "dop": float(sigma)}
-    for image in solution.images:
-        model = models[image.camera_id]
+def _write_metadata(partial: Path, project: Project) -> None:
+    write(partial / "camera_models.json", _json(dict(project.cameras.values())))
+    for image in project.solution.images:
+        name, model = project.cameras[image.camera_id]
         exif = {
             "make": "aeromatch", "model": image.camera_id, "width": image.width_px, "height": image.height_px,
             "projection_type": model["projection_type"], "focal_ratio": model["focal_x"], "orientation": 1,
-            "capture_time": 0.0, "camera": keys[image.camera_id], "skey": "", "gps": gps.get(image.image_id, {}),
+            "capture_time": capture_time(image), "camera": name, "skey": "", "gps": project.gps.get(image.image_id, {}),
         }  # fmt: skip
-        write(partial / "exif" / f"{names[image.image_id]}.exif", _json(exif))
-    means = (
-        [float(np.mean([place[key] for place in gps.values()])) for key in ("latitude", "longitude")]
-        if gps
-        else [0.0] * 2
-    )
-    write(partial / "reference_lla.json", _json({"latitude": means[0], "longitude": means[1], "altitude": 0.0}))
-    return remarks
-
-
-def camera_model(camera: Camera) -> dict[str, Any]:
-    """OpenSfM's `brown` or `fisheye_opencv`: lengths as shares of the longer side, the principal point from the middle
-    of the image."""
-    values, longer = parameters(camera), max(camera.width_px, camera.height_px)
-    middle = camera.width_px / 2.0 - COLMAP_OFFSET_PX, camera.height_px / 2.0 - COLMAP_OFFSET_PX
-    model, terms = ("fisheye_opencv", ("k1", "k2", "k3", "k4")) if is_fisheye(camera) else (
-        "brown", ("k1", "k2", "k3", "p1", "p2"))  # fmt: skip
-    return {
-        "projection_type": model, "width": camera.width_px, "height": camera.height_px,
-        "focal_x": values["fx"] / longer, "focal_y": values["fy"] / longer, "c_x": (values["cx"] - middle[0]) / longer,
-        "c_y": (values["cy"] - middle[1]) / longer, **{name: values[name] for name in terms},
-    }  # fmt: skip
+        write(partial / "exif" / f"{project.names[image.image_id]}.exif", _json(exif))
+    write(partial / "reference_lla.json", _json(lla(project.reference)))
 
 
 def _json(value: Any) -> str:

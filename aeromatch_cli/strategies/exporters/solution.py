@@ -12,7 +12,9 @@ import numpy as np
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.geometry.lenses import Nearest
-from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary
+from aeromatch_cli.strategies.exporters.contents import Colours, ExportContents, ExportSummary
+
+_GREY = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Solution:
         if adjusted is not None:
             aside = unplaced(contents)
             poses = {i: (pose.rotation, pose.center_m) for i, pose in adjusted.poses.items() if i not in aside}
-            return cls(block.images, adjusted.cameras, poses)
+            return cls(block.images, {**block.cameras, **adjusted.cameras}, poses)
         given = {i: (p.world_rotation, p.center_m) for i, p in block.poses.items() if p.world_rotation is not None}
         return cls(block.images, block.cameras, given)
 
@@ -134,6 +136,31 @@ def _joined(
 def keypoints_of(contents: ExportContents) -> dict[str, FloatArray]:
     """image_id -> (K, 2) float64 stored pixels of every image, each read once."""
     return {i.image_id: np.asarray(contents.keypoints_px(i.image_id), np.float64) for i in contents.block.images}
+
+
+def rows_of_images(image_idx: IntArray, count: int) -> list[IntArray]:
+    """The rows of (N,) that are of each of so many images, in order: sorted once, not looked for by every image."""
+    order = np.argsort(image_idx, kind="stable")
+    return np.split(order, np.searchsorted(image_idx[order], np.arange(1, count)))
+
+
+def colours_of(contents: ExportContents, keypoints: Mapping[str, FloatArray]) -> dict[str, Colours]:
+    """image_id -> RGB (K, 3) of the picture at its keypoints, grey where it cannot be seen; every picture is decoded
+    once."""
+    found = {}
+    for image_id, places_px in keypoints.items():
+        seen = contents.colours(image_id)
+        found[image_id] = np.full((len(places_px), 3), _GREY, np.uint8) if seen is None else seen
+    return found
+
+
+def track_colours(found: Matched, colours: Mapping[str, Colours]) -> Colours:
+    """(T, 3) RGB of every track: the mean over the images that see it."""
+    sums = np.zeros((len(found.points_m), 3))
+    rows = rows_of_images(found.image_idx, len(found.image_ids))
+    for image_id, own in zip(found.image_ids, rows, strict=True):
+        sums[found.track[own]] += colours[image_id][found.keypoint[own]]  # a track sees an image once
+    return np.rint(sums / np.maximum(np.diff(found.starts), 1)[:, None]).astype(np.uint8)
 
 
 def summary_of(
