@@ -20,7 +20,7 @@ FOUND_M = TRUE_M + RNG.normal(0.0, 0.05, TRUE_M.shape)
         (TRUE_M * 0.3048, "they are in metres and were taken as feet"),
         (TRUE_M * [1.0, -1.0, 1.0], "their y has the other sign"),
         (TRUE_M / [1.0, 1.0, 0.3048], "their heights are in feet, not in metres"),
-        (TRUE_M + [0.0, 0.0, 47.0], ""),  # another zero of heights
+        (TRUE_M + np.array([0.0, 0.0, 47.0]), ""),  # another zero of heights
         (TRUE_M, ""),
     ],
 )

@@ -517,7 +517,7 @@ def _calibration(evidence: Evidence) -> _Found:
             changes = {name: change for name, change in changes.items() if name not in held}
             if "f" in changes and parameters["f"][1] == 0.0:
                 words = (
-                    f"camera {camera_id} keeps its focal length of {_number(parameters['f'][0])} px: matches would put it "
+                    f"camera {camera_id} keeps its focal length of {_number(parameters['f'][0])} px: matches put it "
                     "where no lens is, though their residuals hardly tell. Moving trees, a rolling shutter or wrong "
                     "distortion do that: a calibration of the camera, or another flying height, helps"
                 )

@@ -55,7 +55,8 @@ _IMPLAUSIBLE_SIGMAS, _TELLING_SHARE = 3.0, 0.1
 # Explanations are tried where positions are off by more than so many times what was stated, and taken where each of
 # their unknowns lowers the sum of squares by so much and is so many times as large as its standard deviation.
 _UNEXPLAINED, _WORTH_SQUARES, _WORTH_SIGMAS = 1.3, 25.0, 5.0
-# None is taken that is so many times as large as what is usual: an antenna of 3 m hides a wrong focal length.
+# None is taken that is so many times as large as what is usual (an antenna of 3 m hides a wrong focal length), and no
+# read-out that runs backwards.
 _BELIEVED_SIGMAS = 5.0
 # Standard deviations of what may explain residuals, before the block is asked: shifts of a flight's positions, metres;
 # their delay, seconds; the lever arm, metres; the read-out of a shutter, seconds.
@@ -242,7 +243,7 @@ def _worth(
     after = solved.state
     values = _chosen((after.lens, after.mount, after.flight), unknowns)
     usual = _chosen((tried.lens_sigmas, tried.mount_sigmas, tried.flight_sigmas), unknowns)
-    if (np.abs(values) > _BELIEVED_SIGMAS * usual).any():
+    if (np.abs(values) > _BELIEVED_SIGMAS * usual).any() or (after.lens[:, READOUT] < 0.0).any():
         return None
     sigmas = _sigmas(covariance(fair, after), unknowns)
     return (gain, tried, after) if (np.abs(values) > _WORTH_SIGMAS * sigmas).any() else None
