@@ -222,7 +222,7 @@ def _frames(evidence: Evidence) -> _Found:
         )
         yield Finding("parts", float(parts), 1.0, "bad", words)
     yield from _placed_parts(evidence)
-    given = int(evidence.adjust.get("positions_given", 0))
+    given = _positions_given(evidence)
     used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
     kept = any(kind == "given" for kind in kinds)
     # Control points that took no part show how the block is to be moved; they do not hold it.
@@ -241,6 +241,11 @@ def _frames(evidence: Evidence) -> _Found:
             "(--poses) do; control points alone show how the block is to be moved"
         )
         yield Finding("ground", None, None, "doubtful", words)
+
+
+def _positions_given(evidence: Evidence) -> int:
+    """Of how many images; the adjustment knows of none that the orientation has left out."""
+    return int(max(one.get("positions_given", 0) for one in (evidence.adjust, evidence.orient)))
 
 
 def _weak_ties(evidence: Evidence) -> _Found:
@@ -295,7 +300,7 @@ def _sizes(parts: Sequence[int]) -> str:
 def _positions(evidence: Evidence) -> _Found:
     found = [group["positions"] for group in evidence.groups if group.get("positions")]
     if not found:
-        if not evidence.adjust.get("positions_given"):
+        if not _positions_given(evidence):
             yield "positions: none are given"
         return
     images = sum(one["images"] for one in found)

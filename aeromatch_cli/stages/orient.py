@@ -154,7 +154,8 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
             solution.facts["remarks"].append(unoriented_remark(evidence))
         if not recipe.replaces:
             solution = judged(from_given(evidence, good, correct=False), solution)
-    facts = {"images_matched": len(evidence.matched), "given_poses_explained": len(good), **solution.facts}
+    counts = {"images_matched": len(evidence.matched), "positions_given": len(block.poses)}
+    facts = {**counts, "given_poses_explained": len(good), **solution.facts}
     facts["further_first_passes"] = tried
     facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
     facts["similar"] = list(first.block.similar)
