@@ -39,6 +39,7 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
+from aeromatch_cli.blocks.left_out import excluded
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Located,
@@ -151,6 +152,7 @@ def block_inputs(
     sigma_position_m: float,
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
+    exclude: str = "",
     drop_ground_shots: bool = False,
     given_heights: GivenHeights = _AS_STATED,
 ) -> BlockInputs:
@@ -159,14 +161,16 @@ def block_inputs(
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
     why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
     "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
-    given_heights: of positions.
+    that a growing block does not move. exclude: as of `left_out.excluded`. drop_ground_shots: leave out pictures that
+    were taken on the ground. given_heights: of positions.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
     warnings, failures = _report_scan(passed_over)
-    failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
-    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
+    out, remarks = excluded(exclude, list(headers))
+    warnings += remarks
+    failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
+    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
     shots = ground_shots(facts)
     warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:

@@ -110,6 +110,11 @@ class BlockSettings(_Section):
         description="Folder of masks in COLMAP's naming (a/1.jpg.png masks a/1.jpg; 0 = ignore), or one mask for all "
         "images.",
     )
+    exclude: str = Field(
+        "",
+        description="Images that are left out: names, patterns such as takeoff/*, or files with one of these in each "
+        "line; separated by commas.",
+    )
     gcp: str = Field(
         "",
         description="Ground control points: ODM's gcp_list.txt, Pix4D's or Metashape's coordinates (CSV), or "

@@ -205,6 +205,7 @@ def _read_inputs(
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
+        exclude=given.exclude,
         drop_ground_shots=given.ground_shots == "drop",
         given_heights=GivenHeights(given.heights, given.height_shift_m),
     )
