@@ -196,7 +196,7 @@ def dem_context(terrain: Terrain, shape: np.ndarray, sigma_m: float) -> Any:
     }
     return SimpleNamespace(
         block=SimpleNamespace(ground=dem, ground_source="DEM dem.tif", poses=poses),
-        settings=SimpleNamespace(orient=None),
+        settings=SimpleNamespace(orient=None, block=SimpleNamespace(sigma_position_m=5.0)),
     )
 
 
@@ -215,6 +215,7 @@ def test_a_dem_with_another_zero_is_used_shifted_and_the_offset_named(off_m: flo
     assert f"lies {abs(off_m):.1f} m {'below' if off_m < 0 else 'above'} the terrain" in remark
     assert f"--set block.height_shift_m={off_m:.2f}" in remark
     assert "most likely one counts from the ellipsoid (GNSS, RTK), the other from the geoid" in remark
+    assert ("unless trees or roofs cover the ground" in remark) == (off_m == -8.0)
 
 
 def test_a_dem_that_agrees_or_has_another_shape_is_not_shifted() -> None:

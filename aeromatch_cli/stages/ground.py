@@ -21,11 +21,13 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.orienters import GivenPoses
 
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
-# that differs by more than so many standard deviations of a position's height, whichever is more.
-_SAID_SHARE, _SAID_SIGMAS = 0.05, 3.0
-# A DEM has the shape of the terrain, and its heights count from another zero, where it differs by nearly the same
-# everywhere: this share of the flying height, median deviation from the median.
-_ALIKE_SHARE = 0.05
+# that differs by more than so many standard deviations of a position, whichever is more.
+_SAID_SHARE, _SAID_SIGMAS = 0.1, 3.0
+# A DEM is more exact than a height that somebody states. It has the shape of the terrain, and its heights count from
+# another zero, where it differs by nearly the same everywhere: second share, median deviation from the median.
+_DEM_SHARE, _ALIKE_SHARE = 0.05, 0.03
+# No trees or houses are higher: a DEM of bare ground below them lies no farther below what the pictures show.
+_TALLEST_M = 40.0
 # No ground lies farther above or below the zero of its heights.
 _FARTHEST_M = 100_000.0
 # A stated ground that differs by this share is wrong: views and footprints of it would miss each other.
@@ -85,8 +87,10 @@ def judged_ground(
         return shown, words, []
     centers_m = _centers_m(context.block)
     off_m, spread_m, flying_m = heights_above_m(ground, shown, centers_m)
-    sigmas_m = [pose.axis_sigmas_m[2] for pose in context.block.poses.values()]
-    if abs(off_m) <= max(_SAID_SHARE * flying_m, _SAID_SIGMAS * float(np.median(sigmas_m))):
+    share, sigma_m = _SAID_SHARE, context.settings.block.sigma_position_m
+    if isinstance(ground, DemGround):
+        share, sigma_m = _DEM_SHARE, float(np.median([p.axis_sigmas_m[2] for p in context.block.poses.values()]))
+    if abs(off_m) <= max(share * flying_m, _SAID_SIGMAS * sigma_m):
         return ground, source, []
     remark = (
         f"the ground ({source}) lies {abs(off_m):.1f} m {'above' if off_m > 0 else 'below'} the terrain that the "
@@ -94,9 +98,10 @@ def judged_ground(
     )
     if isinstance(ground, DemGround) and spread_m <= _ALIKE_SHARE * flying_m:
         shift = f"{'lowered' if off_m > 0 else 'raised'} by {abs(off_m):.1f} m"
+        covered = ", unless trees or roofs cover the ground all over" if -_TALLEST_M < off_m < 0.0 else ""
         words = (
-            f"{remark}, and everywhere about as much (to {spread_m:.1f} m): {zeros_words(off_m)}. The DEM is used, "
-            f"{shift}; {height_remedy(off_m, 'the DEM')}"
+            f"{remark}, and everywhere about as much (to {spread_m:.1f} m): {zeros_words(off_m)}{covered}. The DEM is "
+            f"used, {shift}; {height_remedy(off_m, 'the DEM')}"
         )
         return ground.shifted(-off_m), f"{source}, {shift}", [words]
     remark += ": do heights and ground count from the same zero (ellipsoid, sea level, take-off point)?"
