@@ -257,7 +257,7 @@ def test_the_offset_of_positions_to_control_is_told() -> None:
     ):  # fmt: skip
         assert shift_to_control_m(other) is None
     assert height_remarks([group((0.0, 0.0, 45.31))]) == [
-        "heights of the given positions lie 45.31 m above those of the control points, everywhere by about as much: "
+        "heights of the given positions lie 45.3 m above those of the control points, everywhere by about as much: "
         "most likely one counts from the ellipsoid (GNSS, RTK), the other from the geoid (sea level); the block has "
         "the heights of the control points"
     ]

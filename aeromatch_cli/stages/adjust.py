@@ -228,7 +228,7 @@ def height_remarks(figures: Sequence[Mapping[str, Any]]) -> list[str]:
     """What is said of heights of positions that lie above or below those of the control points, all by as much."""
     shifts_m = [up_m for group in figures if (up_m := shift_to_control_m(group)) is not None]
     return [
-        f"heights of the given positions lie {abs(up_m):.2f} m {'above' if up_m > 0 else 'below'} those of the control "
+        f"heights of the given positions lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} those of the control "
         f"points, everywhere by about as much: {zeros_words(up_m)}; the block has the heights of the control points"
         for up_m in shifts_m
     ]
