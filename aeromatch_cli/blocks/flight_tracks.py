@@ -15,7 +15,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
 
-_SPAN = re.compile(r"(\d+):(\d+):(\d+)[,.](\d+)\s*-->")
+_SPAN = re.compile(r"(\d{1,4}):(\d{1,2}):(\d{1,2})[,.](\d{1,9})\s*-->")
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 # [latitude: 47.1] [longitude: 8.5] [rel_alt: 20.1 abs_alt: 450.2]; older firmware has longtitude, and altitude.
 _LATITUDE = re.compile(rf"\[\s*latitude\s*:\s*{_NUMBER}\s*\]", re.IGNORECASE)
@@ -85,8 +85,14 @@ def _place(block: str) -> tuple[float, float, float] | None:
         place = float(old[2]), float(old[1])
     else:
         return None
-    known = abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0 and any(place)
-    return (*place, float(height[1] or height[2]) if height else math.nan) if known else None
+    return _known(*place, float(height[1] or height[2]) if height else math.nan)
+
+
+def _known(latitude: float, longitude: float, height_m: float) -> tuple[float, float, float] | None:
+    """A place; None where there was no fix (0, 0), or it is none. A height that is none is NaN."""
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and (latitude or longitude)):
+        return None
+    return latitude, longitude, height_m if math.isfinite(height_m) else math.nan
 
 
 def _gpx(path: Path, raw: bytes) -> list[tuple[float, ...]]:
@@ -102,10 +108,9 @@ def _gpx(path: Path, raw: bytes) -> list[tuple[float, ...]]:
                 continue
             inside = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
             if inside.get("time"):
-                height = float(inside.get("ele") or "nan")
-                rows.append(
-                    (utc_seconds(inside["time"]), float(point.attrib["lat"]), float(point.attrib["lon"]), height)
-                )
+                where = float(point.attrib["lat"]), float(point.attrib["lon"]), float(inside.get("ele") or "nan")
+                if (place := _known(*where)) is not None:
+                    rows.append((utc_seconds(inside["time"]), *place))
     except (ParseError, DefusedXmlException, KeyError, ValueError) as error:
         raise ConfigError(f"{path} is no GPX track ({error}): export it anew") from error
     return rows
