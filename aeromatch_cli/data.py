@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,6 +193,15 @@ class Raster(Protocol):
     def window(self, left: int, top: int, width: int, height: int) -> tuple[FloatArray, BoolArray | None]:
         """Stored pixels from (left, top), which must lie inside."""
         ...
+
+
+class PictureQuality(NamedTuple):
+    """How sharp and well exposed a picture is. blur: 0 (sharp) to 1, NaN where nothing is seen. black, white: shares of
+    the pixels that show nothing."""
+
+    blur: float
+    black: float
+    white: float
 
 
 @dataclass(frozen=True, eq=False)

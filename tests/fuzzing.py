@@ -29,6 +29,8 @@ from make_pose_files import LOCAL, WORLD, patb, write_micmac
 from aeromatch_cli.blocks.camera_files import read_camera_file
 from aeromatch_cli.blocks.control import read_control
 from aeromatch_cli.blocks.exif import read_exif
+from aeromatch_cli.blocks.flight_tracks import read_track
+from aeromatch_cli.blocks.left_out import excluded
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.config import load
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, Image, Matches, Pair, Pose, Verdict
@@ -200,6 +202,18 @@ def readers() -> dict[str, Reader]:
                 }
             ),
         ),
+        "tracks": Reader(
+            read_track,
+            _texts(
+                {
+                    "a.srt": "1\n00:00:00,000 --> 00:00:01,000\n[latitude: 47.1] [longitude: 8.5] [rel_alt: 20.1 "
+                    "abs_alt: 450.2]\n\n2\n00:00:01,000 --> 00:00:02,000\nGPS(8.5,47.1,16) BAROMETER:1.9\n",
+                    "a.gpx": "<gpx><trk><trkseg><trkpt lat='47.0' lon='8.5'><ele>450.0</ele>"
+                    "<time>2026-05-01T10:00:00Z</time></trkpt></trkseg></trk></gpx>",
+                }
+            ),
+        ),
+        "exclude": Reader(lambda path: excluded(str(path), ["a.jpg", "b/c.jpg"]), {"a.txt": b"a.jpg\nb/*\n# c\n"}),
         "settings": Reader(lambda path: load(str(path)), _texts({"a.yaml": settings})),
         "exif": Reader(read_exif, pictures),
         "pixels": Reader(lambda path: read_pixels(path, colour=True), pictures),

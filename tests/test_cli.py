@@ -23,8 +23,8 @@ SETTINGS = UNORIENTED
 
 PAIRS = IMAGES * (IMAGES - 1) // 2
 OPTIONS = (
-    "--images", "--poses", "--cameras", "--crs", "--ground", "--masks", "--workspace", "--set", "--max-size", "--jobs",
-    "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json", "--quiet",
+    "--images", "--poses", "--cameras", "--crs", "--ground", "--masks", "--exclude", "--workspace", "--set",
+    "--max-size", "--jobs", "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json", "--quiet",
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -223,21 +224,41 @@ def test_a_malformed_list_is_named(tmp_path: Path, text: str, message: str) -> N
         read_control(str(path), IMAGES, "EPSG:32633", ORIGIN_M)
 
 
-@pytest.mark.slow
-def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
+def write_gcp_list(path: Path, rendered: Path, lower_m: float = 0.0) -> Path:
+    """Points of a rendered block, measured without error, so many metres lower than they are."""
     truth = load_truth(rendered)
     names = sorted(truth.poses)
     rng = np.random.default_rng(3)
     lines = ["local"]
     for number, pixel in enumerate(rng.uniform([60, 60], [260, 180], (12, 2))):
-        place = truth.surface_points(names[0], pixel[None])[0]
+        place = truth.surface_points(names[0], pixel[None])[0] - [0.0, 0.0, lower_m]
         for name in names:
             found, hidden = truth.transfer(names[0], pixel[None], name)
             if not hidden[0]:
                 x, y = found[0] + 0.5
                 lines.append(" ".join(map(str, (*place, x, y, name, f"p{number}"))))
-    path = done_site.root / "gcp_list.txt"
     path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.slow
+def test_control_above_the_geoid_gives_the_block_its_heights(done_site: Site, rendered: Path) -> None:
+    path = write_gcp_list(done_site.root / "gcp_list.txt", rendered, lower_m=45.0)
+    outcome = done_site("run", "--gcp", path, *PAGE)
+    assert outcome.code == 0
+    facts = outcome.facts["stages"]["adjust"]["facts"]
+    inside = facts["groups"][0]["control"]
+    assert inside["held_out_rms_m"][2] < 1.5 < 40.0 < inside["without_rms_m"][2]
+    (remark,) = [line for line in facts["remarks"] if "the block has the heights of the control points" in line]
+    assert 35.0 < float(re.search(r"lie ([\d.]+) m above", remark)[1]) < 55.0
+    assert "shift of a flight" not in [
+        one["what"] for one in outcome.facts["quality"]["findings"] if one["level"] != "good"
+    ]
+
+
+@pytest.mark.slow
+def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
+    path = write_gcp_list(done_site.root / "gcp_list.txt", rendered)
     outcome = done_site("run", "--gcp", path, *PAGE)
     assert outcome.code == 0
     control = outcome.facts["stages"]["adjust"]["facts"]["control"]

@@ -282,4 +282,4 @@ def test_columns_in_feet_below_a_crs_in_feet_are_converted_once(tmp_path: Path) 
 def test_the_zero_of_heights_is_repeated(tmp_path: Path, words: str) -> None:
     found = read_pose_file(written(tmp_path, f"# {words}\nimage,x,y,z\na.jpg,1,2,3\n"))
     assert found.rows[0].position == (1.0, 2.0, 3.0)
-    assert f"'# {words}': heights are not converted; ground and control points must count" in found.warnings[0]
+    assert f"'# {words}': ground and control points must count" in found.warnings[0]

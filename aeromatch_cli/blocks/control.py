@@ -15,7 +15,17 @@ import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
-from aeromatch_cli.blocks.crs import LOCAL, across_unit_m, height_unit_m, is_local, local_unit_m, parsed_crs
+from aeromatch_cli.blocks.crs import (
+    LOCAL,
+    across_unit_m,
+    converted_heights,
+    height_unit_m,
+    heights_of,
+    heights_words,
+    is_local,
+    local_unit_m,
+    parsed_crs,
+)
 from aeromatch_cli.blocks.image_names import matched_names
 from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
@@ -42,21 +52,23 @@ def read_control(
     marks: str = "",
     poses: Mapping[str, Pose] | None = None,
     use: ControlUse = "adjust",
+    heights: str = "",
 ) -> tuple[tuple[ControlPoint, ...], list[str]]:
     """Points in the world frame that images of the block show, and remarks; nothing of no file ("").
 
     crs, origin_m: of the block; a local block takes the coordinates as they are. marks: file of the image measurements
     where they stand apart, "" to look for it beside. poses: of the block, to tell exchanged coordinates and degrees by.
-    use: "check": all are check points. Raises ConfigError with file and line where a file is malformed, or its CRS
-    cannot be brought to the block's.
+    use: "check": all are check points. heights: what those of the world count from, as of `crs.heights_of`. Raises
+    ConfigError with file and line where a file is malformed, or its CRS cannot be brought to the block's.
     """
     if not name:
         return (), []
     path = Path(name)
     survey = read_survey(path, Path(marks) if marks else None)
     places_m, remarks = _places(survey, path, crs, np.array(origin_m), poses or {})
+    places_m, converted = _in_world_heights(survey, path, crs, np.array(origin_m), places_m, heights)
     measured, said = _measured(survey.marks, survey.measured_in, images)
-    remarks = [*survey.remarks, *remarks, *said]
+    remarks = [*survey.remarks, *remarks, *converted, *said]
     points, unseen = [], []
     for point, place_m in zip(survey.points, places_m, strict=True):
         seen = measured.pop(point.name, [])
@@ -142,6 +154,23 @@ def _places(
                     f"in metres: name {_WGS84} there"
                 )
     return places_m, remarks
+
+
+def _in_world_heights(
+    survey: Survey, path: Path, crs: str, origin_m: FloatArray, places_m: FloatArray, heights: str
+) -> tuple[FloatArray, list[str]]:
+    """Positions (N, 3) in the world with its heights, where both sides state theirs, and a remark."""
+    own = heights_of(survey.crs) if survey.crs and crs != LOCAL else ""
+    if not (own and heights) or own == heights:
+        return places_m, []
+    heights_m, why_not = converted_heights(crs, own, heights, places_m + origin_m)
+    if why_not:
+        return places_m, [f"{path.name}: {why_not}"]
+    by_m = float(np.median(heights_m - origin_m[2] - places_m[:, 2]))
+    words = f"from {heights_words(own)} to {heights_words(heights)}"
+    return np.column_stack([places_m[:, :2], heights_m - origin_m[2]]), [
+        f"{path.name}: heights of control points are transformed {words}: {by_m:+.2f} m (median)"
+    ]
 
 
 def _as_degrees(positions: FloatArray) -> bool:

@@ -1,14 +1,16 @@
 """The world frame: a projected CRS in metres minus a rounded origin, or a local frame.
 
-Heights are never transformed but for their unit: z is the altitude as given, whatever its vertical datum, so that
-ground heights of the same source fit. Meridian convergence is the grid azimuth's defect: grid azimuth = true azimuth -
-convergence. It is positive east of the central meridian in the northern hemisphere, where true north lies to the left
-(west) of grid north. Worked case: at 28 N, 1 degree east of UTM 17's meridian it is +sin(28) = +0.47 degrees.
+Heights are transformed only where two inputs state what theirs count from (the ellipsoid, or a vertical CRS), and PROJ
+has the geoid that lies between; else z is the altitude as given, whatever it counts from. Meridian convergence is the
+grid azimuth's defect: grid azimuth = true azimuth - convergence. It is positive east of the central meridian in the
+northern hemisphere, where true north lies to the left (west) of grid north. Worked case: at 28 N, 1 degree east of UTM
+17's meridian it is +sin(28) = +0.47 degrees.
 """
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +28,8 @@ _MARGIN_DEG = 3.0
 # Eastings of some CRSs and many lists begin with the number of the zone, in millions.
 _PREFIX_M = 1_000_000.0
 _SAME_M = 0.001
+# What heights count from where no vertical CRS does.
+ELLIPSOID = "ellipsoid"
 _LOCAL_WKT = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
 _UTM = re.compile(r"WGS\s*84[\s/]+UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IGNORECASE)
 
@@ -116,6 +120,71 @@ def height_unit_m(where: str, crs: Any) -> float:
 def across_unit_m(crs: Any) -> float:
     """Metres of one unit of the horizontal axes, 1 where these are degrees."""
     return float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected and crs.axis_info else 1.0
+
+
+def heights_of(crs: Any) -> str:
+    """What the heights of a CRS count from: code, else WKT, of its vertical CRS, ELLIPSOID, or "" for unknown.
+
+    crs: of pyproj, or a text as for `parsed_crs`; a text that is none says nothing.
+    """
+    from pyproj.exceptions import CRSError
+
+    if isinstance(crs, str):
+        try:
+            crs = parsed_crs(crs)
+        except CRSError:
+            return ""
+    for part in crs.sub_crs_list if crs.is_compound else (crs,):
+        if part.is_vertical:
+            authority = part.to_authority()
+            return ":".join(authority) if authority else str(part.to_wkt())
+        if len(part.axis_info) == 3 and (part.is_geographic or part.is_projected):
+            return ELLIPSOID
+    return ""
+
+
+def checked_heights(text: str) -> str:
+    """What heights count from, in canonical spelling: ELLIPSOID, or the code of a vertical CRS, also where it is part
+    of a compound one. Raises ConfigError."""
+    found = ELLIPSOID if text.strip().lower() == ELLIPSOID else heights_of(text.strip())
+    if not found:
+        raise ConfigError(f"heights {text!r} are unknown: give ellipsoid, or a vertical CRS such as EPSG:5773 (EGM96)")
+    return found
+
+
+def heights_words(heights: str) -> str:
+    """What heights count from, for people."""
+    return "heights above the ellipsoid" if heights == ELLIPSOID else f"{parsed_crs(heights).name} ({heights[:20]})"
+
+
+def converted_heights(crs: str, source: str, target: str, places_m: FloatArray) -> tuple[FloatArray, str]:
+    """Heights (N,) of places (N, 3) whose heights count from `source`, as they count from `target`, both in metres; and
+    why they stay as they are where PROJ cannot transform them, "" where it can. crs: of x and y, projected."""
+    from pyproj import CRS
+    from pyproj.crs import CompoundCRS
+    from pyproj.transformer import TransformerGroup
+
+    heights_m = np.asarray(places_m[:, 2], dtype=np.float64)
+    if source == target or not len(heights_m):
+        return heights_m, ""
+    flat = _crs(crs).to_2d()
+    own, other = (
+        flat.to_3d() if one == ELLIPSOID else CompoundCRS(flat.name, [flat, CRS(one)]) for one in (source, target)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the best operation is not available is said below
+        group = TransformerGroup(own, other, always_xy=True, allow_ballpark=False)
+    units_m = [height_unit_m(side.name, side) for side in (own, other)]
+    for one in group.transformers:  # the best first
+        _, _, found = one.transform(places_m[:, 0], places_m[:, 1], heights_m / units_m[0])
+        found_m = np.asarray(found, dtype=np.float64) * units_m[1]
+        if np.isfinite(found_m).all():
+            return found_m, ""
+    grids = [grid.short_name for one in group.unavailable_operations[:1] for grid in one.grids if not grid.available]
+    remedy = f"; PROJ lacks the grid {grids[0]}: `pyproj sync --file {grids[0]}` fetches it" if grids else ""
+    return heights_m, (
+        f"{heights_words(source)} cannot be brought to {heights_words(target)} and stay as they are{remedy}"
+    )
 
 
 def metric_crs(crs: Any) -> str:

@@ -5,12 +5,13 @@ All heights of a ground are world heights: those of the block's CRS minus the wo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.crs import LOCAL, converted_heights, heights_of, heights_words
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import check_given
@@ -26,6 +27,8 @@ _MARGIN_M = (100.0, 20_000.0)
 # other heights are higher than a cliff.
 _LOWEST_M, _HIGHEST_M, _ABOVE_ZERO_M = -500.0, 9000.0, 100.0
 _CODES_NAMED = 3
+# The geoid is asked for at no more places a side.
+_SHIFT_PLACES = 33
 # So many cells more than asked for, half of them for interpolation.
 _BESIDE = 8
 
@@ -71,6 +74,10 @@ class DemGround:
         bottom = self.heights_m[y1, x0] * (1 - fx) + self.heights_m[y1, x1] * fx
         return np.where(outside, self.outside_m, top * (1 - fy) + bottom * fy)
 
+    def shifted(self, up_m: float) -> DemGround:
+        """The same ground, so many metres higher."""
+        return replace(self, heights_m=self.heights_m + up_m, outside_m=self.outside_m + up_m)
+
     def distance_m(self, xy_m: FloatArray) -> FloatArray:
         """How far (N,) world points (N, 2) lie from the raster, 0 inside."""
         rows, columns = self.heights_m.shape
@@ -94,15 +101,16 @@ class SeveralGrounds:
 
 
 def open_dem(
-    path: Path, crs: str, origin_m: tuple[float, float, float], positions_m: FloatArray
+    path: Path, crs: str, origin_m: tuple[float, float, float], positions_m: FloatArray, zero: str = ""
 ) -> tuple[DemGround, tuple[str, ...]]:
     """The DEM under a block, resampled bilinearly into the block's CRS, and what the user should know about it.
 
     path: any single-band raster of heights in metres that GDAL reads (the first band counts). crs: authority code of
     the world frame or "local"; origin_m: the world origin in it; positions_m: (N, 3) projection centres in the world
     frame. Only the block's extent, 5 flying heights around the cameras, is read. Cells without data get the median.
-    Raises ConfigError where the file cannot be read, its CRS cannot be brought to the block's, or it does not cover
-    the block.
+    zero: what heights of the world count from, as of `crs.heights_of`: those of a DEM that states another zero are
+    brought to it. Raises ConfigError where the file cannot be read, its CRS cannot be brought to the block's, or it
+    does not cover the block.
     """
     import rasterio
     from rasterio.errors import RasterioError
@@ -145,6 +153,9 @@ def open_dem(
             f"the DEM {path} has no data in {missing} % of the block's surroundings: {median:.1f} m there",
         )
         heights = np.where(known, heights, median)
+    shifts_m, said = _shifts_m(source_crs, crs, zero, transform, heights.shape, median, path)
+    heights, median = heights + shifts_m, median + float(np.median(shifts_m))
+    notes = (*notes, *said)
     ground = DemGround(
         heights - origin_m[2],
         transform.c + 0.5 * transform.a - origin_m[0],
@@ -153,6 +164,33 @@ def open_dem(
         median - origin_m[2],
     )
     return ground, notes
+
+
+def _shifts_m(
+    source_crs: Any, crs: str, zero: str, transform: Any, shape: tuple[int, int], height_m: float, path: Path
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """What brings heights (H, W) of a DEM in its own CRS to those of the world, and what was done; zeros where either
+    side does not state its heights. height_m: of the DEM, about. The geoid is smooth: a few places tell it."""
+    own = heights_of(source_crs.to_wkt()) if zero and crs != LOCAL else ""
+    if not own or own == zero:
+        return np.zeros(shape), ()
+    rows, columns = (np.linspace(0.5, count - 0.5, min(count, _SHIFT_PLACES)) for count in shape)
+    x, y = np.meshgrid(transform.c + transform.a * columns, transform.f + transform.e * rows)
+    places_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height_m)])
+    heights_m, why_not = converted_heights(crs, own, zero, places_m)
+    if why_not:
+        return np.zeros(shape), (f"the DEM {path}: {why_not}",)
+    coarse = DemGround(
+        (heights_m - height_m).reshape(x.shape),
+        float(columns[0]),
+        -float(rows[0]),
+        tuple(float(v[1] - v[0]) if len(v) > 1 else 1.0 for v in (columns, rows)),  # type: ignore[arg-type]
+        0.0,
+    )
+    cells = np.stack(np.meshgrid(np.arange(shape[1]) + 0.5, -(np.arange(shape[0]) + 0.5)), axis=-1)
+    shifts_m = coarse.height_m(cells.reshape(-1, 2)).reshape(shape)
+    words = f"from {heights_words(own)} to {heights_words(zero)}: {float(np.median(shifts_m)):+.2f} m (median)"
+    return shifts_m, (f"the heights of the DEM {path} are transformed {words}",)
 
 
 def _source_crs(dataset: DatasetReader, path: Path, crs: str) -> tuple[Any, tuple[str, ...]]:

@@ -63,7 +63,7 @@ def unread_kind(name: str) -> str:
     if suffix in _OTHER_PICTURES:
         return f"{suffix[1:].upper()} is not read: convert to JPEG or TIFF in full size, with the metadata"
     if suffix in _VIDEOS:
-        return "videos are not read: extract pictures, and give their positions with --poses"
+        return "videos are not read: `aeromatch frames VIDEO --out DIR` writes pictures of one, and their positions"
     return ""
 
 

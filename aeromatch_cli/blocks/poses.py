@@ -40,11 +40,13 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
+from aeromatch_cli.blocks.crs import ELLIPSOID
 from aeromatch_cli.blocks.fields import with_name, words_of
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,
     factor,
+    heights_named,
     is_relative,
     kind_of,
     metres_of,
@@ -173,6 +175,7 @@ class PoseRow:
 class PoseList:
     """A pose list as read. warnings: columns that were ignored and lines without usable coordinates. format: what it
     was recognised as, in words. crs: of grid positions, where the file states it. cameras: by the names that rows have.
+    heights: what they count from, as of `crs.heights_of`, where the file states it.
     """
 
     rows: tuple[PoseRow, ...]
@@ -181,6 +184,7 @@ class PoseList:
     format: str = "list with named columns"
     crs: str | None = None
     cameras: Mapping[str, Camera] = field(default_factory=dict)
+    heights: str = ""
 
 
 @dataclass(frozen=True)
@@ -232,8 +236,8 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
     datum = stated_units(line for _, line in lines).get("datum")
     if datum:
         ignored.append(
-            f"{path.name}: {datum!r}: heights are not converted; ground and control points must count from the same "
-            "zero"
+            f"{path.name}: {datum!r}: ground and control points must count from the same zero, or state their own "
+            "(EPSG:32633+5773)"
         )
     if layout.height:
         own = _POSITIONS[layout.position_kind][2]
@@ -244,7 +248,9 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
             f"{path}, line {max(systems.values())}: the list names {len(systems)} coordinate systems: one is needed"
         )
     crs = next(iter(systems), None) or stated_crs(text for _, text in lines)
-    return PoseList(tuple(rows), layout.position_kind, (*ignored, *exchanged, *warnings), crs=crs)
+    remarks = (*ignored, *exchanged, *warnings)
+    heights = ELLIPSOID if layout.height.startswith(ELLIPSOID) else heights_named(datum or "")
+    return PoseList(tuple(rows), layout.position_kind, remarks, crs=crs, heights=heights)
 
 
 def stated_crs(lines: Iterable[str]) -> str | None:

@@ -24,11 +24,22 @@ from aeromatch_cli.blocks.cameras import (
     contradicting_exif,
     listed,
 )
-from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
+from aeromatch_cli.blocks.crs import (
+    AUTO,
+    LOCAL,
+    WorldFrame,
+    checked_crs,
+    checked_heights,
+    converted_heights,
+    heights_of,
+    heights_words,
+    outside_area,
+)
 from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.blocks.exif_and_xmp import settled
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
+from aeromatch_cli.blocks.left_out import excluded
 from aeromatch_cli.blocks.observations import (
     AngleConvention,
     Located,
@@ -67,7 +78,7 @@ class BlockInputs:
     ground_is_stated: the user's camera file says so, rather than a barometer. focal_sigmas: camera id -> standard
     deviation of its focal length, as a share of it. warnings: for a person, in order of reading.
     recognised: what the pose file was read as, and how many images it has, "" without one. flights, velocities: as in
-    `sorties`.
+    `sorties`. heights: what those of the world count from, as of `crs.heights_of`, "" where nothing states it.
     """
 
     images: tuple[Image, ...]
@@ -86,6 +97,17 @@ class BlockInputs:
     recognised: str = ""
     flights: Mapping[str, str] = field(default_factory=dict)
     velocities: Mapping[str, FloatArray] = field(default_factory=dict)
+    heights: str = ""
+
+
+class GivenHeights(NamedTuple):
+    """What is said of heights of positions. zero: "auto", or as of `crs.checked_heights`; shift_m: is added to them."""
+
+    zero: str = AUTO
+    shift_m: float = 0.0
+
+
+_AS_STATED = GivenHeights()
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +152,25 @@ def block_inputs(
     sigma_position_m: float,
     sigma_angle_deg: float,
     known_frame: WorldFrame | None = None,
+    exclude: str = "",
     drop_ground_shots: bool = False,
+    given_heights: GivenHeights = _AS_STATED,
 ) -> BlockInputs:
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
     why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
     "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
+    that a growing block does not move. exclude: as of `left_out.excluded`. drop_ground_shots: leave out pictures that
+    were taken on the ground. given_heights: of positions.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
     warnings, failures = _report_scan(passed_over)
-    failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
-    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
+    out, remarks = excluded(exclude, list(headers))
+    warnings += remarks
+    failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
+    facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
     shots = ground_shots(facts)
     warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:
@@ -172,6 +199,8 @@ def block_inputs(
     observations, remarks = _agreeing(lists, observations, facts, stated_crs if crs == AUTO and stated_crs else crs)
     warnings += remarks
     located = oriented(observations, crs, stated_crs, known_frame, sigma_position_m, sigma_angle_deg)
+    located, heights, remarks = _in_world_heights(located, lists, crs, given_heights)
+    warnings += remarks
     frame, named_poses, angles = located.frame, located.poses, located.angles
     warnings += [f"{_count(items, facts)} {what}: treated as unposed" for what, items in located.unusable.items()]
     warnings += _level_flight(located, facts)
@@ -200,6 +229,7 @@ def block_inputs(
         recognised=_recognised(lists, rows, headers, assignment.by_pose_file),
         flights=flight_of,
         velocities=velocities(captures, flight_of),
+        heights=heights,
     )
 
 
@@ -374,6 +404,48 @@ def _with_exif_heights(
 def _all_level(located: Located) -> bool:
     """Whether heights count from the flight: a ground that counts from elsewhere says nothing there."""
     return bool(located.level) and len(located.level) == len(located.poses)
+
+
+def _in_world_heights(
+    located: Located, lists: GivenLists, crs: str, given: GivenHeights
+) -> tuple[Located, str, list[str]]:
+    """Positions whose heights count from where the CRS says, what that is, "" for unknown, and remarks.
+
+    crs: as the user gave it: of it are positions in a grid of which nothing else is stated, heights included.
+    """
+    wanted = heights_of(crs) if crs.strip().lower() not in ("", AUTO, LOCAL) else ""
+    stated = lists.pose_list.heights if lists.pose_list is not None else ""
+    if not stated and lists.pose_list is not None and lists.pose_list.position_kind == "grid":
+        stated = wanted
+    own = checked_heights(given.zero) if given.zero.strip().lower() != AUTO else stated
+    if _all_level(located) or not located.poses or located.frame.crs == LOCAL:
+        return located, "", []
+    origin_m = np.array(located.frame.origin_m)
+    places_m = np.array([pose.center_m for pose in located.poses.values()]) + origin_m
+    heights_m, remarks = places_m[:, 2], list[str]()
+    if wanted and own and own != wanted:
+        heights_m, why_not = converted_heights(located.frame.crs, own, wanted, places_m)
+        if why_not:
+            remarks.append(f"positions: {why_not}; --set block.height_shift_m=METRES shifts them by a known height")
+        else:
+            by_m = float(np.median(heights_m - places_m[:, 2]))
+            words = f"from {heights_words(own)} to {heights_words(wanted)}"
+            remarks.append(f"heights of positions are transformed {words}: {by_m:+.2f} m (median)")
+            own = wanted
+    elif wanted and not own:
+        remarks.append(
+            f"--crs {crs} names {heights_words(wanted)}, and nothing states what heights of positions count from: they "
+            "stay as they are; --set block.heights=ellipsoid has them transformed"
+        )
+    if given.shift_m:
+        heights_m = heights_m + given.shift_m
+        remarks.append(f"heights of positions are shifted by {given.shift_m:+g} m, as block.height_shift_m asks")
+        own = wanted
+    poses = {
+        name: replace(pose, center_m=np.array([*pose.center_m[:2], height_m - origin_m[2]]))
+        for (name, pose), height_m in zip(located.poses.items(), heights_m, strict=True)
+    }
+    return located._replace(poses=poses), own, remarks
 
 
 def _foreign_crs(located: Located) -> list[str]:

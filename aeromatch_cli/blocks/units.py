@@ -44,6 +44,13 @@ _DATUMS = re.compile(
     r"(above)?(wgs84)?(the)?(msl|amsl|asl|sealevel|meansealevel|hae|ellipsoid(al)?(height)?|orthometric(height)?"
     r"|geoid(al)?(height)?|egm(96|08|2008|84)|navd88|ngvd29|evrf\d*|dhhn\d*|odn)(height|datum)?"
 )
+# Of these the zeros that are known exactly: vertical CRSs, and the ellipsoid.
+_ZEROS: Mapping[str, str] = {
+    **dict.fromkeys(("hae", "ellipsoid", "ellipsoidal"), "ellipsoid"),
+    **{"egm84": "EPSG:5798", "egm96": "EPSG:5773", "egm08": "EPSG:3855", "egm2008": "EPSG:3855"},
+    **{"navd88": "EPSG:5703", "ngvd29": "EPSG:7968", "evrf2000": "EPSG:5730", "evrf2007": "EPSG:5621"},
+    **{"evrf2019": "EPSG:9389", "dhhn92": "EPSG:5783", "dhhn2016": "EPSG:7837", "odn": "EPSG:5701"},
+}
 _RELATIVE = re.compile(r"(above|over)?(the)?(agl|ground|groundlevel|relative|rel|ato|takeoff|takeoffpoint|home)")
 _BRACKET = re.compile(r"(.*\S)[\s_]*[\[(]([^\[\]()]*)[\])]\s*")
 _SUBJECTS: Mapping[str, tuple[str, ...]] = {
@@ -142,6 +149,13 @@ def stated_units(lines: Iterable[str], mark: str = "#") -> dict[str, str]:
 def _names_datum(words: list[str]) -> bool:
     spans = (words[first : first + count] for first in range(len(words)) for count in (1, 2, 3))
     return any(_DATUMS.fullmatch(_bare("".join(span))) for span in spans)
+
+
+def heights_named(comment: str) -> str:
+    """What heights count from by a comment of theirs, as of `crs.heights_of`; "" where it names no zero, or several."""
+    words = re.split(r"[\s,;:=()\[\]/#]+", comment.lower())
+    found = {_ZEROS[word] for word in map(_bare, words) if word in _ZEROS}
+    return found.pop() if len(found) == 1 else ""
 
 
 def _unit_of(words: list[str]) -> tuple[str, bool]:

@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from aeromatch_cli import __version__
-from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, synth
+from aeromatch_cli.cli.commands import EXAMPLES, WEIGHTS, evaluate, frames, synth
 from aeromatch_cli.cli.look_commands import EXAMPLES as LOOK_EXAMPLES
 from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.options import GroupedHelp
@@ -100,6 +100,7 @@ for _name, _look in LOOK.items():
     app.command(_name, cls=GroupedHelp, epilog=as_epilog(LOOK_EXAMPLES[_name]))(_look)
 app.command(cls=GroupedHelp, epilog=as_epilog(EXAMPLES["evaluate"]))(evaluate)
 app.command(cls=GroupedHelp, epilog=as_epilog(EXAMPLES["synth"]))(synth)
+app.command(cls=GroupedHelp, epilog=as_epilog(EXAMPLES["frames"]))(frames)
 for _name, (_help, _command) in WEIGHTS.items():
     weights_app.command(_name, help=_help, epilog=as_epilog(EXAMPLES[f"weights {_name}"]))(_command)
 

@@ -26,6 +26,10 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
         "aeromatch synth OUT --preset suburb --images 12 --seed 0",
         "aeromatch synth OUT --preset city --flight two-flights --size 1000x750 --images 24",
     ),
+    "frames": (
+        "aeromatch frames DJI_0001.MP4 --out IMGS",
+        "aeromatch frames DJI_0001.MP4 --out IMGS --track log.gpx --start 2026-05-01T10:00:00Z --overlap 0.7",
+    ),
     "weights list": ("aeromatch weights list", "aeromatch weights list --json"),
     "weights verify": ("aeromatch weights verify", "aeromatch weights verify --json"),
     "weights add": ("aeromatch weights add sift_lightglue.pth", "aeromatch weights add sift_lightglue.safetensors"),
@@ -75,6 +79,40 @@ def evaluate(
         return Result((*lines(evaluation), *end), facts(evaluation))
 
     guarded(call, "evaluate", quiet=quiet, as_json=json_, log_file=log_file, context=context)
+
+
+def frames(
+    context: typer.Context,
+    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="MP4, MOV or AVI.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the pictures and poses.csv.")],
+    track: Annotated[
+        Path | None,
+        typer.Option(
+            "--track", metavar="FILE", help="DJI's subtitles (SRT) or a GPX track (default: the one beside the video)."
+        ),
+    ] = None,
+    start: Annotated[
+        str, typer.Option("--start", metavar="TIME", help="UTC of the video's first frame, which a GPX track needs.")
+    ] = "",
+    overlap: Annotated[
+        float, typer.Option("--overlap", metavar="SHARE", help="What one picture shows of the one before.")
+    ] = 0.8,
+    log_file: LogFile = None,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write pictures of a video that overlap as those of a flight do, with a list of their positions."""
+
+    def call() -> Result:
+        from aeromatch_cli.executor import Executor
+        from aeromatch_cli.stages.frames import write_frames
+        from aeromatch_cli.stages.run import Result
+
+        with Executor("serial", 1, progress_shown(quiet)) as executor:
+            lines, facts = write_frames(video, out, executor, track=track, start=start, overlap=overlap)
+        return Result(tuple(lines), facts)
+
+    guarded(call, "frames", quiet=quiet, as_json=json_, log_file=log_file, context=context)
 
 
 def synth(

@@ -114,6 +114,15 @@ Masks = Annotated[
         help="Masks in COLMAP naming, 0 = ignore; or one mask.",
     ),
 ]
+Exclude = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--exclude",
+        metavar="NAME|PATTERN|FILE",
+        rich_help_panel=_BLOCK,
+        help="Leave images out: a name, a pattern, or a file with one of these in each line; repeatable.",
+    ),
+]
 ControlFile = Annotated[
     Path | None,
     typer.Option(

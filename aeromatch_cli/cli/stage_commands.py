@@ -16,6 +16,7 @@ from aeromatch_cli.cli.options import (
     ControlMarks,
     ControlPurpose,
     Crs,
+    Exclude,
     ExecutorName,
     Ground,
     Images,
@@ -147,6 +148,7 @@ def stage_command(name: str) -> Callable[..., None]:
         crs: Crs = None,
         ground: Ground = None,
         masks: Masks = None,
+        exclude: Exclude = None,
         gcp: ControlFile = None,
         gcp_marks: ControlMarks = None,
         gcp_use: ControlPurpose = None,
@@ -167,6 +169,7 @@ def stage_command(name: str) -> Callable[..., None]:
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
         block |= {"pose_format": pose_format, "masks": masks, "max_size_px": max_size}
+        block |= {"exclude": ",".join(exclude) if exclude else None}
         block |= {"gcp": gcp, "gcp_marks": gcp_marks, "gcp_use": gcp_use}
         run = {"jobs": jobs, "memory": memory, "executor": executor, "keep_images": keep_images or None}
         run |= {"scheduler": scheduler, "executor": executor or ("dask" if scheduler else None)}

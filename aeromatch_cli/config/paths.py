@@ -39,6 +39,11 @@ def absolute_paths(differences: Mapping[str, Any], tree: Mapping[str, Any], fold
 
 
 def _absolute_block_path(key: Any, value: Any, folder: Path) -> Any:
+    if key == "exclude" and isinstance(value, str):  # names and patterns, and files that hold them
+        below = [_below(folder, entry.strip()) for entry in value.split(",")]
+        return ",".join(
+            path if Path(path).is_file() else entry for path, entry in zip(below, value.split(","), strict=True)
+        )
     if key not in PATH_KEYS or not isinstance(value, str) or not value or value in _WORDS.get(key, ()):
         return value
     if key == "images" and "://" in value:

@@ -84,7 +84,21 @@ class BlockSettings(_Section):
     )
     crs: str = Field(
         "auto",
-        description="World frame: a code such as EPSG:32633, `local`, or `auto` (the UTM zone of the median position).",
+        description="World frame: a code such as EPSG:32633, or with its heights EPSG:32633+5773, `local`, or `auto` "
+        "(the UTM zone of the median position).",
+    )
+    heights: str = Field(
+        "auto",
+        description="What heights of positions count from: `ellipsoid`, a vertical CRS such as EPSG:5773, or `auto` "
+        "(as their file states). Where `crs` names other heights (EPSG:32633+5773) they are brought to those, which "
+        "needs PROJ's grid of the geoid.",
+    )
+    height_shift_m: float = Field(
+        0.0,
+        ge=-12_000.0,
+        le=12_000.0,
+        description="Metres that are added to the heights of all positions. Where these count from the ellipsoid and "
+        "control points or the DEM from sea level: the geoid's height above the ellipsoid there, with a minus.",
     )
     ground: str = Field(
         "auto",
@@ -95,6 +109,11 @@ class BlockSettings(_Section):
         "",
         description="Folder of masks in COLMAP's naming (a/1.jpg.png masks a/1.jpg; 0 = ignore), or one mask for all "
         "images.",
+    )
+    exclude: str = Field(
+        "",
+        description="Images that are left out: names, patterns such as takeoff/*, or files with one of these in each "
+        "line; separated by commas.",
     )
     gcp: str = Field(
         "",

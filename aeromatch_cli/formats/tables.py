@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from aeromatch_cli.data import (
     FloatArray,
     Image,
     Pair,
+    PictureQuality,
     Pose,
 )
 from aeromatch_cli.formats.reading import readable
@@ -21,6 +23,8 @@ from aeromatch_cli.geometry.rotations import from_quaternion, to_quaternion
 
 T = TypeVar("T")
 _QUATERNION_DIGITS = 14
+_QUALITY_DIGITS = 4
+_NONE: Mapping[str, PictureQuality] = MappingProxyType({})
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -48,10 +52,41 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return rows
 
 
-def images_text(images: Iterable[Image], fingerprints: Mapping[str, str]) -> str:
+def images_text(
+    images: Iterable[Image], fingerprints: Mapping[str, str], quality: Mapping[str, PictureQuality] = _NONE
+) -> str:
     columns = ("image_id", "name", "width_px", "height_px", "camera_id", "exif_orientation", "time")
-    rows = ((*(getattr(image, name) for name in columns), fingerprints[image.image_id]) for image in images)
-    return csv_text((*columns, "fingerprint"), rows)
+    unknown = (None,) * len(PictureQuality._fields)
+    rows = (
+        (
+            *(getattr(image, name) for name in columns),
+            fingerprints[image.image_id],
+            *map(_short, quality.get(image.image_id, unknown)),
+        )
+        for image in images
+    )
+    return csv_text((*columns, "fingerprint", *PictureQuality._fields), rows)
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else round(value, _QUALITY_DIGITS)
+
+
+def read_picture_quality(path: Path) -> dict[tuple[str, str], PictureQuality]:
+    """By image_id and fingerprint of the file; pictures that were not measured are absent."""
+    return {
+        (row["image_id"], row["fingerprint"]): quality
+        for row in read_csv(path)
+        if (quality := _quality(path, row)) is not None
+    }
+
+
+def _quality(path: Path, row: Mapping[str, str]) -> PictureQuality | None:
+    cells = [row.get(name, "") for name in PictureQuality._fields]
+    if not cells[1]:  # of an earlier version, or not read
+        return None
+    with readable(path, ValueError):
+        return PictureQuality(*(float(cell or "nan") for cell in cells))
 
 
 def cameras_text(cameras: Mapping[str, Camera]) -> str:

@@ -27,6 +27,7 @@ _JPEG_MARKER = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _JPEG_SEGMENTS = frozenset((*range(0xC0, 0xD0), *range(0xDA, 0xF0), 0xFE))
 
 _END_OF_IMAGE = 0xD9
+_JPEG_QUALITY = 95
 # Where a PNG says how many bits its numbers have.
 _PNG_BITS = 24
 # A reduced mask has the shape of its image but for rounding to whole pixels.
@@ -172,6 +173,16 @@ def write_png(stream: Any, pixels: NDArray[Any]) -> None:
         raise ValueError(f"a PNG holds uint8 or uint16, not {pixels.dtype}")  # OpenCV would cast without a word
     ordered = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
     ok, data = cv2.imencode(".png", ordered)
+    if not ok:
+        raise ValueError(f"cannot encode a picture of shape {pixels.shape}")
+    stream.write(data.tobytes())
+
+
+def write_jpeg(stream: Any, pixels: NDArray[np.uint8]) -> None:
+    """JPEG of (H, W, 3) RGB into a binary stream, of a quality that costs no match."""
+    import cv2
+
+    ok, data = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not ok:
         raise ValueError(f"cannot encode a picture of shape {pixels.shape}")
     stream.write(data.tobytes())

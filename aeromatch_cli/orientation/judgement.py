@@ -130,13 +130,16 @@ def triangulated(
     return found
 
 
-def heights_above_m(given: Ground, terrain: Ground, centers_m: FloatArray) -> tuple[float, float]:
-    """How far a given ground lies above the terrain found, and the flying height above that: medians, metres.
+def heights_above_m(given: Ground, terrain: Ground, centers_m: FloatArray) -> tuple[float, float, float]:
+    """How far a given ground lies above the terrain found, the median deviation from that, and the flying height above
+    the terrain: medians, metres.
 
     centers_m: (N, 3) projection centres, below which both are asked.
     """
     below = terrain.height_m(centers_m[:, :2])
-    return float(np.median(given.height_m(centers_m[:, :2]) - below)), float(np.median(centers_m[:, 2] - below))
+    above = given.height_m(centers_m[:, :2]) - below
+    middle = float(np.median(above))
+    return middle, float(np.median(np.abs(above - middle))), float(np.median(centers_m[:, 2] - below))
 
 
 def attitude_errors_deg(given: Mapping[str, Pose], found: Mapping[str, Pose]) -> dict[str, float]:

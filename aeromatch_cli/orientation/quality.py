@@ -15,6 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import BROWN, MODELS
+from aeromatch_cli.orientation.heights import height_remedy, shift_of_points_m, shift_to_control_m, zeros_words
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -345,9 +346,12 @@ def _flights(evidence: Evidence) -> _Found:
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
                 words = f"positions of {name} ({images} images) are off by {shown} m, which was taken out"
                 remedy = "check its base station, geoid and coordinate system; control points tell what is right"
-                known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
-                sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
-                yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
+                if shift_to_control_m(group) is not None:  # adjust says what it is, and which heights are right
+                    yield Finding("shift of a flight", None, None, "good", words)
+                else:
+                    known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
+                    sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
+                    yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
             found.add(flight["flight"])
             if "lag_s" in flight:
                 lag_s = flight["lag_s"][0]
@@ -437,6 +441,15 @@ def _control(evidence: Evidence) -> _Found:
     held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
     errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
     errors = [error_m for error_m in errors if error_m]
+    as_it_is = list(control.get("residuals", {}).values()) if _is_as_it_is(control, inside) else []
+    up_m = shift_of_points_m(as_it_is, control["sigmas_m"])
+    if up_m is not None:
+        errors = [np.sqrt(np.mean((np.array(as_it_is) - [0.0, 0.0, up_m]) ** 2, axis=0)).tolist()]
+        words = (
+            f"the block lies {abs(up_m):.2f} m {'above' if up_m > 0.0 else 'below'} all surveyed points: "
+            f"{zeros_words(up_m)}; {height_remedy(-up_m, 'the points')}, or let some of them take part"
+        )
+        yield Finding("heights of surveyed points", up_m, None, "doubtful", words)
     if not errors:
         yield "control points: too few to check the block by them"
         return
@@ -448,6 +461,11 @@ def _control(evidence: Evidence) -> _Found:
     )
     remedy = "check their coordinates and measurements; more control points at the border of the block help"
     yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
+
+
+def _is_as_it_is(control: Mapping[str, Any], adjusted: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether residuals are of the block as it is, which no surveyed point holds."""
+    return control.get("transformation") is None and not any(one["used"] for one in adjusted)
 
 
 def _refused(control: Mapping[str, Any], stated_m: FloatArray) -> Finding:

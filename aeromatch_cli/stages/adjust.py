@@ -25,6 +25,7 @@ from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.orientation.calibration import held_by
 from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.orientation.heights import shift_to_control_m, zeros_words
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import orient, refine
@@ -171,7 +172,7 @@ def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[
         "held_by": _held_by(context),
         "readout_not_tried": readout_not_tried(context, adjusted.poses),
         "control": control,
-        "remarks": _remarks(context, adjusted, control),
+        "remarks": _remarks(context, adjusted, figures, control),
     }
 
 
@@ -200,7 +201,12 @@ def _reduced(context: Context) -> float:
     return round(1.0 / float(np.median(scales)), 4)
 
 
-def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, Any] | None) -> list[str]:
+def _remarks(
+    context: Context,
+    adjusted: AdjustedBlock,
+    figures: Sequence[Mapping[str, Any]],
+    control: Mapping[str, Any] | None,
+) -> list[str]:
     """What a person should know of the adjusted block, one sentence each."""
     if not adjusted.poses:
         words = "no image could be oriented from the verified matches: export/colmap/sparse has no points"
@@ -214,7 +220,18 @@ def _remarks(context: Context, adjusted: AdjustedBlock, control: Mapping[str, An
             remarks.append(
                 f"focal length of camera {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before"
             )
+    remarks += height_remarks(figures)
     return remarks + control_remarks(context, None if control is None else control["offset_m"])
+
+
+def height_remarks(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is said of heights of positions that lie above or below those of the control points, all by as much."""
+    shifts_m = [up_m for group in figures if (up_m := shift_to_control_m(group)) is not None]
+    return [
+        f"heights of the given positions lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} those of the control "
+        f"points, everywhere by about as much: {zeros_words(up_m)}; the block has the heights of the control points"
+        for up_m in shifts_m
+    ]
 
 
 def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[str]:

@@ -19,7 +19,7 @@ from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.blocks.other_files import MASK
-from aeromatch_cli.blocks.read import BlockInputs, block_inputs, read_lists
+from aeromatch_cli.blocks.read import BlockInputs, GivenHeights, block_inputs, read_lists
 from aeromatch_cli.blocks.scan import scan_files, scan_images
 from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, ControlPoint, FloatArray, Ground, Image
@@ -82,6 +82,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         marks=settings.block.gcp_marks,
         poses=inputs.poses,
         use=settings.block.gcp_use,
+        heights=inputs.heights,
     )
     block = Block(
         images=inputs.images,
@@ -204,7 +205,9 @@ def _read_inputs(
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
+        exclude=given.exclude,
         drop_ground_shots=given.ground_shots == "drop",
+        given_heights=GivenHeights(given.heights, given.height_shift_m),
     )
     twice = doubles({image.name: on_disk(remote.get(image.name) or root / image.name) for image in inputs.images})
     inputs = replace(inputs, warnings=(*inputs.warnings, *remarks_on(twice, len(inputs.images))))

@@ -15,6 +15,7 @@ from aeromatch_cli.data import Block, FloatArray, Ground
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.orientation.dem import Terrain
+from aeromatch_cli.orientation.heights import height_remedy, zeros_words
 from aeromatch_cli.orientation.judgement import heights_above_m
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.orienters import GivenPoses
@@ -22,6 +23,11 @@ from aeromatch_cli.strategies.orienters import GivenPoses
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
 # that differs by more than so many standard deviations of a position, whichever is more.
 _SAID_SHARE, _SAID_SIGMAS = 0.1, 3.0
+# A DEM is more exact than a height that somebody states. It has the shape of the terrain, and its heights count from
+# another zero, where it differs by nearly the same everywhere: second share, median deviation from the median.
+_DEM_SHARE, _ALIKE_SHARE = 0.05, 0.03
+# No trees or houses are higher: a DEM of bare ground below them lies no farther below what the pictures show.
+_TALLEST_M = 40.0
 # No ground lies farther above or below the zero of its heights.
 _FARTHEST_M = 100_000.0
 # A stated ground that differs by this share is wrong: views and footprints of it would miss each other.
@@ -45,7 +51,7 @@ def given_ground(settings: Settings, inputs: BlockInputs) -> tuple[Ground | None
         return ConstantGround(z_m - inputs.origin_m[2]), f"given: {z_m:g} m", ()
     if text != "auto":
         positions = np.array([pose.center_m for pose in inputs.poses.values()]).reshape(-1, 3)
-        dem, remarks = open_dem(Path(text), inputs.crs, inputs.origin_m, positions)
+        dem, remarks = open_dem(Path(text), inputs.crs, inputs.origin_m, positions, inputs.heights)
         return dem, f"DEM {text}", remarks
     if inputs.ground_hint_z_m is not None and inputs.ground_is_stated:
         return ConstantGround(inputs.ground_hint_z_m), inputs.ground_hint_source, ()
@@ -79,14 +85,26 @@ def judged_ground(
     words = f"terrain from {facts['points']} points of the first pass"
     if ground is None or own_frame:
         return shown, words, []
-    off_m, flying_m = heights_above_m(ground, shown, _centers_m(context.block))
-    if abs(off_m) <= max(_SAID_SHARE * flying_m, _SAID_SIGMAS * context.settings.block.sigma_position_m):
+    centers_m = _centers_m(context.block)
+    off_m, spread_m, flying_m = heights_above_m(ground, shown, centers_m)
+    share, sigma_m = _SAID_SHARE, context.settings.block.sigma_position_m
+    if isinstance(ground, DemGround):
+        share, sigma_m = _DEM_SHARE, float(np.median([p.axis_sigmas_m[2] for p in context.block.poses.values()]))
+    if abs(off_m) <= max(share * flying_m, _SAID_SIGMAS * sigma_m):
         return ground, source, []
     remark = (
         f"the ground ({source}) lies {abs(off_m):.1f} m {'above' if off_m > 0 else 'below'} the terrain that the "
-        f"pictures show, at a flying height of {flying_m:.1f} m: do heights and ground count from the same zero "
-        "(ellipsoid, sea level, take-off point)?"
+        f"pictures show, at a flying height of {flying_m:.1f} m"
     )
+    if isinstance(ground, DemGround) and spread_m <= _ALIKE_SHARE * flying_m:
+        shift = f"{'lowered' if off_m > 0 else 'raised'} by {abs(off_m):.1f} m"
+        covered = ", unless trees or roofs cover the ground all over" if -_TALLEST_M < off_m < 0.0 else ""
+        words = (
+            f"{remark}, and everywhere about as much (to {spread_m:.1f} m): {zeros_words(off_m)}{covered}. The DEM is "
+            f"used, {shift}; {height_remedy(off_m, 'the DEM')}"
+        )
+        return ground.shifted(-off_m), f"{source}, {shift}", [words]
+    remark += ": do heights and ground count from the same zero (ellipsoid, sea level, take-off point)?"
     keeps = isinstance(context.settings.orient, GivenPoses) or abs(off_m) <= _WRONG_SHARE * flying_m
     return (ground, source, [remark]) if keeps else (shown, words, [f"{remark} The terrain of the pictures is used"])
 
@@ -97,7 +115,7 @@ def judged_altitudes(
     """What the ground says against heights above the take-off point. facts: those of the orientation."""
     if altitudes is None or ground is None or not block.poses or facts["frame"] == "own":
         return []
-    off_m, flying_m = heights_above_m(altitudes[0], ground, _centers_m(block))
+    off_m, _, flying_m = heights_above_m(altitudes[0], ground, _centers_m(block))
     if abs(off_m) <= _ALTITUDE_SHARE * flying_m:
         return []
     return [

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from aeromatch_cli.blocks.summary import summarise
 from aeromatch_cli.config import Settings, dump
-from aeromatch_cli.data import Block, Pair
+from aeromatch_cli.data import Block, Pair, PictureQuality
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json, write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
-from aeromatch_cli.stages import orient
+from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import orientation_lines
@@ -59,6 +59,10 @@ def prepare(
     for warning in known:
         log.warning("warning: %s", warning)
     given = _context(settings, workspace, executor, found, shard, overwrite)
+    quality = picture_quality.measured(given, dry=dry)
+    for warning in (looks := picture_quality.remarks(given, quality)):
+        log.warning("warning: %s", warning)
+    known += looks
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
     context = _with_ground(context, found)
@@ -77,7 +81,7 @@ def prepare(
     report.failures = list(found.failures)
     context = replace(context, pairs=tuple(pairs))
     if not dry:
-        _write(context, pairs_csv)
+        _write(context, pairs_csv, quality)
         forget_absent(context)
         report.write(workspace)
     for line in report.facts["summary"]:
@@ -214,10 +218,10 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     return read_pairs(workspace.pairs)
 
 
-def _write(context: Context, pairs_csv: str) -> None:
+def _write(context: Context, pairs_csv: str, quality: Mapping[str, PictureQuality]) -> None:
     workspace, block = context.workspace, context.block
     texts = {
-        workspace.images: images_text(block.images, context.image_fingerprints),
+        workspace.images: images_text(block.images, context.image_fingerprints, quality),
         workspace.cameras: cameras_text(block.cameras),
         workspace.poses: poses_text(block.poses),
         workspace.pairs: pairs_csv,

@@ -30,6 +30,7 @@ from aeromatch_cli.stages import (
     filter,  # noqa: A004
     match,
     pairs,
+    picture_quality,
     refine,
     simulate,
     unchanged,
@@ -421,10 +422,19 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
 
 def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
     settled = bool(oriented.facts) or not isinstance(context.settings.orient, FirstPass)
+    quality = picture_quality.measured(context)
+    looks = picture_quality.remarks(context, quality)
+    for warning in looks:
+        if warning not in first.facts["warnings"]:
+            log.warning("warning: %s", warning)
     found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)
     lines = (*said.rest(first.facts["summary"]), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     for _, item, reason in failures:
         log.error("failed: %s: %s", item, reason)
-    facts = {"warnings": first.facts["warnings"], "estimate": found.estimate, "failures": len(failures)}
+    facts = {
+        "warnings": [*dict.fromkeys([*first.facts["warnings"], *looks])],
+        "estimate": found.estimate,
+        "failures": len(failures),
+    }
     return Result(tuple(lines), facts, failures)

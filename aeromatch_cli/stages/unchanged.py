@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli.blocks.left_out import list_files
 from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
 from aeromatch_cli.files import read_json, write_json
@@ -97,6 +98,7 @@ def _inputs(settings: Settings, root: Path) -> Iterator[Path]:
             yield from _beside(path.parent)
         if key != "images":
             yield from _beside(path.parent.parent if path.is_file() else path.parent)
+    yield from list_files(block.exclude)
     for strategy in chosen_strategies(settings):
         yield from (Path(name) for name in strategy.fingerprint_files())
 

@@ -70,7 +70,8 @@ def read_blocks_exchange(source: Source) -> PoseList:
     remarks = [*system.remarks, *([f"{source.path.name}: {unposed} photos have no pose there"] if unposed else [])]
     words = crs or ("degrees" if kind == "geographic" else "local frame")
     remarks += cameras.remarks
-    return PoseList(tuple(rows), kind, tuple(remarks), f"BlocksExchange, {words}", crs, cameras.found)
+    title = f"BlocksExchange, {words}"
+    return PoseList(tuple(rows), kind, tuple(remarks), title, crs, cameras.found, system.heights)
 
 
 def _lens(group: Any) -> Nearest | None:

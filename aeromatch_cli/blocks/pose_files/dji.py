@@ -11,6 +11,7 @@ import re
 from collections import Counter
 
 from aeromatch_cli.blocks.accuracies import RTK_NONE, believed_sigmas_m, completed_sigmas_m
+from aeromatch_cli.blocks.crs import ELLIPSOID
 from aeromatch_cli.blocks.pose_files.source import Source
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
@@ -52,4 +53,5 @@ def read_mrk(source: Source) -> PoseList:
     if none:
         remarks.append(f"{source.path.name}: {none} exposures had no fix: treated as unposed")
     remarks += [f"{source.path.name}: {count} of {len(rows)} exposures had {what}" for what, count in said.items()]
-    return PoseList(tuple(rows), "geographic", tuple(remarks), "DJI MRK, latitude, longitude, ellipsoidal height")
+    words = "DJI MRK, latitude, longitude, ellipsoidal height"
+    return PoseList(tuple(rows), "geographic", tuple(remarks), words, heights=ELLIPSOID)

@@ -11,6 +11,7 @@ import numpy as np
 from aeromatch_cli.blocks.crs import (
     across_unit_m,
     height_unit_m,
+    heights_of,
     is_local,
     is_stretched,
     local_unit_m,
@@ -29,7 +30,8 @@ _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 class StatedCrs:
     """What a file states of its coordinates. crs: code or WKT of the grid in metres, None for a local one and for
     degrees. name: for messages. across_m, up_m: metres of one unit of x and y, and of heights. to_degrees: transforms
-    x and y to WGS84 longitudes and latitudes where the file's are not such. remarks: for a person."""
+    x and y to WGS84 longitudes and latitudes where the file's are not such. remarks: for a person. heights: as of
+    `crs.heights_of`."""
 
     crs: str | None = None
     kind: PositionKind = "grid"
@@ -38,6 +40,7 @@ class StatedCrs:
     up_m: float = 1.0
     to_degrees: Any = None
     remarks: tuple[str, ...] = ()
+    heights: str = ""
 
     def position(self, where: str, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Position of a `PoseRow`, in metres and degrees, of easting or longitude, northing or latitude, and height.
@@ -69,8 +72,10 @@ def described_crs(where: str, text: str) -> StatedCrs:
     if not (crs.is_geographic or crs.is_projected):
         raise ConfigError(f"{where}: {crs.name} has no easting and northing: name a projected CRS, or one in degrees")
     if crs.is_geographic or is_stretched(crs.to_2d()):
-        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=_to_degrees(where, crs))
-    return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, tuple(unit_remarks(where, crs)))
+        degrees = _to_degrees(where, crs)
+        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=degrees, heights=heights_of(crs))
+    remarks = tuple(unit_remarks(where, crs))
+    return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, remarks, heights_of(crs))
 
 
 def unit_remarks(where: str, crs: Any) -> list[str]:

@@ -50,7 +50,9 @@ def read_points(source: Source) -> PoseList:
     found = read_poses(source.path, text=table.getvalue())
     rows = tuple(replace(row, line=row.line - 1) for row in found.rows)
     words = (*stated.remarks, *found.warnings)
-    return replace(found, rows=rows, crs=stated.crs, warnings=words, format=f"GeoJSON, {stated.name}")
+    title = f"GeoJSON, {stated.name}"
+    zero = stated.heights or found.heights
+    return replace(found, rows=rows, crs=stated.crs, heights=zero, warnings=words, format=title)
 
 
 def _coordinates(source: Source, count: int, feature: Any) -> list[float]:

@@ -89,7 +89,8 @@ def read_reference(source: Source, *, estimated: bool = True) -> PoseList:
     code = system.crs if system.crs and len(system.crs) < _LONGEST_CODE else system.name
     words += [(code if system.crs else "WGS84" if system.kind == "geographic" else "local")] if stated_one else []
     title = f"Metashape reference, {', '.join(words)}"
-    return PoseList(tuple(rows), system.kind, (*system.remarks, *remarks), title, system.crs)
+    warnings = (*system.remarks, *remarks)
+    return PoseList(tuple(rows), system.kind, warnings, title, system.crs, heights=system.heights)
 
 
 def _column(cell: str) -> tuple[str, str]:

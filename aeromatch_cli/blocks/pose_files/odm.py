@@ -75,7 +75,8 @@ def read_geo_txt(source: Source) -> PoseList:
     remarks = stated.remarks
     if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
         remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
-    return PoseList(tuple(rows), stated.kind, remarks, f"ODM geo.txt, {text}, {words}", stated.crs)
+    title = f"ODM geo.txt, {text}, {words}"
+    return PoseList(tuple(rows), stated.kind, remarks, title, stated.crs, heights=stated.heights)
 
 
 def _value(where: str, cell: str, comma: bool) -> float:

@@ -55,7 +55,7 @@ def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
     """Of a list whose comment, or a column, names the CRS."""
     stated = described_crs(str(source.path), found.crs or "")
     if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
-        return replace(found, crs=stated.crs)
+        return replace(found, crs=stated.crs, heights=stated.heights or found.heights)
     if found.position_kind == "grid":  # what columns state counts before the unit of the CRS
         found = read_poses(source.path, (stated.across_m, stated.up_m))
     one = replace(stated, across_m=1.0, up_m=1.0)
@@ -67,7 +67,16 @@ def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
             row = replace(row, position=one.position(source.at(row.line), *across, height_m), position_kind=one.kind)
         rows.append(row)
     words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *found.warnings)
-    return replace(found, rows=tuple(rows), position_kind=one.kind, crs=one.crs, warnings=warnings, format=words)
+    heights = stated.heights or found.heights
+    return replace(
+        found,
+        rows=tuple(rows),
+        position_kind=one.kind,
+        crs=one.crs,
+        warnings=warnings,
+        format=words,
+        heights=heights,
+    )
 
 
 _MISSION_PLANNER = re.compile(r"#\s*name\s+latitude/y\s+longitude/x\b.*", re.IGNORECASE)

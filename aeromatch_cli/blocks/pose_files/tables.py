@@ -227,7 +227,9 @@ def read_inpho(source: Source) -> PoseList:
     if not rows:
         raise ConfigError(f"{source.path}: no photo of this Inpho project has $EXT_ORI: export it after orientation")
     words = system.name or "its coordinate system is not stated"
-    return PoseList(tuple(rows), system.kind, system.remarks, f"Inpho project, {words}", system.crs)
+    return PoseList(
+        tuple(rows), system.kind, system.remarks, f"Inpho project, {words}", system.crs, heights=system.heights
+    )
 
 
 def _mounts(lines: Sequence[str]) -> Iterator[tuple[str, float]]:
