@@ -68,7 +68,8 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
 - `fingerprint`: of the inputs and settings. `images`: fingerprint of what was given of every image. `settings`: of the
   rest. `files`: SHA-256 of the other files.
 - `facts`: `poses_from` (`given poses`: they explain the matches; `pictures`: a mapper oriented the block),
-  `images_matched`, `positions_given`, `given_poses_explained` (images), `corrected` (images whose given pose was replaced), `points`,
+  `images_matched`, `positions_given`, `given_poses_explained` (images), `corrected` (images whose given pose was
+  replaced), `points`,
   `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`,
   `turned_back`: images that the mapper had turned over), `calibrated` (cameras whose
   parameters a mapper found), `stopped` (why mapping failed; it is tried again), `by_one_pair`
