@@ -28,6 +28,7 @@ from aeromatch_cli.orientation.bundle.of_model import (
     unknowns_of,
 )
 from aeromatch_cli.orientation.bundle.projection import project
+from aeromatch_cli.orientation.bundle.shared import lenses_if_freed
 from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.placing import Placement, delay_s, height_steps_m, place
@@ -99,7 +100,8 @@ class Work:
     """What all adjustments of a process share.
 
     priors, sigmas: by camera number (12,) as in `network.LENS`, sigmas zero where an unknown is held; fisheyes: numbers
-    of such cameras. options: of the adjustment. lenses: what adjustments have found, by camera number.
+    of such cameras. options: of the adjustment. lenses: what adjustments have found, by camera number. held_sigmas: of
+    what settings hold, as far as it is known.
     """
 
     pycolmap: ModuleType
@@ -108,6 +110,7 @@ class Work:
     fisheyes: frozenset[int]
     options: Options
     lenses: Lenses = field(default_factory=dict)
+    held_sigmas: Lenses = field(default_factory=dict)
 
     @classmethod
     def of_task(cls, pycolmap: ModuleType, cameras: Mapping[str, Any], options: Options) -> Work:
@@ -119,6 +122,7 @@ class Work:
             {number: np.array(one["sigmas"]) for number, one in named.items()},
             frozenset(number for number, one in named.items() if one["fisheye"]),
             options,
+            held_sigmas={number: np.array(one["held_sigmas"]) for number, one in named.items()},
         )
 
     def lens(self, model: Any, number: int) -> FloatArray:
@@ -138,6 +142,7 @@ class Work:
 class Outcome:
     """result: of the adjustment; images, points, cameras, flights: numbers of its rows. placement: None where the model
     had its place. steps_m: (N,) by row of what was given, steps of height of the flights that were taken out before.
+    if_freed: `lenses_if_freed` of what settings hold, None where they hold nothing.
     """
 
     result: Adjusted
@@ -147,6 +152,7 @@ class Outcome:
     flights: list[int]
     placement: Placement | None = None
     steps_m: FloatArray | None = None
+    if_freed: tuple[FloatArray, float] | None = None
 
 
 def adjusted(work: Work, model: Any, given: Given, held: Collection[int] = ()) -> Outcome:
@@ -250,7 +256,10 @@ def _adjust(
     start = replace(start, lens=np.where(network.lens_sigmas > 0.0, start.lens, network.lens_prior))
     result = adjust(network, start, work.options)
     _take(work, model, ids, points, numbers, result.state)
-    return Outcome(result, ids, points, numbers, np.unique(given.flights[rows]).tolist())
+    unknown = np.array([work.held_sigmas.get(n, np.zeros(len(LENS))) * (n not in held) for n in numbers])
+    tried = work.options.final and unknown.any()
+    freed = lenses_if_freed(result.network, result.state, unknown, work.options.tolerance) if tried else None
+    return Outcome(result, ids, points, numbers, np.unique(given.flights[rows]).tolist(), if_freed=freed)
 
 
 def _with_drifts(network: Network) -> Network:

@@ -164,9 +164,13 @@ def _calibration(outcome: Outcome, row: int) -> dict[str, Any]:
         for camera, first, second, value in lens_correlations(found)
         if camera == row and abs(value) > _STRONG
     ]  # fmt: skip
+    change, worth = (np.zeros(len(LENS)), 0.0) if outcome.if_freed is None else (
+        outcome.if_freed[0][row], outcome.if_freed[1]
+    )  # fmt: skip
     return {
         "images": int((network.camera == row).sum()),
         "parameters": parameters,
+        "if_freed": {"change": {LENS[k]: float(change[k]) for k in np.flatnonzero(change)}, "worth": worth},
         "correlations": strong[:_MOST_LISTED],
         "flights": [
             {

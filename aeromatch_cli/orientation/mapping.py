@@ -22,7 +22,8 @@ from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px
 from aeromatch_cli.geometry.lenses import in_colmap
 from aeromatch_cli.orientation.adjustment_facts import with_names
-from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, lens_prior
+from aeromatch_cli.orientation.bundle.network import LENS
+from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, held_by, lens_prior
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
 from aeromatch_cli.strategies.exporters.colmap import Colmap
@@ -205,9 +206,11 @@ def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, 
     stated = observed.cameras.get(camera_id, block.cameras[camera_id])
     prior = lens_prior(stated, observed.focal_sigmas[camera_id])
     images = sum(image.camera_id == camera_id for image in block.images)
+    held = held_by(observed.calibration, observed.switches)
     return {
         "lens": prior.lens.tolist(),
         "sigmas": freed(prior, observed.calibration, observed.switches, images).tolist(),
+        "held_sigmas": [sigma * (name in held) for name, sigma in zip(LENS, prior.sigmas.tolist(), strict=True)],
         "fisheye": prior.fisheye,
         "params": colmap_params(in_colmap(block.cameras[camera_id]).camera or block.cameras[camera_id]),
         "focal_px": focal_px(stated),

@@ -556,6 +556,7 @@ def _calibration(evidence: Evidence) -> _Found:
                     "shorter exposure"
                 )
                 yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
+            yield from _wrongly_held(evidence, camera_id, camera)
             if not changes:
                 continue
             told.add(camera_id)
@@ -592,6 +593,21 @@ def _with_held(evidence: Evidence, remedy: str) -> str:
     """The remedy for what a wrong calibration may have done, with the settings that have held parameters of it."""
     held = _held_words(evidence)
     return f"{remedy}; {held} of cameras as stated, which may be wrong" if held else remedy
+
+
+def _wrongly_held(evidence: Evidence, camera_id: str, camera: Mapping[str, Any]) -> Iterator[Finding]:
+    freed = camera.get("if_freed") or {"change": {}, "worth": 0.0}
+    if not freed["change"]:
+        return
+    known = camera["parameters"]
+    in_sigmas = {n: abs(c) / known[n][3] for n, c in freed["change"].items() if n in known and known[n][3] > 0.0}
+    name = max(in_sigmas, key=lambda key: in_sigmas[key], default=next(iter(freed["change"])))
+    words = (
+        f"{_held_words(evidence)} of camera {camera_id}: the pictures put {name} at "
+        f"{_number(known[name][0] + freed['change'][name])}, not at {_number(known[name][0])}"
+    )
+    remedy = "free it, or give the calibration of this camera at this size of the pictures"
+    yield _finding("held calibration", freed["worth"], _FLIGHT_LENS, words, remedy)
 
 
 def _flight_lenses(camera_id: str, camera: Mapping[str, Any]) -> Iterator[Finding]:

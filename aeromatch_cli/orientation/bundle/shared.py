@@ -1,4 +1,5 @@
-"""Whether a camera has the same calibration in all of its flights: the block with a lens for each flight, beside it."""
+"""Whether a camera has the same calibration in all of its flights, and that at which a setting holds it: the block with
+further unknowns of lenses beside the block as it is."""
 
 from __future__ import annotations
 
@@ -9,7 +10,6 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.orientation.bundle.network import READOUT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.normal_equations import cost
 from aeromatch_cli.orientation.bundle.solve import solve
 
 # A flight with fewer images or image points tells nothing of its lens.
@@ -36,14 +36,29 @@ class FlightLens:
 def lenses_by_flight(network: Network, state: Unknowns, tolerance: float) -> list[FlightLens]:
     """Of every camera with several flights that each tell of a lens. state: a solution of the network."""
     found = []
-    for camera, flight in _apart(network):
+    apart = list(_apart(network))
+    as_it_is = solve(network, state, tolerance, near=True).cost if apart else 0.0
+    for camera, flight in apart:
         own = (network.camera == camera) & (network.flight == flight)
         split, start = _split(network, state, camera, own)
         solved = solve(split, start, tolerance, near=True)
-        gain = 2.0 * (cost(network, state) - solved.cost)
+        gain = 2.0 * (as_it_is - solved.cost)
         asked = _WORTH_SQUARES * np.count_nonzero(split.lens_sigmas[-1])
         found.append(FlightLens(camera, flight, solved.state.lens[-1] - solved.state.lens[camera], float(gain / asked)))
     return found
+
+
+def lenses_if_freed(
+    network: Network, state: Unknowns, sigmas: FloatArray, tolerance: float
+) -> tuple[FloatArray, float]:
+    """(K, 12) changes of lenses with further unknowns, and by how much these lower the sum of squares, over what is
+    asked for. sigmas: (K, 12) of the further unknowns, else 0. state: a solution of the network."""
+    further = (sigmas > 0.0) & (network.lens_sigmas == 0.0)
+    if not further.any():
+        return np.zeros_like(sigmas), 0.0
+    solved = solve(replace(network, lens_sigmas=np.where(further, sigmas, network.lens_sigmas)), state, tolerance)
+    gain = 2.0 * (solve(network, state, tolerance, near=True).cost - solved.cost)
+    return (solved.state.lens - state.lens) * further, float(gain / (_WORTH_SQUARES * np.count_nonzero(further)))
 
 
 def _apart(network: Network) -> Iterator[tuple[int, int]]:
