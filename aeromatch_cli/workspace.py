@@ -70,6 +70,11 @@ class Workspace:
         return self.root / "failures.csv"
 
     @property
+    def lost(self) -> Path:
+        """Images that the result does not hold."""
+        return self.root / "lost.csv"
+
+    @property
     def finished(self) -> Path:
         """What a run that ended without a failure has left, to know whether anything has changed since."""
         return self.root / "finished.json"

@@ -202,7 +202,12 @@ def test_quiet_leaves_errors_and_json(site):
     site.image(0).write_bytes(b"")
     outcome = invoke("run", "baseline", *site.options("--quiet"))
     assert (outcome.code, outcome.stdout) == (1, "")
-    assert outcome.stderr.splitlines() == [f"{site.names()[0]}: file is empty: copy it again"]
+    name, reason = site.names()[0], "file is empty: copy it again"
+    first, *others = outcome.stderr.splitlines()
+    assert first == f"{name}: {reason}"
+    lost = f"lost      1 of {IMAGES} images is not in the result (1 not read): {name}; listed in {site.work}/lost.csv"
+    assert others[-2:] == [lost, f"1 failed, listed in {site.work}/failures.csv"]
+    assert (site.work / "lost.csv").read_text() == f"image,what,reason\n{name},not read,{reason}\n"
     outcome = invoke("run", "baseline", *site.options("--quiet", "--json"))
     assert len(outcome.stdout.splitlines()) == 1
     outcome = invoke("run", "baseline", *site.options("--quiet", "--shard", "0/1"))

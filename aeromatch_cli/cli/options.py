@@ -280,6 +280,6 @@ Quiet = Annotated[
         envvar="AEROMATCH_QUIET",
         show_envvar=False,
         rich_help_panel=_MESSAGES,
-        help="Print only errors, no summary and no progress.",
+        help="Print only errors, lost images and a result that is not good.",
     ),
 ]

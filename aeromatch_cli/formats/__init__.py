@@ -299,8 +299,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `facts` of refine: `keypoints` (matched ones, without those that stand for their points), `measured`, `shift_px`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
-  `weakly_tied` (as of filter, of those that stay), `points`, `observations` (of the adjusted block), `points_left`,
-  `observations_left` (that those that stay hold),
+  `weakly_tied`, `unconnected` (as of filter, of those that stay), `points`, `observations` (of the adjusted block),
+  `points_left`, `observations_left` (that those that stay hold),
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
   `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
   (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images
@@ -308,12 +308,18 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
   matches than their overlap promises, or with empty parts of it). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
-  `weakly_tied` (images with few verified matches).
+  `weakly_tied` (images with few verified matches), `unconnected` (those with none).
 - `facts` of export: exporter -> files and counts.
 
 ### failures.csv
 
 `stage`, `item`, `reason`: every image or pair that failed.
+
+### lost.csv
+
+Written by `run` and `adjust`: every image of the folder that the result does not hold. `image` (relative path), `what`
+(`not read`, `not oriented`; of a block that was not adjusted `not connected`), `reason`. Without lines where
+every image is held.
 
 ### .lock
 

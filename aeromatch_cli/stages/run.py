@@ -36,9 +36,10 @@ from aeromatch_cli.stages import (
     union,
 )
 from aeromatch_cli.stages.changes import changed_words
-from aeromatch_cli.stages.closing import closing_lines
+from aeromatch_cli.stages.closing import closing_lines, verdict_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
+from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
 from aeromatch_cli.stages.quality import facts_told, quality_of
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
@@ -65,12 +66,13 @@ _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "
 @dataclass(frozen=True)
 class Result:
     """What a command says: lines for people, facts for machines; failures, and the verdict on the block where there is
-    one, for the exit code."""
+    one, for the exit code. urgent: those of the lines that are said even where quiet is asked for."""
 
     lines: tuple[str, ...]
     facts: dict[str, Any] = field(default_factory=dict)
     failures: tuple[tuple[str, str, str], ...] = ()
     verdict: Level | None = None
+    urgent: tuple[str, ...] = ()
 
 
 def execute(
@@ -336,12 +338,18 @@ def _result(
     part: bool = False,
 ) -> Result:
     """names: of the files, by image_id. part: of a shard."""
-    lines = said.rest(next(report for report in reports if report.stage == "pairs").facts["summary"])
+    first = next(report for report in reports if report.stage == "pairs")
+    lines = said.rest(first.facts["summary"])
     for stage in reports:
         lines += stage_lines(stage, names, part=part)
     quality, told = _quality(command, workspace, reports, names, part=part)
+    lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        lines += closing_lines(quality, told, names)
+        lost = lost_images(told, first.failures, names)
+        write_lost(workspace, lost)
+        told_lost = lost_lines(workspace, lost, len(names) + len(first.failures))
+        lines += [*closing_lines(quality, told, names), *told_lost]
+        urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {workspace.report}")
@@ -358,6 +366,7 @@ def _result(
         lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
     if failures:
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
+        urgent.append(lines[-1])
     facts = {
         "workspace": str(workspace.root),
         "stages": _stage_facts(reports),
@@ -365,7 +374,8 @@ def _result(
     }
     if quality is not None:
         facts["quality"] = quality.as_facts()
-    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict)
+        facts["lost"] = {name: reason for name, _, reason in lost}
+    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict, tuple(urgent))
 
 
 def _quality(
