@@ -58,6 +58,7 @@ def prepare(
     known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.block)]
     for warning in known:
         log.warning("warning: %s", warning)
+    _check_images(found.block)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report
@@ -76,15 +77,15 @@ def prepare(
     }
     report.failures = list(found.failures)
     context = replace(context, pairs=tuple(pairs))
-    if not dry:
-        _write(context, pairs_csv)
-        forget_absent(context)
-        report.write(workspace)
     for line in report.facts["summary"]:
         say(line)
     for warning in said_later:
         log.warning("warning: %s", warning)
     _check_pairs(context)
+    if not dry:
+        _write(context, pairs_csv)
+        forget_absent(context)
+        report.write(workspace)
     return context, oriented, report
 
 
@@ -110,14 +111,17 @@ def _listed(context: Context, report: StageReport, *, anew: bool) -> Sequence[Pa
     return chosen
 
 
+def _check_images(block: Block) -> None:
+    """Raise InputError where there is nothing to match."""
+    if len(block.images) == 1:
+        raise InputError(f"only one image can be used ({block.images[0].name}): one image makes no pair")
+
+
 def _check_pairs(context: Context) -> None:
     """Raise InputError where there is nothing to match."""
-    images = context.block.images
-    if len(images) == 1:
-        raise InputError(f"only one image can be used ({images[0].name}): one image makes no pair")
     if not context.pairs:
         raise InputError(
-            f"no pairs: {len(images)} images, none of which overlap; check poses, cameras and ground "
+            f"no pairs: {len(context.block.images)} images, none of which overlap; check poses, cameras and ground "
             "(the warnings above), or use --set pairs=exhaustive"
         )
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,8 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
+# These look at what other commands have made.
+_NEEDS_RESULTS = ("filter", "adjust", "export")
 # What a command rests on: everything before it in this chain.
 _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
 
@@ -92,9 +95,10 @@ def execute(
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     root = Path(settings.workspace)
-    new = not root.exists()
+    if settings.block.images and command in _NEEDS_RESULTS and not root.exists():
+        raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
     with ExitStack() as stack:
-        stack.callback(_without_empty_folder, root, new)
+        stack.enter_context(_nothing_left_of_a_failed_start(Workspace(root), shared=part is not None))
         if command != "check" and (not settings.block.images or _there(settings)):
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
@@ -131,13 +135,23 @@ def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> R
     return _result("run", settings, workspace, names, reports, (), said)
 
 
-def _without_empty_folder(root: Path, new: bool) -> None:
-    """Where nothing could be started, no folder is left but one that was there before."""
-    lock = Workspace(root).lock
-    if new and root.is_dir() and list(root.iterdir()) == [lock]:
-        with translated_os_errors(root):
-            lock.unlink()
-            root.rmdir()
+@contextmanager
+def _nothing_left_of_a_failed_start(workspace: Workspace, *, shared: bool) -> Iterator[None]:
+    """Where nothing could be started, no folder is left but those that were there before. shared: other shards may be
+    at work in the workspace."""
+    root = workspace.root
+    absent = [folder for folder in (root, *root.absolute().parents) if not folder.exists()]
+    try:
+        yield
+    except BaseException as error:
+        # The block is on file once it has images and pairs: what an interrupted command has made before that stays.
+        refused = isinstance(error, ConfigError | InputError) and not workspace.block.exists() and not shared
+        if absent and root.is_dir() and (refused or set(root.iterdir()) <= {workspace.lock}):
+            shutil.rmtree(root, ignore_errors=True)
+            for folder in absent[1:]:
+                with suppress(OSError):  # something else lies in it by now
+                    folder.rmdir()
+        raise
 
 
 class _Said:
