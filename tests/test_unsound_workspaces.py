@@ -103,6 +103,14 @@ def test_nothing_is_left_of_a_run_that_could_not_begin(site: Site) -> None:
         outcome = invoke("run", "baseline", *given, "--jobs", 1, "--workspace", deep, *wrong, "--quiet")
         assert (outcome.code in (2, 3), outcome.stderr.startswith("error: ")) == (True, True), wrong
         assert not site.work.exists(), wrong
+    twin = site.images / "second" / site.names()[0]
+    twin.parent.mkdir()
+    twin.write_bytes(site.image(1).read_bytes())
+    for command in ("check", "run"):
+        outcome = invoke(command, "baseline", *given, "--workspace", site.work, "--set", "export=colmap+opensfm")
+        assert outcome.code == 2
+        assert f"second/{twin.name} and {twin.name} would both be called {twin.name}: rename" in outcome.stderr
+        assert not site.work.exists()
     for command in ("filter", "adjust", "export"):
         outcome = invoke(command, "baseline", *given, "--workspace", site.work)
         assert (outcome.code, "does not exist: run `aeromatch run`" in outcome.stderr) == (3, True)

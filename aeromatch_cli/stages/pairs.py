@@ -39,10 +39,12 @@ def prepare(
     shard: Shard | None = None,
     overwrite: bool = False,
     dry: bool = False,
+    exports: bool = False,
 ) -> tuple[Context, StageReport, StageReport]:
     """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
 
-    say: gets the lines of the summary as soon as each is known. Returns the context and the reports of orient and
+    say: gets the lines of the summary as soon as each is known. exports: whether the command ends with an export, whose
+    refusals come at once, and not after hours. Returns the context and the reports of orient and
     pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
@@ -59,6 +61,8 @@ def prepare(
     for warning in known:
         log.warning("warning: %s", warning)
     _check_images(found.block)
+    for exporter in settings.export if exports else ():
+        exporter.check_images(found.block.images)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     context, oriented = orient.run(given, found.ground_hint, dry=dry)
     report.started += oriented.seconds  # has its own report

@@ -60,6 +60,8 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
+# Commands that export, and the one that says what they would do.
+_EXPORTING = ("run", "export", "check")
 # These look at what other commands have made.
 _NEEDS_RESULTS = ("filter", "adjust", "export")
 # What a command rests on: everything before it in this chain.
@@ -227,7 +229,10 @@ def _attempt(
             log.warning("warning: %s is not as it was written: it is made again", workspace.root / name)
     if _there(settings) and (words := changed_words(workspace.config, settings)):
         said(f"changed          {words}")
-    context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
+    exports = command in _EXPORTING
+    context, *reports = pairs.prepare(
+        settings, executor, said, shard=part, overwrite=overwrite, dry=dry, exports=exports
+    )
     if command == "check":
         return _check(context, reports[0], reports[-1], said)
     if command == "run":

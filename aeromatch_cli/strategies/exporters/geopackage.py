@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.residuals import fields_of
 from aeromatch_cli.geometry.footprints import block_footprints
@@ -32,6 +33,10 @@ class GeoPackage(Strategy):
 
     version: ClassVar[int] = 5
     name: Literal["geopackage"] = "geopackage"
+
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError without pyogrio."""
+        _writer()
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without pyogrio."""

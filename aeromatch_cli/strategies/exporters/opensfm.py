@@ -40,10 +40,18 @@ class OpenSfm(Strategy):
     version: ClassVar[int] = 2
     name: Literal["opensfm"] = "opensfm"
 
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError where file names are not different."""
+        self._called(images)
+
+    def _called(self, images: Sequence[Image]) -> dict[str, str]:
+        how = "OpenSfM calls images by file names"
+        return called(images, lambda name: PurePosixPath(name).name, self.name, how)
+
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where file names are not different."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError as `check_images`."""
         solution = Solution.of(contents)
-        names = called(solution.images, lambda name: PurePosixPath(name).name, "OpenSfM calls images by file names")
+        names = self._called(solution.images)
         with whole_folder(folder) as partial:
             found = matched(contents)
             places = {i.image_id: _normalised(contents, i) for i in solution.images}
