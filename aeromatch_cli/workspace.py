@@ -153,6 +153,10 @@ class Workspace:
     def views(self, image_id: str) -> Path:
         return self._pictures / "simulated" / image_id / "views.json"
 
+    def view_pictures(self, image_id: str) -> Path:
+        """Which pictures of views are kept, and of what."""
+        return self._pictures / "simulated" / image_id / "pictures.json"
+
     def view(self, image_id: str, view_name: str) -> Path:
         return self._pictures / "simulated" / image_id / f"{view_name}.png"
 

@@ -220,15 +220,18 @@ The enhanced picture (kept by the single stage and with `--keep-images`); the ma
 `fingerprint`, `picture` (whether the picture is kept), the strategy's own facts and `files`. Images that are not
 enhanced have none.
 
-### simulated/<id>/views.json, <view>.png
+### simulated/<id>/views.json, pictures.json, <view>.png
 
-- `fingerprint`, `files`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views
+- `fingerprint`, `files`. `scale`: stored raster to the raster that the views
   were made of. `remark`: why another ground than the terrain below the image is looked at, else empty.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
   With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image, a few pixels
   larger or smaller than what it shows: only ground that the box of the ground view leaves out, the rest is black.
-- `<view>.png`: gray picture of the view (kept by the single stage and with `--keep-images`).
+- `<view>.png`: gray picture of the view. `simulate`, and every command with `--keep-images`, writes them, in place of
+  earlier ones; other commands leave them as they are.
+- `pictures.json`: as views.json, of the views that the PNGs show; it differs from views.json where features were found
+  with other settings since. Absent without PNGs.
 
 ## Features and matches
 
