@@ -24,7 +24,7 @@ SETTINGS = UNORIENTED
 PAIRS = IMAGES * (IMAGES - 1) // 2
 OPTIONS = (
     "--images", "--poses", "--cameras", "--crs", "--ground", "--masks", "--workspace", "--set", "--max-size", "--jobs",
-    "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json", "--quiet",
+    "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json", "--progress", "--quiet",
 )  # fmt: skip
 
 
