@@ -197,8 +197,12 @@ def evidence_of(
     poses, which another pass may follow."""
     prepared = first_pass.prepared(context, recipe, "first look" if look else "first pass")
     first, failed = first_pass.run(prepared, recipe, by_position=by_position)
-    limit = first.settings.block.max_size_px
-    sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
-    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras, failed)
+    return first, Evidence(context.block, pairs, thresholds_px(first), context.given.cameras, failed)
+
+
+def thresholds_px(first: Context) -> dict[str, float]:
+    """image_id -> error of an exact match of a first pass, stored pixels."""
+    limit = first.settings.block.max_size_px
+    sizes = {image.image_id: max(image.width_px, image.height_px) for image in first.block.images}
+    return {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
