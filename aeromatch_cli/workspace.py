@@ -70,6 +70,11 @@ class Workspace:
         return self.root / "failures.csv"
 
     @property
+    def lost(self) -> Path:
+        """Images that the result does not hold."""
+        return self.root / "lost.csv"
+
+    @property
     def finished(self) -> Path:
         """What a run that ended without a failure has left, to know whether anything has changed since."""
         return self.root / "finished.json"
@@ -147,6 +152,10 @@ class Workspace:
 
     def views(self, image_id: str) -> Path:
         return self._pictures / "simulated" / image_id / "views.json"
+
+    def view_pictures(self, image_id: str) -> Path:
+        """Which pictures of views are kept, and of what."""
+        return self._pictures / "simulated" / image_id / "pictures.json"
 
     def view(self, image_id: str, view_name: str) -> Path:
         return self._pictures / "simulated" / image_id / f"{view_name}.png"

@@ -122,6 +122,7 @@ def test_one_image_only(site):
     outcome = site("run")
     assert outcome.code == 3
     assert f"only one image can be used ({site.names()[0]})" in outcome.stderr
+    assert not site.work.exists()
 
 
 def test_empty_missing_and_wrong_folder(site):

@@ -24,7 +24,8 @@ SETTINGS = UNORIENTED
 PAIRS = IMAGES * (IMAGES - 1) // 2
 OPTIONS = (
     "--images", "--poses", "--cameras", "--crs", "--ground", "--masks", "--exclude", "--workspace", "--set",
-    "--max-size", "--jobs", "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json", "--quiet",
+    "--max-size", "--jobs", "--executor", "--shard", "--overwrite", "--keep-images", "--log-file", "--json",
+    "--progress", "--quiet",
 )  # fmt: skip
 
 
@@ -124,6 +125,9 @@ def test_the_summary_tells_what_views_cost(site, command):
 
 def test_commands_that_need_an_earlier_one_say_so(site):
     outcome = site("filter")
+    assert (outcome.code, "does not exist: run `aeromatch run`" in outcome.stderr) == (3, True)
+    assert site("pairs").code == 0
+    outcome = site("filter")
     assert (outcome.code, "run `aeromatch match` first" in outcome.stderr) == (3, True)
     outcome = site("export")
     assert (outcome.code, "run `aeromatch match` and then `aeromatch filter`" in outcome.stderr) == (3, True)
@@ -202,7 +206,12 @@ def test_quiet_leaves_errors_and_json(site):
     site.image(0).write_bytes(b"")
     outcome = invoke("run", "baseline", *site.options("--quiet"))
     assert (outcome.code, outcome.stdout) == (1, "")
-    assert outcome.stderr.splitlines() == [f"{site.names()[0]}: file is empty: copy it again"]
+    name, reason = site.names()[0], "file is empty: copy it again"
+    first, *others = outcome.stderr.splitlines()
+    assert first == f"{name}: {reason}"
+    lost = f"lost      1 of {IMAGES} images is not in the result (1 not read): {name}; listed in {site.work}/lost.csv"
+    assert others[-2:] == [lost, f"1 failed, listed in {site.work}/failures.csv"]
+    assert (site.work / "lost.csv").read_text() == f"image,what,reason\n{name},not read,{reason}\n"
     outcome = invoke("run", "baseline", *site.options("--quiet", "--json"))
     assert len(outcome.stdout.splitlines()) == 1
     outcome = invoke("run", "baseline", *site.options("--quiet", "--shard", "0/1"))

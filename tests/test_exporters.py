@@ -19,7 +19,7 @@ from test_export_colmap import ORIGIN_M, Truth, make_truth
 from aeromatch_cli.blocks.crs import geographic_from_grid
 from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray
-from aeromatch_cli.errors import ItemError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import normalise
 from aeromatch_cli.geometry.rotations import from_quaternion, to_omega_phi_kappa
 from aeromatch_cli.strategies.exporters import EXPORTERS, ExportContents, PairContents
@@ -169,7 +169,7 @@ def test_opensfm_reads_matches_cameras_and_positions(contents, truth: Truth, tmp
 def test_opensfm_refuses_two_images_of_one_file_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(i, name=f"{k}/same.jpg") for k, i in enumerate(truth.block.images)]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(ItemError, match=r"would both be called same\.jpg"):
+    with pytest.raises(ConfigError, match=r"would both be called same\.jpg"):
         EXPORTERS["opensfm"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "o")  # type: ignore[operator]
 
 
@@ -306,7 +306,7 @@ def test_openmvg_has_views_poses_features_and_matches(contents, truth: Truth, tm
 def test_openmvg_refuses_two_images_of_one_name(truth: Truth, tmp_path: Path) -> None:
     images = [dataclasses.replace(image, name=f"{image.name[0:6]}/same.jpg") for image in truth.block.images]
     block = dataclasses.replace(truth.block, images=tuple(images))
-    with pytest.raises(ItemError, match="would both be called same"):
+    with pytest.raises(ConfigError, match="would both be called same"):
         EXPORTERS["openmvg"]()(dataclasses.replace(truth.contents(), block=block), tmp_path / "v")  # type: ignore[operator]
 
 

@@ -14,7 +14,7 @@ import pytest
 from test_export_colmap import Truth, make_truth
 
 from aeromatch_cli.data import Image
-from aeromatch_cli.errors import ItemError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.strategies.exporters import EXPORTERS, ExportContents
 from aeromatch_cli.strategies.exporters.solution import rows_of_images
 
@@ -47,9 +47,12 @@ def test_two_images_whose_files_would_be_one_are_refused(
     if exporter == "hloc":
         pytest.importorskip("h5py")
     contents = renamed(truth, *names)
-    with pytest.raises(ItemError) as raised:
+    with pytest.raises(ConfigError) as refused:
+        EXPORTERS[exporter]().check_images(contents.block.images)
+    with pytest.raises(ConfigError) as raised:
         EXPORTERS[exporter]()(contents, tmp_path / "e")  # type: ignore[operator]
     assert f"{names[0]} and {names[1]} would both be called {same}: rename one" in str(raised.value)
+    assert str(refused.value) == str(raised.value)
     assert not (tmp_path / "e").exists()
 
 

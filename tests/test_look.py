@@ -25,12 +25,12 @@ GRAY = np.full((60, 80, 3), 128, np.uint8)
 
 
 def test_keypoints_are_drawn_where_they_lie() -> None:
-    """Matched ones green, others red, in a picture as large as the image."""
+    """Matched ones green, others pale, in a picture as large as the image."""
     picture = image_picture(GRAY, np.array([[10.0, 20.0], [70.0, 50.0]]), np.array([True, False]))
     assert picture.shape == (60, 80, 3)
-    green, red = picture[20, 10].astype(int), picture[50, 70].astype(int)
+    green, pale = picture[20, 10].astype(int), picture[50, 70].astype(int)
     assert green[1] - green[0] > 100
-    assert red[0] - red[1] > 100
+    assert pale.min() > 190
     assert (picture[5, 40] == 128).all()
 
 

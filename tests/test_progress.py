@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from aeromatch_cli.cli.progress import RUN_STAGES, LineProgress
+import json
+
+import pytest
+
+from aeromatch_cli.cli.progress import RUN_STAGES, JsonProgress, LineProgress, ProgressKind, progress_shown
+from aeromatch_cli.executor import SilentProgress
 
 
 def test_plain_progress_says_percent_and_time_left(capsys):
@@ -35,24 +40,74 @@ def test_progress_says_which_stage_of_how_many(capsys):
     ]
 
 
-def test_the_time_to_the_end_is_estimated_from_the_stages_that_did_something(monkeypatch, capsys):
-    """Extraction takes 15 shares of 100, what follows 51: after half of it in 10 s (a stage may have further parts, so
-    that a half counts for a quarter), 10 / 3.75 x (11.25 + 51) s are left."""
-    clock = iter([0.0, 0.0, 10.0, 10.0])
-    monkeypatch.setattr("aeromatch_cli.cli.progress.time.monotonic", lambda: next(clock))
-    progress = LineProgress(RUN_STAGES)
-    progress.start("extract", 2)
-    progress.advance()
-    assert capsys.readouterr().err.endswith("10 s left; about 3 min to the end\n")
+def told(monkeypatch, parts):
+    """Seconds to the end as they are told and as they are, after every tenth of every part. parts: labels, items and
+    seconds, in order."""
+    now = [0.0]
+    monkeypatch.setattr("aeromatch_cli.cli.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("aeromatch_cli.cli.progress._JSON_EVERY_S", 0.0)
+    lines: list[str] = []
+    monkeypatch.setattr("aeromatch_cli.cli.progress.printed", lambda line, err: lines.append(line))
+    progress = JsonProgress(RUN_STAGES)
+    whole_s = sum(seconds for _, seconds in parts)
+    pairs = []
+    for label, seconds in parts:
+        progress.start(label, 10)
+        for _ in range(10):
+            now[0] += seconds / 10
+            progress.advance()
+            pairs.append((json.loads(lines[-1])["progress"]["seconds_left"], whole_s - now[0]))
+        progress.stop()
+    return pairs
 
 
-def test_the_end_does_not_come_before_that_of_the_present_part(monkeypatch, capsys):
+# Of a rendered block whose poses are off, and of one whose poses are those of the flight; one job, seconds.
+_FOUND = [
+    ("first look: extract", 3.8), ("first look: match", 0.5), ("first look: filter", 0.3),
+    ("first pass: extract", 8.8), ("first pass: match", 1.3), ("first pass: filter", 0.4),
+    ("first pass: global mapping of 8 images", 6.0), ("pairs", 0.1),
+]  # fmt: skip
+_REST = [
+    ("step first: extract", 15.4), ("step first: match", 13.8), ("step first: filter", 1.0),
+    ("step guided: match", 0.6), ("extract", 0.1), ("match", 0.2), ("filter", 0.9), ("refine", 0.1), ("refine", 2.4),
+    ("adjust", 6.3), ("consistency", 0.8), ("export", 0.5), ("report", 4.4),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("parts", [[*_FOUND, *_REST], [*_FOUND[:3], *_REST]])
+def test_the_time_to_the_end_is_right_to_a_third_from_the_first_tenth_on(monkeypatch, parts):
+    pairs = told(monkeypatch, parts)
+    whole_s = sum(seconds for _, seconds in parts)
+    late = [(left, right) for left, right in pairs if 0.1 * whole_s < right < 0.9 * whole_s]
+    assert len(late) > 50
+    off = [left / right for left, right in late]
+    assert min(off) > 0.7
+    assert max(off) < 1.35
+
+
+def test_the_end_does_not_come_before_that_of_the_present_part(monkeypatch):
     """Matching of 1 s, then 100 s for half of a report: 100 s are left of it alone."""
-    times = iter([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 101.0, 101.0])
-    monkeypatch.setattr("aeromatch_cli.cli.progress.time.monotonic", lambda: next(times))
-    progress = LineProgress(RUN_STAGES)
-    progress.start("match", 1)
-    progress.advance()
-    progress.start("step learned: report", 2)
-    progress.advance()
-    assert capsys.readouterr().err.endswith("2 min left; about 2 min to the end\n")
+    pairs = told(monkeypatch, [("match", 1.0), ("step learned: report", 200.0)])
+    assert pairs[14][0] == pytest.approx(100.0)
+
+
+def test_json_progress_is_a_line_for_machines(capsys):
+    progress = JsonProgress(RUN_STAGES)
+    progress.start("read", 2)
+    progress.advance(2)
+    progress.start("step first: match", 3)
+    progress.advance()  # within half a second of the line before
+    progress.advance(2)
+    lines = [json.loads(line)["progress"] for line in capsys.readouterr().err.splitlines()]
+    assert [(one["stage"], one["number"], one["done"], one["total"]) for one in lines] == [
+        (None, None, 0, 2), (None, None, 2, 2), ("match", 4, 0, 3), ("match", 4, 3, 3),
+    ]  # fmt: skip
+    assert {one["count"] for one in lines} == {10}
+    assert lines[2]["part"] == "step first: match"
+    assert [one["seconds_left"] is None for one in lines] == [True, True, True, False]
+
+
+def test_json_progress_is_shown_even_where_quiet_is_asked_for():
+    assert isinstance(progress_shown(ProgressKind.JSON, quiet=True), JsonProgress)
+    assert isinstance(progress_shown(ProgressKind.AUTO, quiet=True), SilentProgress)
+    assert isinstance(progress_shown(ProgressKind.AUTO, quiet=False), LineProgress)

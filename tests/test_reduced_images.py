@@ -89,12 +89,12 @@ def test_the_half_pixel_in_numbers():
         rows, sizes, empty, np.array([[80, 60]], np.int32), np.zeros(1, np.float32),
         np.full((1, 3), np.nan, np.float32), np.full(1, np.nan, np.float32), np.zeros(1, bool),
     )  # fmt: skip
-    moved = extract._in_stored_frame(plain, 0.25)
+    moved = extract.in_stored_frame(plain, 0.25)
     # The upper left corner stays the corner; pixel 0 of four times the size has its centre at 1.5.
     np.testing.assert_allclose(moved.keypoints_px, [[-0.5, -0.5], [1.5, 5.5], [319.5, 239.5]], atol=1e-5)
     np.testing.assert_allclose(moved.sizes_px, [8.0, 12.0, 16.0], atol=1e-5)
     np.testing.assert_array_equal(moved.view_keypoints_px, rows)
-    np.testing.assert_array_equal(extract._in_stored_frame(plain, 1.0).keypoints_px, rows)
+    np.testing.assert_array_equal(extract.in_stored_frame(plain, 1.0).keypoints_px, rows)
 
 
 def test_reduced_images_give_keypoints_in_stored_pixels(site):

@@ -361,6 +361,19 @@ def test_shards_are_summed_per_stage(tmp_path):
     assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 6.0, 40, 36, 4)
 
 
+def test_facts_of_stages_are_told_in_words_and_internals_are_not(tmp_path):
+    workspace = Workspace(tmp_path)
+    counts = {"seconds": 1.0, "items": 8, "done": 8, "skipped": 0, "failed": 0, "failures": []}
+    facts = {"images_matched": 8, "stays": False, "frame": "world", "stopped": "", "points": 5925}
+    write_json(workspace.stage_report("orient"), {"stage": "orient", **counts, "facts": facts})
+    facts = {"keypoints": 25068, "measured": 23385, "shift_px": 0.2436}
+    write_json(workspace.stage_report("refine"), {"stage": "refine", **counts, "facts": facts})
+    assert [row.facts for row in stage_rows(workspace)] == [
+        "8 images matched in the first pass, 5,925 points",
+        "23,385 keypoints measured, 25,068 matched, moved by 0.24 px (median)",
+    ]
+
+
 def pair_row(index: int, state: str, matches: int, ids: tuple[str, str] = ("a", "b")) -> PairRow:
     reason = "" if state == "verified" else "3 inliers of 40 matches, 15 needed"
     verified = matches if state == "verified" else 0

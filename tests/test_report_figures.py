@@ -144,6 +144,25 @@ def test_figures_are_well_formed_equal_and_in_the_colours_of_the_page():
         assert "matches" in Structure.of(svg).words().lower()
 
 
+def test_labels_of_a_dense_block_lie_on_nothing_else():
+    rng = np.random.default_rng(2)
+    places = rng.uniform((0.0, 0.0), (200.0, 120.0), (55, 2))
+    kinds = ["weak" if k % 6 == 0 else "fine" for k in range(55)]
+    stations = [
+        report_map.Station(str(k), f"DJI_2024_{k:04}_V", "", *map(float, place), kinds[k])
+        for k, place in enumerate(places)
+    ]
+    axes = figures.new_axes(9.0, 6.0)
+    axes.set(xlim=(-5.0, 205.0), ylim=(-5.0, 125.0))
+    report_map._draw_labels(axes, stations)
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert len(boxes) > 15
+    assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+    assert not any(box.count_contains(axes.transData.transform(places)) for box in boxes)
+    frame = axes.get_window_extent()
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
+
+
 def test_a_view_of_the_horizon_does_not_shrink_the_block():
     stations = [report_map.Station(str(k), str(k), "", 20.0 * k, 0.0) for k in range(6)]
     wide = np.array([[0.0, -1e5], [1e5, -1e5], [1e5, 1e5], [0.0, 1e5]])

@@ -98,6 +98,28 @@ def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
     assert not tilted <= {f"{name}.png" for name in names}
 
 
+def test_pictures_of_views_outlive_features_of_other_settings(site: Site) -> None:
+    """They were asked for, and features are found without them."""
+    workspace = Workspace(site.work)
+    image_id = site.names()[0].replace(".", "_")
+    folder = workspace.views(image_id).parent
+
+    def shown() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in folder.glob("*.png")}
+
+    assert site("simulate", "--set", "simulate=tilts").code == 0
+    tilted = shown()
+    assert site("simulate", "--set", "simulate=tilts").done() == {}
+    assert site("match").code == 0
+    assert shown() == tilted
+    told = read_json(workspace.view_pictures(image_id))["views"]
+    assert {f"{view['name']}.png" for view in told} == tilted.keys()
+    assert [view["name"] for view in read_json(workspace.views(image_id))["views"]] == ["ground"]
+    assert site("match").done() == {}
+    assert site("match", "--keep-images").code == 0
+    assert shown().keys() == {"ground.png"}
+
+
 @pytest.mark.parametrize("command", ["extract", "run"])
 def test_pictures_of_the_same_settings_stay(site: Site, command: str) -> None:
     shadow = ("--set", "enhance=shadow")
@@ -112,6 +134,6 @@ def test_pictures_of_the_same_settings_stay(site: Site, command: str) -> None:
     assert pictures() == made
     for stage in ("enhance", "simulate"):
         assert site(stage, *shadow).counts(stage) == (0, IMAGES, 0)
-    # Of other settings they go: the features come from other pixels.
+    # Of other settings enhanced ones go: the features come from other pixels. Those that `simulate` has made stay.
     assert site(command, *shadow, "--set", "enhance.max_gain=5").code == 0
-    assert pictures() == {}
+    assert pictures() == {path: time for path, time in made.items() if "simulated" in path.parts}

@@ -93,6 +93,28 @@ def test_nothing_is_left_of_a_run_that_could_not_begin(site: Site) -> None:
         outcome = invoke(command, "baseline", "--images", site.root / "empty", "--workspace", site.work)
         assert outcome.code in (2, 3)
         assert not site.work.exists()
+    given = ("--images", site.images, "--poses", site.poses, "--cameras", site.root / "block.json")
+    for wrong in (
+        ("--images", site.root / "absent"), ("--poses", site.root / "absent.csv"), ("--crs", "EPSG:1"),
+        ("--masks", site.root / "absent"), ("--gcp", site.root / "absent.txt"), ("--ground", "absent.tif"),
+        ("--memory", "1MB"),
+    ):  # fmt: skip
+        deep = site.work / "deep" / "er"
+        outcome = invoke("run", "baseline", *given, "--jobs", 1, "--workspace", deep, *wrong, "--quiet")
+        assert (outcome.code in (2, 3), outcome.stderr.startswith("error: ")) == (True, True), wrong
+        assert not site.work.exists(), wrong
+    twin = site.images / "second" / site.names()[0]
+    twin.parent.mkdir()
+    twin.write_bytes(site.image(1).read_bytes())
+    for command in ("check", "run"):
+        outcome = invoke(command, "baseline", *given, "--workspace", site.work, "--set", "export=colmap+opensfm")
+        assert outcome.code == 2
+        assert f"second/{twin.name} and {twin.name} would both be called {twin.name}: rename" in outcome.stderr
+        assert not site.work.exists()
+    for command in ("filter", "adjust", "export"):
+        outcome = invoke(command, "baseline", *given, "--workspace", site.work)
+        assert (outcome.code, "does not exist: run `aeromatch run`" in outcome.stderr) == (3, True)
+        assert not site.work.exists()
     site.work.mkdir()
     invoke("run", "baseline", "--images", site.root / "empty", "--workspace", site.work)
     assert site.work.is_dir()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import IMAGES
+from conftest import IMAGES, PAGE
 from make_images import write_image
 from read_html import shapes
 from read_inputs import read_inputs
@@ -231,7 +231,7 @@ def test_labels_on_the_map_do_not_cover_each_other():
     ]
     stations.append(report_map.Station("far", "far", "", 100.0, 100.0))
     svg = report_map.block_map(stations, [], []).svg
-    assert re.findall(r'<g class="label">\s*<text[^>]*>([^<]+)</text>', svg) == ["label3", "far"]
+    assert re.findall(r'<g class="label">\s*<text[^>]*>([^<]+)</text>', svg) == ["label3", "label0", "far"]
 
 
 def test_memory_estimate_counts_the_largest_view(site):
@@ -263,6 +263,25 @@ def test_time_estimate_leaves_out_what_happens_once(site, monkeypatch):
     assert estimate["seconds"] == pytest.approx(whole, abs=0.2)
 
 
+def test_disk_estimate_is_that_of_the_finished_workspace(site):
+    estimate = site("check", *PAGE).facts["estimate"]
+    assert site("run", *PAGE).code == 0
+    size_mb = sum(path.stat().st_size for path in site.work.rglob("*") if path.is_file()) / 1e6
+    assert estimate["disk_mb"] == pytest.approx(size_mb, rel=0.3)
+
+
+def test_time_estimate_counts_a_whole_first_pass_where_given_poses_are_wrong(site):
+    def orient_s() -> float:
+        return float(site("check").facts["estimate"]["seconds_to_orient"])
+
+    looked_at_s = orient_s()
+    # Every image turned by as much as the next one is not: no pair is explained.
+    site.rewrite_poses(
+        lambda rows: [{**row, "phi_deg": str(float(row["phi_deg"]) + 15.0 * (k % 3))} for k, row in enumerate(rows)]
+    )
+    assert orient_s() > looked_at_s + 1.0  # the mapping alone takes more
+
+
 def test_the_orientation_costs_nothing_where_it_is_there_or_not_wanted(done_site):
     assert done_site("check").facts["estimate"]["seconds_to_orient"] == 0.0
     outcome = done_site("check", "--set", "orient=none")
@@ -281,4 +300,5 @@ def test_the_estimate_times_pairs_where_a_run_matches_them(site, monkeypatch):
     monkeypatch.setattr(Executor, "run", recorded)
     assert site("check").code == 0
     whole, first_pass = [("_try_image", len(site.names())), ("_try_pair", 3)], [("_try_image", 2), ("_try_pair", 1)]
-    assert labels[-4:] == [*whole, *first_pass]
+    # All sampled pairs are looked at, to judge the given poses.
+    assert labels == [("_read_header", len(site.names())), *whole, *(3 * first_pass)]

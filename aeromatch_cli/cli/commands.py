@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aeromatch_cli.cli.options import Jobs, Json, LogFile, Quiet
+from aeromatch_cli.cli.options import Jobs, Json, LogFile, ProgressFormat, Quiet
 from aeromatch_cli.cli.output import as_texts, guarded
-from aeromatch_cli.cli.progress import progress_shown
+from aeromatch_cli.cli.progress import ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def evaluate(
     mapping: Annotated[bool, typer.Option(help="Also count the images that pycolmap registers (default yes).")] = True,
     log_file: LogFile = None,
     json_: Json = False,
+    progress: ProgressFormat = ProgressKind.AUTO,
     quiet: Quiet = False,
 ) -> None:
     """Evaluate the matches of a workspace against rendered truth or reference poses."""
@@ -69,7 +70,7 @@ def evaluate(
         from aeromatch_cli.evaluate.output import facts, lines, refresh_report, write_evaluation
         from aeromatch_cli.stages.run import Result
 
-        evaluation = evaluate_workspace(work, truth, mapping=mapping, progress=progress_shown(quiet))
+        evaluation = evaluate_workspace(work, truth, mapping=mapping, progress=progress_shown(progress, quiet=quiet))
         try:
             written = write_evaluation(evaluation)
         except WorkspaceError as error:  # an archive that nobody may write: its figures are no less true
@@ -149,6 +150,7 @@ def synth(
     jobs: Jobs = None,
     log_file: LogFile = None,
     json_: Json = False,
+    progress: ProgressFormat = ProgressKind.AUTO,
     quiet: Quiet = False,
 ) -> None:
     """Render a block of images with exact truth."""
@@ -161,7 +163,7 @@ def synth(
         summary = render_block(
             out, preset, seed=seed, width_px=width_px, height_px=height_px, images=images, flight=flight,
             lens=lens.upper(), height_m=height, sun_deg=_parse_sun(sun), texture=texture,
-            readout_ms=readout_ms, speed_m_s=speed, jobs=jobs or 0, progress=progress_shown(quiet),
+            readout_ms=readout_ms, speed_m_s=speed, jobs=jobs or 0, progress=progress_shown(progress, quiet=quiet),
         )  # fmt: skip
         return Result((f"rendered {images} images into {out} ({summary.seconds:.0f} s)",), as_texts(asdict(summary)))
 

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from aeromatch_cli.cli.progress import ProgressKind
+
 # Groups of options in every help.
 _BLOCK, _RESULTS, _WORK, _MESSAGES = "Block", "Results and settings", "How it runs", "Messages"
 
@@ -281,6 +283,16 @@ Json = Annotated[
         help="Print a JSON object as the last line of stdout.",
     ),
 ]
+ProgressFormat = Annotated[
+    ProgressKind,
+    typer.Option(
+        "--progress",
+        envvar="AEROMATCH_PROGRESS",
+        show_envvar=False,
+        rich_help_panel=_MESSAGES,
+        help="json: a JSON object per line on stderr; auto: a bar on a terminal, plain lines elsewhere.",
+    ),
+]
 Quiet = Annotated[
     bool,
     typer.Option(
@@ -289,6 +301,6 @@ Quiet = Annotated[
         envvar="AEROMATCH_QUIET",
         show_envvar=False,
         rich_help_panel=_MESSAGES,
-        help="Print only errors, no summary and no progress.",
+        help="Print only errors, lost images and a result that is not good.",
     ),
 ]

@@ -56,6 +56,7 @@ class FilterFacts(Facts):
     verified_matches: int | None = Field(None, description="Matches of the verified pairs.")
     components: list[int] = Field([], description="Sizes of the groups of images that verified pairs connect.")
     weakly_tied: list[str] = Field([], description="Images with few verified matches.")
+    unconnected: list[str] = Field([], description="Images with no verified match.")
 
 
 class AdjustFacts(Facts):
@@ -205,6 +206,9 @@ class Outcome(Line):
     workspace: str = Field(description="Folder of the results.")
     failures: int = Field(description="Images and pairs that failed; failures.csv names them.")
     quality: Quality | None = Field(None, description="After `run` and `adjust`: what their line `result` says.")
+    lost: dict[str, str] | None = Field(
+        None, description="After `run` and `adjust`: images that the result does not hold -> reason; as in lost.csv."
+    )
     stages: Stages = Field(description="What each stage did.")
 
 

@@ -95,11 +95,13 @@ def _outcome(call: Callable[[], Result], *, quiet: bool, strict: bool) -> dict[s
     say = said(quiet)
     for line in result.lines:
         say(line)
-    if quiet:  # what failed is an error
+    if quiet:  # what failed is an error, and a result that is not whole must not pass for a good one
         for failure in result.failures[:_FAILURES_SHOWN]:
             printed(": ".join(failure[1:]), err=True)
         if len(result.failures) > _FAILURES_SHOWN:
             printed(f"and {len(result.failures) - _FAILURES_SHOWN} more", err=True)
+        for line in result.urgent:
+            printed(line, err=True)
     return result.facts | {"exit_code": _exit_code(result, strict=strict)}
 
 

@@ -1,10 +1,13 @@
-"""Progress: a bar on a terminal, plain lines elsewhere."""
+"""Progress: a bar on a terminal, plain lines elsewhere, or JSON lines for machines."""
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from aeromatch_cli.cli.output import printed
@@ -13,22 +16,51 @@ if TYPE_CHECKING:
     from aeromatch_cli.executor import Progress
 
 
-# What `run` goes through, in order, and the share of its time that a stage takes, roughly: blocks of twelve small
-# images to some of 12 megapixels, preset auto (reports/<stage>.json).
-_SHARES = {"orient": 0.3, "pairs": 0.05, "extract": 0.15, "match": 0.25, "filter": 0.03, "refine": 0.05,
-           "adjust": 0.13, "consistency": 0.02, "export": 0.01, "report": 0.02}  # fmt: skip
-RUN_STAGES = tuple(_SHARES)
+class ProgressKind(StrEnum):
+    """How progress is shown; auto: a bar on a terminal, plain lines elsewhere."""
+
+    AUTO = "auto"
+    JSON = "json"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of `run`: its stage, the words of its label, and the share of the whole time that it takes, roughly."""
+
+    stage: str
+    words: str
+    share: float
+
+
+# What `run` goes through, in order: blocks of eight small images to some of 12 megapixels, preset auto, one job
+# (--log-file tells the seconds of every part).
+_PARTS = (
+    _Part("orient", "first look extract", 0.05), _Part("orient", "first look match", 0.01),
+    _Part("orient", "first look filter", 0.005),
+    _Part("orient", "first pass extract", 0.14), _Part("orient", "first pass match", 0.02),
+    _Part("orient", "first pass filter", 0.01), _Part("orient", "first pass mapping", 0.10),
+    _Part("pairs", "pairs", 0.005), _Part("extract", "extract", 0.23), _Part("match", "match", 0.21),
+    _Part("filter", "filter", 0.02), _Part("refine", "refine", 0.045), _Part("adjust", "adjust", 0.10),
+    _Part("consistency", "consistency", 0.01), _Part("export", "export", 0.01), _Part("report", "report", 0.065),
+)  # fmt: skip
+# While given poses are looked at nobody knows whether they do, or are to be found from the pictures.
+_CHANCE = 0.5
+RUN_STAGES = tuple(dict.fromkeys(part.stage for part in _PARTS))
 # A shard ends there: what follows needs the whole block.
 SHARD_STAGES = RUN_STAGES[: RUN_STAGES.index("filter") + 1]
+# JSON lines come no faster than this, seconds, but for the first and the last of every part.
+_JSON_EVERY_S = 0.5
 
 
-def progress_shown(quiet: bool, stages: Sequence[str] = ()) -> Progress:
-    """How a command shows how far it is: nothing if quiet, a bar on a terminal, plain lines elsewhere.
+def progress_shown(kind: ProgressKind, *, quiet: bool, stages: Sequence[str] = ()) -> Progress:
+    """How a command shows how far it is; quiet: not at all, unless JSON is asked for.
 
     stages: what the command goes through; each is shown with its place among them.
     """
     from aeromatch_cli.executor import SilentProgress
 
+    if kind is ProgressKind.JSON:
+        return JsonProgress(stages)
     if quiet:
         return SilentProgress()
     return TerminalProgress(stages) if sys.stderr.isatty() else LineProgress(stages)
@@ -37,50 +69,64 @@ def progress_shown(quiet: bool, stages: Sequence[str] = ()) -> Progress:
 class _Course:
     """Where a command is among its stages, and how long the rest may take.
 
-    The number of the stage never goes back: the steps of a cascade, which extract and match again, belong to the
-    stage that the first of them has reached. The rest is estimated from the stages that have done something so far.
+    The place never goes back: the steps of a cascade, which extract and match again, belong to the part that the first
+    of them has reached. The rest is estimated from the parts that have been done so far; one that is left out, as
+    everything of it is up to date, tells nothing.
     """
 
     def __init__(self, stages: Sequence[str]) -> None:
-        self._stages = stages
-        self._place, self._parts = -1, 0
-        self._reached = 0.0  # of the present stage, 0-1
-        self._known = 0.0  # shares of the stages that have done something before
-        self._first: float | None = None
-        self._part_begun = 0.0
+        self._stages = tuple(stages)
+        self._parts = [part for part in _PARTS if part.stage in stages]
+        self._place = -1
+        self.stage = ""  # the present one, "" where it is none of the command's
+        self._first_time = False  # whether the present part is done for the first time
+        self._begun_s = 0.0
+        self._done, self._spent_s = 0.0, 0.0  # shares of parts before, and what they took
+
+    @property
+    def number(self) -> int:
+        """Of the present stage, from 1."""
+        return self._stages.index(self.stage) + 1
+
+    @property
+    def count(self) -> int:
+        return len(self._stages)
 
     def begin(self, label: str) -> str:
-        """`match` as `4/9 match`. Parts of a stage begin with its name or end with it."""
-        self._part_begun = time.monotonic()
-        self._first = self._first or self._part_begun
-        words = label.replace(":", " ").split()
-        first_pass = words[:2] == ["first", "pass"]
-        own = "orient" if first_pass else next((w for w in (words[-1], words[0]) if w in self._stages), "")
-        if own not in self._stages:
-            return label
-        place = max(self._place, self._stages.index(own))
-        if place > self._place >= 0:
-            self._known += _SHARES[self._stages[self._place]]
-        self._parts = 1 if place > self._place else self._parts + 1
-        self._place = place
-        return f"{place + 1}/{len(self._stages)} {label}"
+        """`match` as `4/10 match`."""
+        now_s = time.monotonic()
+        if self._first_time:
+            self._done += self._parts[self._place].share
+            self._spent_s += now_s - self._begun_s
+        self._begun_s = now_s
+        place = self._found(label)
+        self._first_time = place > self._place
+        self._place = max(place, self._place)
+        self.stage = self._parts[self._place].stage if place >= 0 else ""
+        return f"{self.number}/{self.count} {label}" if self.stage else label
+
+    def _found(self, label: str) -> int:
+        """The part that a label names, the one with most words in common; -1 for none."""
+        words = set(label.replace(":", " ").split())
+        fitting = [k for k, part in enumerate(self._parts) if words.issuperset(part.words.split())]
+        return max(fitting, key=lambda k: len(self._parts[k].words.split()), default=-1)
 
     def left_s(self, fraction: float) -> float | None:
         """Of the whole command. fraction: of the part that is being done."""
-        if self._place < 0 or self._first is None:
+        if not self.stage or fraction <= 0.0:
             return None
-        # How many parts a stage has is not known before: each is taken for half of what is left of it.
-        self._reached = 1.0 - 0.5 ** (self._parts - 1) * (1.0 - 0.5 * fraction)
-        own = _SHARES[self._stages[self._place]]
-        done = self._known + own * self._reached
-        later = sum(_SHARES[name] for name in self._stages[self._place + 1 :])
-        rest = own * (1.0 - self._reached) + later
-        if done <= 0.0:
-            return None
-        now = time.monotonic()
-        # Shares are those of other blocks: what is left of the present part alone may already be more.
-        part_s = (now - self._part_begun) * (1.0 - fraction) / fraction if fraction > 0.0 else 0.0
-        return max((now - self._first) / done * rest, part_s)
+        part_s = time.monotonic() - self._begun_s
+        done, spent_s = self._done, self._spent_s
+        if self._first_time:
+            done, spent_s = done + fraction * self._parts[self._place].share, spent_s + part_s
+        rate = spent_s / done if done > 0.0 else 0.0
+        return part_s * (1.0 - fraction) / fraction + rate * self._later()
+
+    def _later(self) -> float:
+        """Shares of the parts after the present one."""
+        looking = " look " in self._parts[self._place].words
+        later = self._parts[self._place + 1 :]
+        return sum(part.share * (_CHANCE if looking and part.stage == "orient" else 1.0) for part in later)
 
 
 def _words(seconds: float) -> str:
@@ -109,6 +155,46 @@ class LineProgress:
 
     def stop(self) -> None:
         """Nothing to clean up."""
+
+
+class JsonProgress:
+    """One JSON object per line, for programs that watch a run.
+
+    stage: one of the command's, null for what comes before them. part: what is being done, in words. number, count: of
+    the stage among all. done, total: items of the part. seconds_left: to the end of the command; null where unknown.
+    """
+
+    def __init__(self, stages: Sequence[str] = ()) -> None:
+        self._course = _Course(stages)
+
+    def start(self, label: str, total: int) -> None:
+        self._course.begin(label)
+        self._label, self._total, self._done = label, total, 0
+        self._print()
+
+    def advance(self, count: int = 1) -> None:
+        self._done += count
+        if self._done >= self._total or time.monotonic() - self._printed_s >= _JSON_EVERY_S:
+            self._print()
+
+    def stop(self) -> None:
+        """Nothing to clean up."""
+
+    def _print(self) -> None:
+        self._printed_s = time.monotonic()
+        stage, left_s = self._course.stage, self._course.left_s(self._done / max(self._total, 1))
+        line = {
+            "progress": {
+                "stage": stage or None,
+                "part": self._label,
+                "number": self._course.number if stage else None,
+                "count": self._course.count or None,
+                "done": self._done,
+                "total": self._total,
+                "seconds_left": None if left_s is None else round(left_s, 1),
+            }
+        }
+        printed(json.dumps(line), err=True)
 
 
 class TerminalProgress:

@@ -30,6 +30,7 @@ from aeromatch_cli.cli.options import (
     Overwrite,
     PoseFormat,
     Poses,
+    ProgressFormat,
     Quiet,
     Scheduler,
     Set,
@@ -38,7 +39,7 @@ from aeromatch_cli.cli.options import (
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
-from aeromatch_cli.cli.progress import RUN_STAGES, SHARD_STAGES, progress_shown
+from aeromatch_cli.cli.progress import RUN_STAGES, SHARD_STAGES, ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -165,6 +166,7 @@ def stage_command(name: str) -> Callable[..., None]:
         keep_images: KeepImages = False,
         log_file: LogFile = None,
         json_: Json = False,
+        progress: ProgressFormat = ProgressKind.AUTO,
         quiet: Quiet = False,
     ) -> None:
         block: dict[str, Any] = {"images": images, "poses": poses, "cameras": cameras, "crs": crs, "ground": ground}
@@ -194,7 +196,7 @@ def stage_command(name: str) -> Callable[..., None]:
             )
             _check_control(block, settings.block)
             course = SHARD_STAGES if shard else RUN_STAGES
-            shown = progress_shown(quiet, course if name == "run" else ())
+            shown = progress_shown(progress, quiet=quiet, stages=course if name == "run" else ())
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)

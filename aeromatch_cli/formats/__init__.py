@@ -223,15 +223,18 @@ The enhanced picture (kept by the single stage and with `--keep-images`); the ma
 `fingerprint`, `picture` (whether the picture is kept), the strategy's own facts and `files`. Images that are not
 enhanced have none.
 
-### simulated/<id>/views.json, <view>.png
+### simulated/<id>/views.json, pictures.json, <view>.png
 
-- `fingerprint`, `files`. `pictures`: whether the PNGs are kept. `scale`: stored raster to the raster that the views
+- `fingerprint`, `files`. `scale`: stored raster to the raster that the views
   were made of. `remark`: why another ground than the terrain below the image is looked at, else empty.
 - `views`: list of `name`, `width_px`, `height_px`, `is_source`, `angle_deg`, `enhanced`, `undistorted_from_view` (3x3).
   Source pixel = distort(camera, `undistorted_from_view` . view pixel). With `is_source` the view is the raster itself.
   With `scale` < 1 the camera is the one resized by it. View `far` is a part of the undistorted image, a few pixels
   larger or smaller than what it shows: only ground that the box of the ground view leaves out, the rest is black.
-- `<view>.png`: gray picture of the view (kept by the single stage and with `--keep-images`).
+- `<view>.png`: gray picture of the view. `simulate`, and every command with `--keep-images`, writes them, in place of
+  earlier ones; other commands leave them as they are.
+- `pictures.json`: as views.json, of the views that the PNGs show; it differs from views.json where features were found
+  with other settings since. Absent without PNGs.
 
 ## Features and matches
 
@@ -302,8 +305,8 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `facts` of refine: `keypoints` (matched ones, without those that stand for their points), `measured`, `shift_px`.
 - `facts` of adjust: those of `orientation/adjusted.json`.
 - `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
-  `weakly_tied` (as of filter, of those that stay), `points`, `observations` (of the adjusted block), `points_left`,
-  `observations_left` (that those that stay hold),
+  `weakly_tied`, `unconnected` (as of filter, of those that stay), `points`, `observations` (of the adjusted block),
+  `points_left`, `observations_left` (that those that stay hold),
   `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
   `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
   (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images
@@ -311,12 +314,18 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 - `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
   matches than their overlap promises, or with empty parts of it). Of extract with a cascade: `images_by_step`.
   Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
-  `weakly_tied` (images with few verified matches).
+  `weakly_tied` (images with few verified matches), `unconnected` (those with none).
 - `facts` of export: exporter -> files and counts.
 
 ### failures.csv
 
 `stage`, `item`, `reason`: every image or pair that failed, by the names of the files, a pair as `NAME0 and NAME1`.
+
+### lost.csv
+
+Written by `run` and `adjust`: every image of the folder that the result does not hold. `image` (relative path), `what`
+(`not read`, `not oriented`; of a block that was not adjusted `not connected`), `reason`. Without lines where
+every image is held.
 
 ### .lock
 

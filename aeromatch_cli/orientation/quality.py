@@ -205,7 +205,7 @@ def _left_out(evidence: Evidence) -> _Found:
     if outside:
         one = evidence.names.get(outside[0], outside[0])
         remedy = (
-            f"not oriented: {evidence.named(outside)}; the lines of adjust say why; `aeromatch show WORK {one}` shows "
+            f"not oriented: {evidence.named(outside)}; lost.csv says why; `aeromatch show WORK {one}` shows "
             "what it has; images of other places may be left out"
         )
     else:

@@ -25,6 +25,13 @@ _WIDTH, _LEGEND_WIDTH, _AXES_HEIGHTS = 1000.0, 190.0, (330.0, 860.0)
 # Side of the frame over the extent of the cameras, and over the extent of what it shows.
 _LARGEST_FRAME = 5.0
 _AIR = 1.08
+# Where a label may stand beside its camera, the best place first: points to the right and up, and what of it is there.
+_BESIDE: dict[tuple[float, float], dict[str, str]] = {
+    (right, up): {"ha": "left" if right > 0 else "right", "va": "bottom" if up > 0 else "top"}
+    for right, up in ((5.0, 3.0), (5.0, -4.0), (-5.0, 3.0), (-5.0, -4.0))
+}
+# What a browser's font may need more than matplotlib's, points.
+_LABEL_AIR = 2.0
 _REJECTED: dict[str, Any] = {"color": COLOURS["bad"], "linewidth": 0.8, "linestyle": (0, (5, 4)), "alpha": 0.7}
 _UNJUDGED: dict[str, Any] = {"color": COLOURS["soft"], "linewidth": 0.8, "linestyle": (0, (1.5, 3)), "alpha": 0.7}
 _CAMERAS = {
@@ -243,17 +250,21 @@ def _draw_links(
 
 
 def _draw_labels(axes: Any, stations: Sequence[Station]) -> None:
-    """Labels that lie on no earlier one and on no other camera; the tooltips name all. Weak and wrong come first."""
-    taken: list[Any] = []
+    """Labels that lie on no earlier one and on no other camera, within the map; the tooltips name all. Weak and wrong
+    come first."""
+    taken = [text.get_window_extent() for text in axes.texts]
     places = axes.transData.transform([(s.x_m, s.y_m) for s in stations])
+    inside = axes.get_window_extent()
+    # Names are no formulas, even with two dollar signs.
+    style = {"gid": "label", "color": COLOURS["ink"], "parse_math": False, "zorder": 3.5}
     for station in sorted(stations, key=lambda s: s.kind, reverse=True):
-        where = {"xytext": (5.0, 4.0), "textcoords": "offset points", "zorder": 3.5}
-        # Names are no formulas, even with two dollar signs.
-        where |= {"gid": "label", "color": COLOURS["ink"], "parse_math": False}
-        text = axes.annotate(station.label, (station.x_m, station.y_m), **where)
-        box = text.get_window_extent()
-        hides = station.kind == "fine" and box.count_contains(places)
-        if hides or any(box.overlaps(other) for other in taken):
+        for (right, up), sides in _BESIDE.items():
+            text = axes.annotate(
+                station.label, (station.x_m, station.y_m), (right, up), textcoords="offset points", **sides, **style
+            )
+            box = text.get_window_extent().padded(_LABEL_AIR)
+            free = not any(box.overlaps(other) for other in taken) and not box.count_contains(places)
+            if free and inside.containsx(box.x0) and inside.containsx(box.x1):
+                taken.append(box)
+                break
             text.remove()
-        else:
-            taken.append(box)

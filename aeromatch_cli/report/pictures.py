@@ -20,18 +20,18 @@ _SIDE_PX = 1400
 _GAP_PX = 8
 # A match with this error is yellow, one without any green.
 _LARGE_ERROR_PX = 2.0
-_GREEN, _YELLOW, _RED = (60, 200, 80), (250, 220, 60), (230, 60, 60)
+_GREEN, _YELLOW, _RED, _PALE = (60, 200, 80), (250, 220, 60), (230, 60, 60), (205, 215, 235)
 # Lines of more matches hide the images.
 _MOST_LINES = 400
 
 
 def image_picture(pixels: NDArray[Any], keypoints_px: FloatArray, matched: BoolArray) -> NDArray[np.uint8]:
-    """RGB picture with every keypoint (K, 2), matched ones (K,) green and above the others."""
+    """RGB picture with every keypoint (K, 2), matched ones (K,) green and above the others, which are no fault."""
     import cv2
 
     picture, ratio = small(pixels)
     places = (np.asarray(keypoints_px, np.float64) + 0.5) * ratio - 0.5
-    for chosen, colour in ((~matched, _RED), (matched, _GREEN)):
+    for chosen, colour in ((~matched, _PALE), (matched, _GREEN)):
         for x, y in places[chosen]:
             cv2.circle(picture, (round(x), round(y)), 2, colour, -1, cv2.LINE_AA)
     return picture

@@ -1,7 +1,7 @@
 """What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
 
-Of reports/*.json every stage's counts and plain facts are shown as they are named there; by name the report reads
-`summary` and `warnings` of pairs, those of orient and adjust (page.py), `spread` and `doubtful` of consistency.
+Of reports/*.json every stage's counts are shown, and of its facts those that `_DETAILS` has words for; the page also
+reads `summary` and `warnings` of pairs, those of orient and adjust (page.py), `spread` and `doubtful` of consistency.
 """
 
 from __future__ import annotations
@@ -20,6 +20,33 @@ from aeromatch_cli.stages.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
+_VIEWS = (("views_per_image", "{:.3g} views per image"), ("view_megapixels_per_image", "{:.3g} megapixels together"))
+_UNENHANCED = (("images_skipped_same_illumination", "{:,} images not enhanced (same illumination)"),)
+# What is told of a stage's facts, and how.
+_DETAILS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "orient": (("images_matched", "{:,} images matched in the first pass"), ("points", "{:,} points")),
+    "pairs": (("images", "of {:,} images"),),
+    "enhance": _UNENHANCED,
+    "simulate": _VIEWS,
+    "extract": (
+        ("keypoints", "{:,} keypoints"), ("images_without_keypoints", "{:,} images without keypoints"), *_VIEWS,
+        *_UNENHANCED,
+    ),
+    "match": (("matches", "{:,} matches before verification"), ("not_settled", "{:,} pairs left with few matches")),
+    "filter": (("verified_matches", "{:,} verified matches"),),
+    "refine": (
+        ("measured", "{:,} keypoints measured"), ("keypoints", "{:,} matched"),
+        ("shift_px", "moved by {:.2f} px (median)"),
+    ),
+    "adjust": (
+        ("images", "{:,} images oriented"), ("points", "{:,} points"), ("track_length", "{:.1f} images per point"),
+        ("reprojection_error_px", "mean reprojection error {:.2f} px"),
+    ),
+    "consistency": (
+        ("verified_matches", "{:,} verified matches left"), ("dropped_matches", "{:,} dropped"),
+        ("rejected_pairs", "{:,} pairs dropped as a whole"), ("points_left", "{:,} points left"),
+    ),
+}  # fmt: skip
 STAGE_ORDER = (
     "orient",
     "pairs",
@@ -140,7 +167,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
             sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
         )
         label = f"{name} ({len(shards[name])} shards)" if sharded else name
-        facts = "" if sharded else _facts_words(reports[0]["facts"])
+        facts = "" if sharded else _details(name, reports[0]["facts"])
         rows.append(StageRow(label, seconds, items, done, skipped, failed, facts))
     return rows
 
@@ -160,14 +187,9 @@ def seconds_by_stage(workspace: Workspace) -> dict[str, float]:
     return found
 
 
-def _facts_words(facts: Mapping[str, Any]) -> str:
-    """The plain numbers and words among a stage's facts, without checksums; what is nested has its own place."""
-    plain = {k: value for k, value in facts.items() if isinstance(value, int | float | str) and "sha256" not in k}
-    return ", ".join(f"{key.replace('_', ' ')} {_number(value)}" for key, value in plain.items())
-
-
-def _number(value: float | str) -> str:
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.2f}" if isinstance(value, float) else value
+def _details(stage: str, facts: Mapping[str, Any]) -> str:
+    """What a stage has found, in words; nothing is said of what is zero or unknown."""
+    return ", ".join(words.format(facts[key]) for key, words in _DETAILS.get(stage, ()) if facts.get(key))
 
 
 def failure_rows(context: Context) -> list[dict[str, str]]:

@@ -245,12 +245,12 @@ def _image(work: _Work, image: Image, out: Path | None, *, views: bool) -> Shown
                 lines.append(f"{what:<11} {path}")
     target = out or _own_file(workspace, f"{image_id}.png")
     picture = image_picture(read_pixels(work.picture(image), colour=True), keypoints, matched)
-    tiles = [Tile("keypoints: in verified matches green, others red", picture)]
+    tiles = [Tile("keypoints: in verified matches green, others pale", picture)]
     if views:
         tiles += tiles_of_image(steps_of_image(work.settings, image_id))
     write_tiles(target, tiles, lines, image.name)
     also = f"; {', '.join(tile.title for tile in tiles[1:])}" if views else ""
-    lines.append(f"picture     {target}: keypoints in verified matches green, others red{also}")
+    lines.append(f"picture     {target}: keypoints in verified matches green, others pale{also}")
     partners = {name: count for count, name, *_ in rows}
     facts = {"image": image.name, "keypoints": len(keypoints), "partners": partners, "picture": str(target)}
     return Shown(lines, facts, target)

@@ -6,33 +6,44 @@ import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from aeromatch_cli.data import Features, Pair
+import numpy as np
+
+from aeromatch_cli.data import Features, FloatArray, Pair
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.orientation.judgement import EXPLAINED_SHARE, MIN_MATCHES, PairPoints, explained_share
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
 from aeromatch_cli.stages.memory import command_mb, runs_network
+from aeromatch_cli.stages.models import thresholds_px
 from aeromatch_cli.stages.rows import PairTask
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.chain import Filter
 from aeromatch_cli.strategies.orienters import FirstPass
 
-_BYTES_PER_DESCRIPTOR = 170.0
-_BYTES_PER_MATCH = 60.0
+# Of what the stages write, measured on blocks of 8 and 9 images of 0.75 megapixels. A match is written before and after
+# verification, and with a cascade once more by its step.
+_BYTES_PER_DESCRIPTOR, _BYTES_PER_MATCH = 170.0, 34.0
+# What a cascade has found together, per keypoint; and refined keypoints, with what they were measured from.
+_BYTES_PER_UNITED, _BYTES_PER_REFINED = 18.0, 20.0
+# Per match: the adjusted block, and what an exporter writes of its observations.
+_BYTES_PER_ADJUSTED, _BYTES_PER_EXPORTED = 25.0, 90.0
+# The page, and the reduced pictures on it, by the pixels of the images up to where these are reduced.
+_BYTES_OF_PAGE, _BYTES_PER_PIXEL, _BYTES_PER_PICTURE = 0.8e6, 0.16, 0.12e6
 # How many pairs are tried, and how much smaller the picture is with which a worker gets ready.
 _SAMPLED_PAIRS = 3
 _WARM_UP_SCALE = 0.25
-# Seconds of mapping per image: measured 0.04 (300 images of 480 x 360) to 0.4 (ochota).
-_MAPPING_S = 0.2
+# Seconds of mapping, and per image: measured 0.04 (300 images of 480 x 360) to 0.4 (8 images, and ochota).
+_MAPPING_S, _MAPPING_S_PER_IMAGE = 1.5, 0.15
 # Seconds of measuring, adjustment, consistency, export and report for one of orientation, features and matching: 0.20
-# to 0.30 in blocks of 7 to 13 images, lewis, ochota, seneca and rendered ones.
-_LATER = 0.26
+# to 0.30 in blocks of 7 to 13 images, lewis, ochota, seneca and rendered ones. The page takes some in any block.
+_LATER, _PAGE_S = 0.26, 3.0
 
 
 @dataclass(frozen=True)
@@ -67,13 +78,15 @@ class _PairTrial:
 class _Tried:
     """start_s: what a worker does once (imports, networks). seconds: what every further item takes.
 
-    features: of a sampled image. matches: of a sampled pair.
+    features: of a sampled image. matches: of a sampled pair, before verification; verified: stored pixels (M, 2) of
+    either image of those that are left.
     """
 
     start_s: float
     seconds: float
     features: Features | None = None
     matches: int = 0
+    verified: tuple[FloatArray, FloatArray] = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros((0, 2))))
 
 
 def _try_image(trial: _Trial) -> _Tried:
@@ -92,24 +105,27 @@ def _try_image(trial: _Trial) -> _Tried:
 
 def _features(trial: _Trial, views: simulate.SimulateTask) -> Features:
     pictures, _ = simulate.render(views)
-    return trial.task.extractor(views.enhance.source.working_camera, pictures)
+    source = views.enhance.source
+    return extract.in_stored_frame(trial.task.extractor(source.working_camera, pictures), source.scale)
 
 
 def _try_pair(trial: _PairTrial) -> _Tried:
     started = time.perf_counter()
     _match(trial)
     ready = time.perf_counter()
-    matches = _match(trial)
+    matches, verified = _match(trial)
     seconds = time.perf_counter() - ready
-    return _Tried(max(ready - started - seconds, 0.0), seconds, matches=matches)
+    return _Tried(max(ready - started - seconds, 0.0), seconds, matches=matches, verified=verified)
 
 
-def _match(trial: _PairTrial) -> int:
-    """How many matches there are before they are judged."""
+def _match(trial: _PairTrial) -> tuple[int, tuple[FloatArray, FloatArray]]:
+    """How many matches there are before they are judged, and the places of those that are left."""
     matches = compared(trial.matcher, trial.features, trial.pair.geometry, trial.sources)
     sides = [(features.keypoints_px, features.colours) for features in trial.features]
-    apply_chain(trial.chain, candidates(matches, *sides), trial.pair.geometry, trial.pair.seed)
-    return len(matches.indices)
+    judged = candidates(matches, *sides)
+    verdict = apply_chain(trial.chain, judged, trial.pair.geometry, trial.pair.seed)
+    kept = judged.take(np.flatnonzero(verdict.keep))
+    return len(judged), (kept.points0_px, kept.points1_px)
 
 
 def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Check:
@@ -132,11 +148,17 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     }
     estimate = _estimate(context, largest_px, timed, _time_pairs(context, sampled, timed), reading_s)
     estimate["readable_images"] = len(images) - len(failures)
-    estimate["seconds_to_orient"] = 0.0 if oriented else _orientation_s(context, sampled)
+    estimate["seconds_to_orient"] = 0.0
+    if not oriented:
+        estimate["seconds_to_orient"], first_keypoints = _orientation(context, sampled)
+        estimate["disk_mb"] = round(
+            estimate["disk_mb"] + len(images) * first_keypoints * _BYTES_PER_DESCRIPTOR / 1e6, 1
+        )
     estimate["seconds_of_further_steps"] = _further_s(context, sampled)
     if estimate["seconds"] is not None:
         own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
-        estimate["seconds_after_matching"] = round(own_s * _later(context), 1)
+        page_s = _PAGE_S if context.settings.run.report else 0.0
+        estimate["seconds_after_matching"] = round(own_s * _later(context) + page_s, 1)
         estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
 
@@ -147,34 +169,72 @@ def _later(context: Context) -> float:
     return _LATER if adjusts else 0.0
 
 
-def _orientation_s(context: Context, sampled: Sequence[Pair]) -> float | None:
-    """Seconds that the first pass and the mapping take, by a trial of both images of a sampled pair; None where these
-    cannot be read. Workers are ready by then."""
+def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | None, int]:
+    """Seconds that the first pass and the mapping take, by trials of sampled pairs, None where their images cannot be
+    read; and keypoints of each image in the first pass that stays on file. Workers are ready by then. Given poses are
+    looked at, and found anew where they do not explain the sampled pairs."""
     recipe, block = context.settings.orient, context.block
     if not isinstance(recipe, FirstPass) or not sampled:
-        return None
-    posed = sum(pose.world_rotation is not None for pose in block.poses.values()) == len(block.images)
-    recipe = first_pass.look(recipe, block) if posed else recipe
-    costs = _costs(first_pass.prepared(context, recipe), sampled[0])
-    if costs is None:
-        return None
-    every_s = len(block.images) * costs[0] + first_pass.count_pairs(context, recipe) * costs[1]
-    return round(every_s / context.executor.jobs + (0.0 if posed else _MAPPING_S * len(block.images)), 1)
+        return None, 0
+    recipe, seconds = first_pass.fitted(recipe, block), 0.0
+    if sum(pose.world_rotation is not None for pose in block.poses.values()) == len(block.images):
+        look = first_pass.look(recipe, block)
+        looking = first_pass.prepared(context, look)
+        tried = [_try(looking, pair) for pair in sampled]
+        known = [one for one in tried if one is not None]
+        if not known:
+            return None, look.keypoints
+        seconds = _pass_s(context, look, known[0])
+        if _explained(context, looking, list(zip(sampled, tried, strict=True))) or not recipe.replaces:
+            return round(seconds, 1), look.keypoints
+    found = _try(first_pass.prepared(context, recipe), sampled[0])
+    if found is None:
+        return None, recipe.keypoints
+    mapping_s = _MAPPING_S + _MAPPING_S_PER_IMAGE * len(block.images)
+    return round(seconds + _pass_s(context, recipe, found) + mapping_s, 1), recipe.keypoints
+
+
+def _pass_s(context: Context, recipe: FirstPass, tried: _TriedPair) -> float:
+    """Seconds of a first pass."""
+    count, pairs = len(context.block.images), first_pass.count_pairs(context, recipe)
+    return (count * tried.image_s + pairs * tried.pair_s) / context.executor.jobs
+
+
+def _explained(context: Context, first: Context, tried: Sequence[tuple[Pair, _TriedPair | None]]) -> bool:
+    """Whether given poses explain the matches of all sampled pairs that have enough of them."""
+    block = context.block
+    cameras = {image.image_id: block.camera(image) for image in block.images}
+    points = [
+        PairPoints(pair.image_id0, pair.image_id1, *one.verified, np.zeros((len(one.verified[0]), 2), np.int64))
+        for pair, one in tried
+        if one is not None and len(one.verified[0]) >= MIN_MATCHES
+    ]
+    shares = [explained_share(pair, block.poses, cameras, thresholds_px(first)) for pair in points]
+    return all(share >= EXPLAINED_SHARE for share in shares)
 
 
 def _further_s(context: Context, sampled: Sequence[Pair]) -> float | None:
     """Seconds that the further steps of a cascade take where every pair needs them; None where that is unknown."""
     every_s = 0.0
     for step in cascade.further(context):
-        costs = _costs(step.context, sampled[0]) if sampled else None
-        if costs is None:
+        tried = _try(step.context, sampled[0]) if sampled else None
+        if tried is None:
             return None
-        every_s += step.own_features * len(context.block.images) * costs[0] + len(context.pairs) * costs[1]
+        every_s += step.own_features * len(context.block.images) * tried.image_s + len(context.pairs) * tried.pair_s
     return round(every_s / context.executor.jobs, 1)
 
 
-def _costs(context: Context, pair: Pair) -> tuple[float, float] | None:
-    """Seconds of an image and of a pair, by a trial of one; None where its images cannot be read."""
+@dataclass(frozen=True, eq=False)
+class _TriedPair:
+    """Seconds of an image and of the pair, and its verified matches as in `_Tried`."""
+
+    image_s: float
+    pair_s: float
+    verified: tuple[FloatArray, FloatArray]
+
+
+def _try(context: Context, pair: Pair) -> _TriedPair | None:
+    """A trial of one pair and its images; None where these cannot be read."""
     ids = pair.image_id0, pair.image_id1
     one = replace(context, pairs=(pair,))
     trials = [_Trial(extract.task_of(one, image_id), sample=True) for image_id in ids]
@@ -183,7 +243,9 @@ def _costs(context: Context, pair: Pair) -> tuple[float, float] | None:
     if len(timed) < len(ids):
         return None
     tried = _time_pairs(one, one.pairs, timed)
-    return _mean([one.seconds for one in timed.values()]), _mean([one.seconds for one in tried])
+    if not tried:
+        return None
+    return _TriedPair(_mean([one.seconds for one in timed.values()]), tried[0].seconds, tried[0].verified)
 
 
 def _sample(context: Context) -> list[Pair]:
@@ -230,9 +292,11 @@ def _estimate(
     stored_px = max(image.width_px * image.height_px for image in context.block.images)
     seconds_image = _mean([tried.seconds for tried in images.values()])
     seconds_pair = _mean([tried.seconds for tried in pairs])
-    descriptors = max((len(tried.features.descriptors) for tried in images.values() if tried.features), default=0)
+    found = [tried.features for tried in images.values() if tried.features]
+    descriptors = max((len(features.descriptors) for features in found), default=0)
+    keypoints = max((len(features.keypoints_px) for features in found), default=0)
     matches = _mean([tried.matches for tried in pairs])
-    disk = count * descriptors * _BYTES_PER_DESCRIPTOR + len(context.pairs) * matches * _BYTES_PER_MATCH
+    disk = _disk_bytes(context, count * keypoints, count * descriptors, len(context.pairs) * matches)
     # Workers start side by side; the pairs of one image are one task.
     starts = sum(max((tried.start_s for tried in group), default=0.0) for group in (images.values(), pairs))
     longest = max((len(row) for row in context.rows().values()), default=0)
@@ -250,6 +314,22 @@ def _estimate(
         "disk_mb": round(disk / 1e6, 1),
         "disk_free_mb": round(shutil.disk_usage(_existing(context.workspace.root)).free / 1e6),
     }
+
+
+def _disk_bytes(context: Context, keypoints: float, descriptors: float, matches: float) -> float:
+    """Of the finished workspace without the first pass. keypoints, descriptors: of all images; matches: of all pairs,
+    before verification."""
+    settings = context.settings
+    total = descriptors * _BYTES_PER_DESCRIPTOR + matches * _BYTES_PER_MATCH * (2 if settings.cascade else 1)
+    total += matches * _BYTES_PER_EXPORTED * len(settings.export)
+    if settings.cascade:
+        total += keypoints * _BYTES_PER_UNITED
+    if isinstance(settings.orient, FirstPass):
+        total += keypoints * _BYTES_PER_REFINED + matches * _BYTES_PER_ADJUSTED
+    if settings.run.report:
+        pixels = [image.width_px * image.height_px for image in context.block.images]
+        total += _BYTES_OF_PAGE + sum(min(_BYTES_PER_PICTURE, count * _BYTES_PER_PIXEL) for count in pixels)
+    return total
 
 
 def _mean(values: Sequence[float]) -> float:

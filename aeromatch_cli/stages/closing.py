@@ -21,12 +21,15 @@ def closing_lines(quality: Quality, facts: Mapping[str, Any], names: Mapping[str
     whole = f"all {count} images are connected" if count > 2 else "both images are connected"
     if facts["adjust"].get("images"):
         whole += " and oriented"
+    lines = verdict_lines(quality, whole)
+    others = [f"not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
+    return [*lines, *(f"{'':<9} {line}" for line in (*others, *_weak(facts, names)))]
+
+
+def verdict_lines(quality: Quality, whole: str = "") -> list[str]:
+    """The verdict with what speaks against the block; whole: what is said where nothing does."""
     first, *others = [one.sentence for one in quality.faults] or [whole]
-    lines = [f"{quality.verdict}: {first}", *others]
-    if quality.unchecked:
-        lines.append(f"not checked: {'; '.join(quality.unchecked)}")
-    lines += _weak(facts, names)
-    return [f"{'result' if not row else '':<9} {line}" for row, line in enumerate(lines)]
+    return [f"{'result':<9} {quality.verdict}: {first}", *(f"{'':<9} {line}" for line in others)]
 
 
 def _weak(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:

@@ -129,6 +129,7 @@ def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> d
         "rejected_pairs": facts["pairs"].get("rejected", 0),
         "components": facts["components"],
         "weakly_tied": facts["weakly_tied"],
+        "unconnected": facts["unconnected"],
     }
 
 

@@ -66,14 +66,14 @@ def run_task(task: ExtractTask) -> Extracted:
     if task.extractor.colours:
         colours = sample_colours(enhancement.pixels, features.keypoints_px, features.sizes_px)
         features = replace(features, colours=colours)
-    features = _in_stored_frame(features, source.scale)
+    features = in_stored_frame(features, source.scale)
     enhance.keep(task.views.enhance, enhancement, picture=task.keep_images)
     simulate.keep(task.views, pictures, with_pictures=task.keep_images)
     write_atomically(task.path, lambda stream: write_features(stream, features, task.fingerprint))
     return Extracted(len(features.keypoints_px), simulate.ViewCost.of(pictures))
 
 
-def _in_stored_frame(features: Features, scale: float) -> Features:
+def in_stored_frame(features: Features, scale: float) -> Features:
     """Keypoints of a reduced raster in the stored one, half-pixel correct."""
     if scale >= 1.0:
         return features

@@ -225,8 +225,8 @@ def verified_pairs(context: Context, features: Callable[[str], str] | None = Non
 
 
 def summarise(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> dict[str, Any]:
-    """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and weakly tied
-    images.
+    """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and images
+    that are weakly tied or not at all.
 
     judged: ids of both images, state and number of matches of every judged pair; by default those of this stage.
     """
@@ -251,6 +251,7 @@ def summarise(context: Context, judged: Iterable[tuple[str, str, str, int]] | No
         "verified_matches": matches,
         "components": sorted(Counter(components(ids, links).values()).values(), reverse=True),
         "weakly_tied": sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
+        "unconnected": sorted(image_id for image_id in ids if not ties[image_id]),
     }
 
 

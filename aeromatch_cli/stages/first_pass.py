@@ -80,8 +80,8 @@ def thorough(recipe: FirstPass, first: Context) -> FirstPass | None:
     return recipe.model_copy(update={"keypoints": _MORE_KEYPOINTS * recipe.keypoints})
 
 
-def prepared(context: Context, recipe: FirstPass) -> Context:
-    """The context of the first pass of a block, without pairs; nothing is run yet."""
+def prepared(context: Context, recipe: FirstPass, part: str = "first pass") -> Context:
+    """The context of the first pass of a block, without pairs; nothing is run yet. part: what is said to be done."""
     settings = context.settings
     limit = settings.block.max_size_px
     size_px = min(recipe.size_px, limit) if limit else recipe.size_px
@@ -107,7 +107,7 @@ def prepared(context: Context, recipe: FirstPass) -> Context:
         block=block,
         pairs=(),
         shard=None,
-        part="first pass: ",
+        part=f"{part}: ",
     )
 
 

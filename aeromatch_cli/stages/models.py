@@ -190,11 +190,19 @@ def _largest(models: Sequence[Model]) -> int:
     return max((len(model.rotations) for model in models), default=0)
 
 
-def evidence_of(context: Context, recipe: FirstPass, *, by_position: bool = True) -> tuple[Context, Evidence]:
-    """The context of a first pass that has been run, and its verified matches."""
-    first, failed = first_pass.run(first_pass.prepared(context, recipe), recipe, by_position=by_position)
-    limit = first.settings.block.max_size_px
-    sizes = {image.image_id: max(image.width_px, image.height_px) for image in context.block.images}
+def evidence_of(
+    context: Context, recipe: FirstPass, *, by_position: bool = True, look: bool = False
+) -> tuple[Context, Evidence]:
+    """The context of a first pass that has been run, and its verified matches. look: whether it is a look at given
+    poses, which another pass may follow."""
+    prepared = first_pass.prepared(context, recipe, "first look" if look else "first pass")
+    first, failed = first_pass.run(prepared, recipe, by_position=by_position)
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    thresholds_px = {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}
-    return first, Evidence(context.block, pairs, thresholds_px, context.given.cameras, failed)
+    return first, Evidence(context.block, pairs, thresholds_px(first), context.given.cameras, failed)
+
+
+def thresholds_px(first: Context) -> dict[str, float]:
+    """image_id -> error of an exact match of a first pass, stored pixels."""
+    limit = first.settings.block.max_size_px
+    sizes = {image.image_id: max(image.width_px, image.height_px) for image in first.block.images}
+    return {i: _EXACT_PX * max(1.0, size / limit) for i, size in sizes.items()}

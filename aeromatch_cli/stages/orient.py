@@ -132,7 +132,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
     looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
-    first, evidence = evidence_of(context, first_pass.look(recipe, block) if looks else recipe)
+    first, evidence = evidence_of(context, first_pass.look(recipe, block) if looks else recipe, look=looks)
     if recipe.replaces:
         context, first, evidence = _with_better_cameras(context, first, evidence)
     good = evidence.explained()

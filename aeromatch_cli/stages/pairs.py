@@ -39,10 +39,12 @@ def prepare(
     shard: Shard | None = None,
     overwrite: bool = False,
     dry: bool = False,
+    exports: bool = False,
 ) -> tuple[Context, StageReport, StageReport]:
     """Read the block, orient it, choose the pairs and, unless `dry`, write what the block is.
 
-    say: gets the lines of the summary as soon as each is known. Returns the context and the reports of orient and
+    say: gets the lines of the summary as soon as each is known. exports: whether the command ends with an export, whose
+    refusals come at once, and not after hours. Returns the context and the reports of orient and
     pairs.
 
     Raises ConfigError for wrong input lists, InputError when no image or no pair is left, WorkspaceError when the
@@ -58,6 +60,9 @@ def prepare(
     known = [*found.warnings, *as_given.warnings, *_within_memory(settings, executor, found.block)]
     for warning in known:
         log.warning("warning: %s", warning)
+    _check_images(found.block)
+    for exporter in settings.export if exports else ():
+        exporter.check_images(found.block.images)
     given = _context(settings, workspace, executor, found, shard, overwrite)
     quality = picture_quality.measured(given, dry=dry)
     for warning in (looks := picture_quality.remarks(given, quality)):
@@ -80,15 +85,15 @@ def prepare(
     }
     report.failures = list(found.failures)
     context = replace(context, pairs=tuple(pairs))
-    if not dry:
-        _write(context, pairs_csv, quality)
-        forget_absent(context)
-        report.write(workspace)
     for line in report.facts["summary"]:
         say(line)
     for warning in said_later:
         log.warning("warning: %s", warning)
     _check_pairs(context)
+    if not dry:
+        _write(context, pairs_csv, quality)
+        forget_absent(context)
+        report.write(workspace)
     return context, oriented, report
 
 
@@ -114,14 +119,17 @@ def _listed(context: Context, report: StageReport, *, anew: bool) -> Sequence[Pa
     return chosen
 
 
+def _check_images(block: Block) -> None:
+    """Raise InputError where there is nothing to match."""
+    if len(block.images) == 1:
+        raise InputError(f"only one image can be used ({block.images[0].name}): one image makes no pair")
+
+
 def _check_pairs(context: Context) -> None:
     """Raise InputError where there is nothing to match."""
-    images = context.block.images
-    if len(images) == 1:
-        raise InputError(f"only one image can be used ({images[0].name}): one image makes no pair")
     if not context.pairs:
         raise InputError(
-            f"no pairs: {len(images)} images, none of which overlap; check poses, cameras and ground "
+            f"no pairs: {len(context.block.images)} images, none of which overlap; check poses, cameras and ground "
             "(the warnings above), or use --set pairs=exhaustive"
         )
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,10 @@ from aeromatch_cli.stages import (
     union,
 )
 from aeromatch_cli.stages.changes import changed_words
-from aeromatch_cli.stages.closing import closing_lines
+from aeromatch_cli.stages.closing import closing_lines, verdict_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
+from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
 from aeromatch_cli.stages.naming import facts_named, item_named, names_on_file
 from aeromatch_cli.stages.quality import facts_told, quality_of
 from aeromatch_cli.stages.shard import Shard
@@ -60,6 +62,10 @@ STAGES: Mapping[str, Callable[[Context], StageReport]] = {
 SHARDED = ("enhance", "simulate", "extract", "match", "filter")
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
+# Commands that export, and the one that says what they would do.
+_EXPORTING = ("run", "export", "check")
+# These look at what other commands have made.
+_NEEDS_RESULTS = ("filter", "adjust", "export")
 # What a command rests on: everything before it in this chain.
 _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
 
@@ -67,12 +73,13 @@ _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "
 @dataclass(frozen=True)
 class Result:
     """What a command says: lines for people, facts for machines; failures, and the verdict on the block where there is
-    one, for the exit code."""
+    one, for the exit code. urgent: those of the lines that are said even where quiet is asked for."""
 
     lines: tuple[str, ...]
     facts: dict[str, Any] = field(default_factory=dict)
     failures: tuple[tuple[str, str, str], ...] = ()
     verdict: Level | None = None
+    urgent: tuple[str, ...] = ()
 
 
 def execute(
@@ -92,9 +99,10 @@ def execute(
     if part and command not in (*SHARDED, "run", "orient", "pairs"):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     root = Path(settings.workspace)
-    new = not root.exists()
+    if settings.block.images and command in _NEEDS_RESULTS and not root.exists():
+        raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
     with ExitStack() as stack:
-        stack.callback(_without_empty_folder, root, new)
+        stack.enter_context(_nothing_left_of_a_failed_start(Workspace(root), shared=part is not None))
         if command != "check" and (not settings.block.images or _there(settings)):
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
@@ -138,13 +146,23 @@ def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> R
     return _result("run", settings, workspace, names, reports, (), said)
 
 
-def _without_empty_folder(root: Path, new: bool) -> None:
-    """Where nothing could be started, no folder is left but one that was there before."""
-    lock = Workspace(root).lock
-    if new and root.is_dir() and list(root.iterdir()) == [lock]:
-        with translated_os_errors(root):
-            lock.unlink()
-            root.rmdir()
+@contextmanager
+def _nothing_left_of_a_failed_start(workspace: Workspace, *, shared: bool) -> Iterator[None]:
+    """Where nothing could be started, no folder is left but those that were there before. shared: other shards may be
+    at work in the workspace."""
+    root = workspace.root
+    absent = [folder for folder in (root, *root.absolute().parents) if not folder.exists()]
+    try:
+        yield
+    except BaseException as error:
+        # The block is on file once it has images and pairs: what an interrupted command has made before that stays.
+        refused = isinstance(error, ConfigError | InputError) and not workspace.block.exists() and not shared
+        if absent and root.is_dir() and (refused or set(root.iterdir()) <= {workspace.lock}):
+            shutil.rmtree(root, ignore_errors=True)
+            for folder in absent[1:]:
+                with suppress(OSError):  # something else lies in it by now
+                    folder.rmdir()
+        raise
 
 
 class _Said:
@@ -220,7 +238,10 @@ def _attempt(
             log.warning("warning: %s is not as it was written: it is made again", workspace.root / name)
     if _there(settings) and (words := changed_words(workspace.config, settings)):
         said(f"changed          {words}")
-    context, *reports = pairs.prepare(settings, executor, said, shard=part, overwrite=overwrite, dry=dry)
+    exports = command in _EXPORTING
+    context, *reports = pairs.prepare(
+        settings, executor, said, shard=part, overwrite=overwrite, dry=dry, exports=exports
+    )
     if command == "check":
         return _check(context, reports[0], reports[-1], said)
     if command == "run":
@@ -345,12 +366,18 @@ def _result(
     part: bool = False,
 ) -> Result:
     """names: of the files, by image_id. part: of a shard."""
-    lines = said.rest(next(report for report in reports if report.stage == "pairs").facts["summary"])
+    first = next(report for report in reports if report.stage == "pairs")
+    lines = said.rest(first.facts["summary"])
     for stage in reports:
         lines += stage_lines(stage, names, part=part)
     quality, told = _quality(command, workspace, reports, names, part=part)
+    lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        lines += closing_lines(quality, told, names)
+        lost = lost_images(told, first.failures, names)
+        write_lost(workspace, lost)
+        told_lost = lost_lines(workspace, lost, len(names) + len(first.failures))
+        lines += [*closing_lines(quality, told, names), *told_lost]
+        urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
         lines.append(f"report    {workspace.report}")
@@ -367,6 +394,7 @@ def _result(
         lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
     if failures:
         lines.append(f"{len(failures)} failed, listed in {workspace.failures}")
+        urgent.append(lines[-1])
     facts = {
         "workspace": str(workspace.root),
         "stages": _stage_facts(reports),
@@ -374,7 +402,8 @@ def _result(
     }
     if quality is not None:
         facts["quality"] = quality.as_facts()
-    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict)
+        facts["lost"] = {name: reason for name, _, reason in lost}
+    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict, tuple(urgent))
 
 
 def _quality(

@@ -108,40 +108,45 @@ class ViewCost:
 
 
 def keep(task: SimulateTask, pictures: Sequence[ViewPixels], *, with_pictures: bool) -> None:
-    """Write views.json, and with `with_pictures` a PNG of every view; those of the very same views stay anyway."""
+    """Write views.json, and with `with_pictures` a PNG of every view and pictures.json, which tells of these.
+
+    Pictures that somebody asked for stay as they are where none are asked for, also those of other settings: features
+    can be found without them, and pictures.json says what they show.
+    """
     workspace, image_id = task.enhance.workspace, task.enhance.image_id
-    stay = with_pictures or is_done(task)
-    stale = set(workspace.views(image_id).parent.glob("*.png"))
-    if stay:
-        stale -= {workspace.view(image_id, item.view.name) for item in pictures}
-    for path in sorted(stale):
-        path.unlink(missing_ok=True)  # of other settings: views.json would not list it
+    record = {
+        "fingerprint": task.fingerprint,
+        "scale": task.enhance.source.scale,
+        "remark": task.remark,
+        "views": [
+            {
+                "name": view.name,
+                "width_px": view.width_px,
+                "height_px": view.height_px,
+                "is_source": view.is_source,
+                "angle_deg": view.angle_deg,
+                "enhanced": view.enhanced,
+                "undistorted_from_view": view.undistorted_from_view.tolist(),
+            }
+            for view in (item.view for item in pictures)
+        ],
+    }
+    write_record(workspace.views(image_id), record, ())
     if with_pictures:
-        for item in pictures:
-            gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
-            write_atomically(workspace.view(image_id, item.view.name), partial(write_png, pixels=gray))
-    write_record(
-        workspace.views(image_id),
-        {
-            "fingerprint": task.fingerprint,
-            "pictures": stay,
-            "scale": task.enhance.source.scale,
-            "remark": task.remark,
-            "views": [
-                {
-                    "name": view.name,
-                    "width_px": view.width_px,
-                    "height_px": view.height_px,
-                    "is_source": view.is_source,
-                    "angle_deg": view.angle_deg,
-                    "enhanced": view.enhanced,
-                    "undistorted_from_view": view.undistorted_from_view.tolist(),
-                }
-                for view in (item.view for item in pictures)
-            ],
-        },
-        [f"{item.view.name}.png" for item in pictures] if stay else (),
-    )
+        _write_pictures(task, pictures, record)
+
+
+def _write_pictures(task: SimulateTask, pictures: Sequence[ViewPixels], record: Mapping[str, Any]) -> None:
+    """In place of those that are there."""
+    workspace, image_id = task.enhance.workspace, task.enhance.image_id
+    names = [f"{item.view.name}.png" for item in pictures]
+    folder = workspace.views(image_id).parent
+    for path in sorted(set(folder.glob("*.png")) - {folder / name for name in names}):
+        path.unlink(missing_ok=True)  # of other settings: pictures.json would not list it
+    for item in pictures:
+        gray = item.gray if item.valid is None else np.where(item.valid, item.gray, 0).astype(np.uint8)
+        write_atomically(workspace.view(image_id, item.view.name), partial(write_png, pixels=gray))
+    write_record(workspace.view_pictures(image_id), record, names)
 
 
 def degenerate_view(workspace: Workspace, image: Image) -> str:
@@ -191,14 +196,11 @@ def run(context: Context) -> StageReport:
 
 def is_done(task: SimulateTask) -> bool:
     """Whether the pictures on file are those that the task would make."""
-    record = _record(task)
-    return record.get("fingerprint") == task.fingerprint and bool(record["pictures"])
+    record = whole_record(task.enhance.workspace.view_pictures(task.enhance.image_id))
+    return is_kept(task) and record.get("fingerprint") == task.fingerprint
 
 
 def is_kept(task: SimulateTask) -> bool:
     """Whether what `keep` leaves in any case is on file."""
-    return bool(_record(task).get("fingerprint") == task.fingerprint)
-
-
-def _record(task: SimulateTask) -> dict[str, Any]:
-    return whole_record(task.enhance.workspace.views(task.enhance.image_id))
+    record = whole_record(task.enhance.workspace.views(task.enhance.image_id))
+    return bool(record.get("fingerprint") == task.fingerprint)

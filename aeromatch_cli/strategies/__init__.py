@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from aeromatch_cli.data import BoolArray, Camera, Features, Matches, Neighbour, PairGeometry, Pose, Raster, View
+from aeromatch_cli.data import BoolArray, Camera, Features, Image, Matches, Neighbour, PairGeometry, Pose, Raster, View
 
 
 class Strategy(BaseModel):
@@ -62,6 +62,9 @@ class Strategy(BaseModel):
     def check_files(self, descriptor_length: int) -> None:
         """Raises ConfigError where a file is missing, or is not what it is named for with this extractor."""
         self.fingerprint_files()
+
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError, before the start, where an exporter cannot write these images, or lacks a library."""
 
     def own_weights(self) -> tuple[str, ...]:
         """The user's own weights files, used instead of the package's. To be called after `check_files`."""

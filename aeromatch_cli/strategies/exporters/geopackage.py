@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.exporters.contents import ExportContents, ExportSummary, whole_folder
@@ -32,6 +33,10 @@ class GeoPackage(Strategy):
 
     version: ClassVar[int] = 6
     name: Literal["geopackage"] = "geopackage"
+
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError without pyogrio."""
+        _writer()
 
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
         """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without pyogrio."""

@@ -7,11 +7,13 @@ parsers.py). Keypoints are float32: hloc's half precision loses what is beyond 2
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.rotations import to_quaternion
 from aeromatch_cli.strategies import Strategy
@@ -26,12 +28,16 @@ class Hloc(Strategy):
     version: ClassVar[int] = 3
     name: Literal["hloc"] = "hloc"
 
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError without h5py, and where two names are one in a pair's."""
+        _h5py()
+        called(images, _in_key, self.name, "hloc's names of pairs have - for / in those of images")
+
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError without h5py, ItemError where two
-        names are one in a pair's."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError as `check_images`."""
         h5py = _h5py()
         solution = Solution.of(contents)
-        called(solution.images, _in_key, "hloc's names of pairs have - for / in those of images")
+        self.check_images(solution.images)
         names = {image.image_id: image.name for image in solution.images}
         with whole_folder(folder) as partial:
             write_world(partial, contents.block)

@@ -8,6 +8,7 @@ numbers are middles of pixels here, as in its own image functions.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -15,7 +16,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import focal_px, is_fisheye, parameters
 from aeromatch_cli.geometry.lenses import Nearest, fitted
 from aeromatch_cli.strategies import Strategy
@@ -42,10 +43,17 @@ class MicMac(Strategy):
         False, description="Write Homol as .dat, MicMac's default, instead of .txt (ExpTxt=1 in its commands)."
     )
 
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError where two names are one in MicMac's."""
+        self._called(images)
+
+    def _called(self, images: Sequence[Image]) -> dict[str, str]:
+        return called(images, lambda name: name.replace("/", "_"), self.name, "MicMac's names of images have _ for /")
+
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where two names are one in it."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError as `check_images`."""
         solution = Solution.of(contents)
-        names = called(solution.images, lambda name: name.replace("/", "_"), "MicMac's names of images have _ for /")
+        names = self._called(solution.images)
         with whole_folder(folder) as partial:
             found, keypoints = matched(contents), keypoints_of(contents)
             for id0, id1, rows in found.pairs:

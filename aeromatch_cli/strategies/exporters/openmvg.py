@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from aeromatch_cli.data import Camera, FloatArray
+from aeromatch_cli.data import Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import BROWN, MODELS, is_fisheye, parameters, pixels_of_rays
 from aeromatch_cli.geometry.lenses import Nearest, fitted, nearest_of
 from aeromatch_cli.strategies import Strategy
@@ -42,12 +42,18 @@ class OpenMvg(Strategy):
     version: ClassVar[int] = 4
     name: Literal["openmvg"] = "openmvg"
 
-    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where two images have one name without
-        suffix."""
-        solution = Solution.of(contents)
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError where two images have one name without suffix."""
+        self._called(images)
+
+    def _called(self, images: Sequence[Image]) -> dict[str, str]:
         how = "openMVG names features by file names without suffix"
-        stems = called(solution.images, lambda name: PurePosixPath(name).stem, how)
+        return called(images, lambda name: PurePosixPath(name).stem, self.name, how)
+
+    def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError as `check_images`."""
+        solution = Solution.of(contents)
+        stems = self._called(solution.images)
         numbers = {image.image_id: number for number, image in enumerate(solution.images)}
         with whole_folder(folder) as partial:
             write_world(partial, contents.block)

@@ -50,10 +50,18 @@ class OpenSfm(Strategy):
     version: ClassVar[int] = 3
     name: Literal["opensfm"] = "opensfm"
 
+    def check_images(self, images: Sequence[Image]) -> None:
+        """Raises ConfigError where file names are not different."""
+        self._called(images)
+
+    def _called(self, images: Sequence[Image]) -> dict[str, str]:
+        how = "OpenSfM calls images by file names"
+        return called(images, lambda name: PurePosixPath(name).name, self.name, how)
+
     def __call__(self, contents: ExportContents, folder: Path) -> ExportSummary:
-        """Replace `folder`. WorkspaceError where it cannot be written, ItemError where file names are not different."""
+        """Replace `folder`. WorkspaceError where it cannot be written, ConfigError as `check_images`."""
         solution = Solution.of(contents)
-        names = called(solution.images, lambda name: PurePosixPath(name).name, "OpenSfM calls images by file names")
+        names = self._called(solution.images)
         lenses, remarks = held(solution, "OpenSfM", in_colmap)  # what it holds of lenses is what COLMAP holds
         project = Project.of(contents, solution, names, lenses)
         with whole_folder(folder) as partial:

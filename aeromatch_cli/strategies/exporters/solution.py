@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
-from aeromatch_cli.errors import ItemError
+from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.strategies.exporters.contents import Colours, ExportContents, ExportSummary
 
@@ -219,14 +219,15 @@ def write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def called(images: Iterable[Image], name_of: Callable[[str], str], how: str) -> dict[str, str]:
-    """image_id -> what a format calls an image, by its name. Raises ItemError, which says how, where two images would
+def called(images: Iterable[Image], name_of: Callable[[str], str], exporter: str, how: str) -> dict[str, str]:
+    """image_id -> what a format calls an image, by its name. Raises ConfigError, which says how, where two images would
     be called the same: one's files would replace the other's."""
     names: dict[str, str] = {}
     first: dict[str, str] = {}
     for image in images:
         name = names[image.image_id] = name_of(image.name)
         if name in first:
-            raise ItemError(f"{how}, and {first[name]} and {image.name} would both be called {name}: rename one")
+            both = f"{first[name]} and {image.name} would both be called {name}"
+            raise ConfigError(f"{how}, and {both}: rename one, or leave {exporter} out of export")
         first[name] = image.name
     return names

@@ -1,0 +1,54 @@
+"""lost: images that a result does not hold, and why. A result that lacks images must never look like a whole one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from aeromatch_cli.files import write_text
+from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.stages.quality import final_links
+from aeromatch_cli.workspace import Workspace
+
+_NAMED = 5
+# What becomes of an image that is lost; also the column `what` of lost.csv.
+_FAILED, _UNORIENTED, _UNCONNECTED = "not read", "not oriented", "not connected"
+
+Lost = tuple[str, str, str]
+
+
+def lost_images(
+    facts: Mapping[str, Mapping[str, Any]], unread: Sequence[tuple[str, str]], names: Mapping[str, str]
+) -> list[Lost]:
+    """Name, what became of it, and the reason, of every image that the result does not hold.
+
+    facts: by stage. unread: images that are not part of the block, with the reason. names: of the files, by image_id.
+    """
+    lost = [(name, _FAILED, reason) for name, reason in unread]
+    adjust = facts["adjust"]
+    if adjust.get("images"):
+        lost += [(names.get(i, i), _UNORIENTED, reason) for i, reason in adjust.get("outside", {}).items()]
+    else:
+        reason = "no pair of it is verified"
+        lost += [(names.get(i, i), _UNCONNECTED, reason) for i in final_links(facts).get("unconnected", ())]
+    return sorted(lost)
+
+
+def lost_lines(workspace: Workspace, lost: Sequence[Lost], images: int) -> list[str]:
+    """What is said of lost images, nothing where there are none. images: of the whole folder."""
+    if not lost:
+        return []
+    counts = ", ".join(f"{count} {what}" for what, count in sorted(Counter(what for _, what, _ in lost).items()))
+    shown = ", ".join(name for name, _, _ in lost[:_NAMED])
+    more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+    verb = "is" if len(lost) == 1 else "are"
+    return [
+        f"lost      {len(lost)} of {images} images {verb} not in the result ({counts}): {shown}{more}; "
+        f"listed in {workspace.lost}"
+    ]
+
+
+def write_lost(workspace: Workspace, lost: Sequence[Lost]) -> None:
+    """Write lost.csv, also where no image is lost."""
+    write_text(workspace.lost, csv_text(("image", "what", "reason"), lost))

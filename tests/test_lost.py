@@ -1,0 +1,53 @@
+"""What is said of images that a result does not hold, even where quiet is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+
+from aeromatch_cli.cli.output import guarded
+from aeromatch_cli.stages.lost import lost_images, lost_lines, write_lost
+from aeromatch_cli.stages.run import Result
+from aeromatch_cli.workspace import Workspace
+
+NAMES = {f"a{k}_jpg": f"a{k}.jpg" for k in range(8)}
+
+
+def test_images_are_lost_that_were_not_read_or_not_oriented(tmp_path: Path) -> None:
+    facts = {"adjust": {"images": 6, "outside": {"a7_jpg": "no pair", "a6_jpg": "no texture"}}}
+    lost = lost_images(facts, [("b.jpg", "file is empty")], NAMES)
+    assert lost == [
+        ("a6.jpg", "not oriented", "no texture"),
+        ("a7.jpg", "not oriented", "no pair"),
+        ("b.jpg", "not read", "file is empty"),
+    ]
+    workspace = Workspace(tmp_path)
+    assert lost_lines(workspace, lost, 9) == [
+        "lost      3 of 9 images are not in the result (2 not oriented, 1 not read): a6.jpg, a7.jpg, b.jpg; "
+        f"listed in {tmp_path}/lost.csv"
+    ]
+    write_lost(workspace, lost)
+    assert workspace.lost.read_text().splitlines()[1] == "a6.jpg,not oriented,no texture"
+
+
+def test_without_adjustment_images_are_lost_that_no_pair_holds(tmp_path: Path) -> None:
+    facts = {"adjust": {"images": 0}, "filter": {"unconnected": ["a0_jpg"]}}
+    whole = {**facts, "consistency": {"components": [6, 1, 1], "unconnected": sorted(NAMES)[:7]}}
+    assert [name for name, _, _ in lost_images(facts, (), NAMES)] == ["a0.jpg"]
+    lost = lost_images(whole, (), NAMES)
+    assert len(lost) == 7
+    [line] = lost_lines(Workspace(tmp_path), lost, 8)
+    assert "7 of 8 images are not in the result (7 not connected): a0.jpg, a1.jpg, a2.jpg, a3.jpg, a4.jpg and 2" in line
+    assert lost_lines(Workspace(tmp_path), (), 8) == []
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_urgent_lines_are_said_once_on_the_right_stream(quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    result = Result(("a summary", "result    bad: so it is"), verdict="bad", urgent=("result    bad: so it is",))
+    with pytest.raises(typer.Exit):
+        guarded(lambda: result, "run", quiet=quiet, as_json=False, log_file=None)
+    shown = capsys.readouterr()
+    assert shown.out == ("" if quiet else "a summary\nresult    bad: so it is\n")
+    assert shown.err == ("result    bad: so it is\n" if quiet else "")
