@@ -15,7 +15,7 @@ import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
-from aeromatch_cli.blocks.crs import LOCAL, across_unit_m, height_unit_m, is_local, local_unit_m, parsed_crs
+from aeromatch_cli.blocks.crs import AUTO, LOCAL, across_unit_m, has_other_units, height_unit_m, is_local, local_unit_m, parsed_crs
 from aeromatch_cli.blocks.image_names import matched_names
 from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
@@ -42,18 +42,20 @@ def read_control(
     marks: str = "",
     poses: Mapping[str, Pose] | None = None,
     use: ControlUse = "adjust",
+    usual_crs: str = AUTO,
 ) -> tuple[tuple[ControlPoint, ...], list[str]]:
     """Points in the world frame that images of the block show, and remarks; nothing of no file ("").
 
     crs, origin_m: of the block; a local block takes the coordinates as they are. marks: file of the image measurements
     where they stand apart, "" to look for it beside. poses: of the block, to tell exchanged coordinates and degrees by.
-    use: "check": all are check points. Raises ConfigError with file and line where a file is malformed, or its CRS
+    use: "check": all are check points. usual_crs: what the user says that coordinates of a file without CRS count in,
+    where that is one in feet. Raises ConfigError with file and line where a file is malformed, or its CRS
     cannot be brought to the block's.
     """
     if not name:
         return (), []
     path = Path(name)
-    survey = read_survey(path, Path(marks) if marks else None)
+    survey = read_survey(path, Path(marks) if marks else None, _in_feet(usual_crs))
     places_m, remarks = _places(survey, path, crs, np.array(origin_m), poses or {})
     measured, said = _measured(survey.marks, survey.measured_in, images)
     remarks = [*survey.remarks, *remarks, *said]
@@ -75,6 +77,11 @@ def read_control(
         what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
     return tuple(points), remarks + far_control(points, poses or {}, name)
+
+
+def _in_feet(crs: str) -> str | None:
+    """The CRS, None where it counts in metres or degrees."""
+    return None if crs.strip().lower() in ("", AUTO, LOCAL) or not has_other_units(parsed_crs(crs)) else crs
 
 
 def far_control(points: Sequence[ControlPoint], poses: Mapping[str, Pose], name: str) -> list[str]:

@@ -105,17 +105,21 @@ class GivenLists:
 
 
 def read_lists(
-    poses: str | None, cameras: str = EXIF, angles: AngleConvention = "auto", pose_format: str = pose_files.AUTO
+    poses: str | None,
+    cameras: str = EXIF,
+    angles: AngleConvention = "auto",
+    pose_format: str = pose_files.AUTO,
+    crs: str = AUTO,
 ) -> GivenLists:
     """Read the pose list and the camera file. To be called first: they are quick, and a mistake in them should not
     cost a walk over 10,000 files.
 
     poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder".
-    pose_format: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera file.
+    pose_format, crs: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera file.
     """
     if angles not in get_args(AngleConvention):
         raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
-    pose_list = pose_files.read_pose_file(Path(poses), pose_format) if poses and poses != EXIF else None
+    pose_list = pose_files.read_pose_file(Path(poses), pose_format, crs) if poses and poses != EXIF else None
     camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
     return GivenLists(poses or "", cameras, angles, pose_list, camera_file)
 
@@ -135,8 +139,8 @@ def block_inputs(
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
-    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
-    "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
+    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code of one in
+    metres (`crs.world_crs`), "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
     that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.

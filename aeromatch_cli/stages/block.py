@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.blocks.control import read_control
-from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, world_crs
 from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -82,6 +82,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         marks=settings.block.gcp_marks,
         poses=inputs.poses,
         use=settings.block.gcp_use,
+        usual_crs=settings.block.crs,
     )
     block = Block(
         images=inputs.images,
@@ -177,7 +178,8 @@ def _read_inputs(
 ) -> tuple[BlockInputs, dict[str, str], dict[str, RemoteFile]]:
     """Inputs, the fingerprint of every image by image_id, and by name those that lie elsewhere."""
     given, root = settings.block, Path(settings.block.images)
-    lists = read_lists("" if given.poses == "none" else given.poses, given.cameras, given.angles, given.pose_format)
+    poses = "" if given.poses == "none" else given.poses
+    lists = read_lists(poses, given.cameras, given.angles, given.pose_format, given.crs)
     remote: dict[str, RemoteFile] = {}
     if is_remote(given.images):
         with executor.step("list"):
@@ -200,7 +202,7 @@ def _read_inputs(
         lists,
         {name: outcome.value[0] if outcome.value else outcome.error for name, outcome in outcomes.items()},
         passed_over,
-        crs=given.crs,
+        crs=world_crs(given.crs),
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
@@ -214,7 +216,7 @@ def _read_inputs(
 
 def _same_crs(given: str, known: str) -> bool:
     """Whether the user asks for no other CRS than the one of an earlier run."""
-    return given.strip().lower() in ("", AUTO) or checked_crs(given) == known
+    return given.strip().lower() in ("", AUTO) or checked_crs(world_crs(given)) == known
 
 
 def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:

@@ -29,25 +29,27 @@ _MARKERS = _Format(metashape.is_markers, metashape.read_markers)
 _FORMATS = (_MARKERS, _MARKS, _COORDINATES)
 
 
-def read_survey(path: Path, marks: Path | None) -> Survey:
+def read_survey(path: Path, marks: Path | None, usual_crs: str | None = None) -> Survey:
     """Coordinates and image measurements of a file, or of two; where one holds only the former or the latter, the other
-    may lie beside it.
+    may lie beside it. usual_crs: of a table of grid coordinates that names none.
 
     Raises ConfigError where a file cannot be read or is malformed, where the other half is missing, and where several
     files could be it.
     """
-    found = _read(path)
+    found = _read(path, usual_crs)
     if marks is not None:
-        return _joined(path, found, marks, _read(marks))
+        return _joined(path, found, marks, _read(marks, usual_crs))
     if found.points and found.marks:
         return found
     other = _beside(path, _COORDINATES if not found.points else _MARKS)
-    return _joined(path, found, other, _read(other))
+    return _joined(path, found, other, _read(other, usual_crs))
 
 
-def _read(path: Path) -> Survey:
+def _read(path: Path, usual_crs: str | None) -> Survey:
     source = _opened(path)
     known = next((one for one in _FORMATS if one.recognises(source)), None)
+    if known is _COORDINATES:
+        return tables.read_coordinates(source, usual_crs)
     return odm.read_gcp_list(source) if known is None else known.read(source)
 
 

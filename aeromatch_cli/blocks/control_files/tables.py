@@ -89,34 +89,41 @@ def is_marks(source: Source) -> bool:
     return bool(IMAGE.fullmatch(cells[0]) or IMAGE.fullmatch(cells[1])) or not is_number(cells[1])
 
 
-def read_coordinates(source: Source) -> Survey:
-    """Raises ConfigError with file and line."""
+def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
+    """usual_crs: of grid coordinates where the file names none. Raises ConfigError with file and line."""
     header, names, units = _header(source, _COORDINATES)
     records = list(_rows(source, header))
     crs, crs_where = _stated_crs(source)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
-    factors = _factors(source, header, names, units)
-    if crs is not None and factors.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
-        stated = described_crs(crs_where, crs)
-        factors |= {name: factors.get(name, stated.across_m) / stated.across_m for name in "xy"}
-        factors["z"] = factors.get("z", stated.up_m) / stated.up_m
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
         for line, cells, _ in records
     ]
+    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys("xyz", "")
+    points = _points(source, rows, _factors(source, header, stated, crs or usual_crs, crs_where))
+    geographic = "latitude" in names or _in_degrees(points)
+    if crs is None and usual_crs is not None and geographic:
+        points = _points(source, rows, _factors(source, header, stated, None, crs_where))
+    elif crs is None:
+        crs = usual_crs
+    if not header and crs is None and geographic:  # the latitude stands first
+        points = [_exchanged(point) for point in points]
+    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
+        crs = None  # of coordinates that the file does not have
+    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
+
+
+def _points(
+    source: Source, rows: Sequence[tuple[int, Mapping[str, str]]], factors: Mapping[str, float]
+) -> list[SurveyedPoint]:
     points = [_point(source, line, record, factors) for line, record in rows]
     if not points:
         raise ConfigError(f"{source.path}: no control points follow the header")
     twice = next((point for n, point in enumerate(points) if point.name in {one.name for one in points[:n]}), None)
     if twice is not None:
         raise ConfigError(f"{twice.where}: the point {twice.name} stands in the file twice: keep one of the two lines")
-    geographic = "latitude" in names or _in_degrees(points)
-    if not header and crs is None and geographic:  # the latitude stands first
-        points = [_exchanged(point) for point in points]
-    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
-        crs = None  # of coordinates that the file does not have
-    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
+    return points
 
 
 def read_marks(source: Source) -> Survey:
@@ -186,15 +193,17 @@ def _column(cell: str, known: Mapping[str, str]) -> tuple[str, str]:
     return ("", "") if name == "z" and is_relative(unit) else (name, unit)
 
 
-def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[str]) -> dict[str, float]:
-    """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
+def _factors(
+    source: Source, line: int, stated: Mapping[str, str], crs: str | None, crs_where: str
+) -> dict[str, float]:
+    """Metres or degrees of one unit of every column: by its name, else by what a comment says; of coordinates in a CRS
+    as shares of its own units. stated: the units that the names state. Raises ConfigError."""
     said = stated_units(source.lines)
     if "relative" in said:
         raise ConfigError(
             f"{source.path}: {said['relative']!r} says that heights do not count from a datum: give heights above the "
             "ellipsoid or sea level"
         )
-    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys(("x", "y", "z"), "")
     found = {}
     for name, unit in stated.items():
         subjects: tuple[str, ...]
@@ -207,6 +216,10 @@ def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[st
             text = unit or next(others, "")
             if text:
                 found[name] = factor(source.at(line), name, text, kind)
+    if crs is not None and found.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
+        own = described_crs(crs_where, crs)
+        found |= {name: found.get(name, own.across_m) / own.across_m for name in "xy"}
+        found["z"] = found.get("z", own.up_m) / own.up_m
     return found
 
 
