@@ -15,7 +15,16 @@ import numpy as np
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
-from aeromatch_cli.blocks.crs import AUTO, LOCAL, across_unit_m, has_other_units, height_unit_m, is_local, local_unit_m, parsed_crs
+from aeromatch_cli.blocks.crs import (
+    AUTO,
+    LOCAL,
+    across_unit_m,
+    has_other_units,
+    height_unit_m,
+    is_local,
+    local_unit_m,
+    parsed_crs,
+)
 from aeromatch_cli.blocks.image_names import matched_names
 from aeromatch_cli.blocks.pose_files.geodesy import unit_remarks
 from aeromatch_cli.data import ControlPoint, FloatArray, Image, Pose
@@ -30,6 +39,7 @@ _FAR_EXTENTS, _FAR_M = 5.0, 2000.0
 _FEW_OUTSIDE, _SHARE_OUTSIDE = 2, 0.25
 _LARGEST_SIZE = 8
 _WGS84 = "EPSG:4326"
+_ZEROS = 3  # so many heights of exactly 0 are none
 _LATITUDE_DEG, _LONGITUDE_DEG = 90.0, 180.0
 
 
@@ -76,6 +86,9 @@ def read_control(
     if measured:
         what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
+    heights = [point.position[2] for point in survey.points]
+    if len(heights) >= _ZEROS and not any(heights):
+        remarks.append(f"{path.name}: all {len(heights)} control points have the height 0: were heights surveyed?")
     return tuple(points), remarks + far_control(points, poses or {}, name)
 
 

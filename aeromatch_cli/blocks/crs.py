@@ -73,8 +73,7 @@ def checked_crs(code: str) -> str:
 
 
 def world_crs(given: str) -> str:
-    """What the user gave for the world's CRS, with one in feet brought to the same grid in metres (`has_other_units`).
-    """
+    """What the user gave for the world's CRS; one in feet as the same grid in metres."""
     if given.strip().lower() in ("", AUTO, LOCAL):
         return given
     crs = _crs(given)
@@ -87,8 +86,9 @@ def has_other_units(crs: Any) -> bool:
 
 
 def parsed_crs(text: str) -> Any:
-    """The CRS of a code, a PROJ string, WKT or words ("WGS84", "WGS84 UTM 33N", "WGS84 UTM 33U", "WGS 84 / UTM zone 33N"); that without
-    its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none."""
+    """The CRS of a code, a PROJ string, WKT or words ("WGS84", "WGS84 UTM 33N", "WGS84 UTM 33U", "WGS 84 / UTM zone
+    33N"); that without its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none.
+    """
     from pyproj import CRS
 
     text = text.strip(" \t;,\"'")  # as spreadsheets leave it

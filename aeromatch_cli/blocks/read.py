@@ -115,7 +115,8 @@ def read_lists(
     cost a walk over 10,000 files.
 
     poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder".
-    pose_format, crs: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera file.
+    pose_format, crs: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera
+    file.
     """
     if angles not in get_args(AngleConvention):
         raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
@@ -139,9 +140,10 @@ def block_inputs(
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
-    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code of one in
-    metres (`crs.world_crs`), "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move. drop_ground_shots: leave out pictures that were taken on the ground.
+    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code of one
+    in metres (`crs.world_crs`), "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run
+    in the same workspace, kept so that a growing block does not move. drop_ground_shots: leave out pictures that were
+    taken on the ground.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """

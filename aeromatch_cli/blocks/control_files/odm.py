@@ -19,7 +19,7 @@ from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
 from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, is_number, number, units_of_comments
+from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number, units_of_comments
 from aeromatch_cli.errors import ConfigError
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
@@ -32,6 +32,17 @@ def read_gcp_list(source: Source) -> Survey:
     records = list(source.records())
     if len(records) < 2:
         raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
+    if is_number(fields_of(records[0][1])[0][0]):
+        raise ConfigError(
+            f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: add it"
+        )
+    if _is_header(records[1][1]):
+        del records[1]
+    elif not _starts_with_numbers(records[1][1]):
+        raise ConfigError(
+            f"{source.path} is no file of control points that is known (it begins with {records[0][1][:60]!r}): write "
+            f"the CRS, then {_COLUMNS}; or a table whose first line names label, x, y, z or label, lat, lon, alt"
+        )
     said = units_of_comments(source)
     factors = 1.0, 1.0, 1.0
     if said.across_m or said.up_m:  # what comments state counts before the unit of the CRS
@@ -52,6 +63,17 @@ def read_gcp_list(source: Source) -> Survey:
     )
 
 
+def _is_header(record: str) -> bool:
+    """Whether a line names the columns, as they stand in this order."""
+    names = [name.lower() for name in fields_of(record)[0][:6]]
+    return len(names) == 6 and names[5].startswith(("image", "file", "photo")) and not any(map(is_number, names))
+
+
+def _starts_with_numbers(record: str) -> bool:
+    cells = fields_of(record)[0]
+    return bool(cells) and is_number(cells[0])
+
+
 def _row(source: Source, line: int, record: str, factors: tuple[float, float, float]) -> tuple[SurveyedPoint, Mark]:
     fields, comma = fields_of(record)
     while fields and not fields[-1]:
@@ -60,7 +82,7 @@ def _row(source: Source, line: int, record: str, factors: tuple[float, float, fl
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
     x, y, z = (
-        number(source.at(line, what), cell, decimal_comma=comma) * one
+        coordinate(source.at(line, what), cell, decimal_comma=comma) * one
         for what, cell, one in zip(("x", "y", "z"), cells[:3], factors, strict=True)
     )
     named = len(cells) > 6 and not is_check(cells[6])

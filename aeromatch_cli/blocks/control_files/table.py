@@ -16,6 +16,13 @@ from aeromatch_cli.formats.reading import given_bytes
 _SUFFIXES, _LARGEST_BYTES = (".csv", ".txt", ".xml"), 20_000_000
 
 
+# What people have besides, by the end of its name, and what to do.
+_OTHERS = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "a workbook: save the sheet as CSV"),
+    **dict.fromkeys((".kml", ".kmz", ".gpx", ".shp", ".gpkg", ".geojson", ".dxf"), "a layer of GIS: export it as CSV"),
+}
+
+
 @dataclass(frozen=True)
 class _Format:
     recognises: Callable[[Source], bool]
@@ -54,6 +61,9 @@ def _read(path: Path, usual_crs: str | None) -> Survey:
 
 
 def _opened(path: Path) -> Source:
+    other = next((words for end, words in _OTHERS.items() if path.name.lower().endswith(end)), "")
+    if other and path.is_file():
+        raise ConfigError(f"control points {path} are {other}, with label, x, y, z or label, lat, lon, alt")
     try:
         given_bytes(path)
     except OSError as error:

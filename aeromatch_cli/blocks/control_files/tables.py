@@ -1,8 +1,8 @@
 """Tables of coordinates, and tables of image measurements.
 
 Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_vertical][,type]`; in degrees the
-latitude stands first; a CRS is not stated, unless a .prj of the same name lies beside. With a header the columns go by
-their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
+latitude stands first; a CRS is not stated, unless a first line is its code, or a .prj of the same name lies beside.
+With a header the columns go by their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
 `#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
 a check point. `type`: check points are named as such, all else is a control point. Names of columns and comments may
 state units, as in pose lists (`poses`).
@@ -31,11 +31,16 @@ from aeromatch_cli.blocks.units import (
     kind_of,
     metres_of,
     named_column,
+    refuse_rounded,
     stated_units,
 )
 from aeromatch_cli.errors import ConfigError
 
 _CRS = re.compile(r"#\s*coordinatesystem\s*:\s*(.*)", re.IGNORECASE)
+# A first line of a table that names the CRS alone, as in the lists of points for editors of gcp_list.txt.
+_CODE = re.compile(r"\s*(EPSG:\d+(?:\+\d+)?|\+proj=[^,;\t]*?)[\s,;]*", re.IGNORECASE)
+# Of a line below a code.
+_POINT_VALUES = 4
 _LARGEST_LONGITUDE_DEG = 180.0
 # A mark that is less exact than this, in pixels, is none: Pix4D may write the zoom of the picture there.
 _LARGEST_SIGMA_PX = 10.0
@@ -49,7 +54,9 @@ _COORDINATES: Mapping[str, str] = {
     **dict.fromkeys(("y", "northing", "north", "n"), "y"),
     **dict.fromkeys(("lon", "longitude", "lng", "long"), "longitude"),
     **dict.fromkeys(("lat", "latitude"), "latitude"),
-    **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "h", "up", "ellipsoidal_height"), "z"),
+    **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "elev", "h", "up", "ellipsoidal_height"), "z"),
+    **dict.fromkeys(("easting/longitude", "x/longitude", "x/lon", "longitude/x", "lon/x"), "x"),
+    **dict.fromkeys(("northing/latitude", "y/latitude", "y/lat", "latitude/y", "lat/y"), "y"),
     **dict.fromkeys(("type", "role", "usage", "use"), "type"),
     **dict.fromkeys(("cs_name", "crs", "srs", "epsg", "coordinate_system"), "crs"),
     **{"easting_rms": "sigma_x", "northing_rms": "sigma_y", "elevation_rms": "sigma_z", "lateral_rms": "sigma_xy"},
@@ -72,7 +79,11 @@ def is_coordinates(source: Source) -> bool:
     header, names, _ = _header(source, _COORDINATES)
     if header:
         return {"label", "z"} <= set(names) and ({"x", "y"} <= set(names) or {"longitude", "latitude"} <= set(names))
-    cells = _first(source)
+    return _is_points(_first(source))
+
+
+def _is_points(cells: Sequence[str]) -> bool:
+    """Whether a line is a name and three coordinates, and no image measurement."""
     return len(cells) >= 4 and all(map(is_number, cells[1:4])) and not any(map(IMAGE.fullmatch, cells))
 
 
@@ -153,7 +164,15 @@ def read_marks(source: Source) -> Survey:
 
 
 def _first(source: Source) -> list[str]:
-    return next((_cells(record)[0] for _, record in source.records()), [])
+    """Values of the first line, of that below a CRS."""
+    first = next((_cells(record)[0] for line, record in source.records() if line > _line_of_code(source)), [])
+    return [] if _line_of_code(source) and len(first) != _POINT_VALUES else first  # gcp_list.txt
+
+
+def _line_of_code(source: Source) -> int:
+    """Number of a first line that is a code of a CRS, 0 for none."""
+    line, record = next(iter(source.records()), (0, ""))
+    return line if _CODE.fullmatch(record) else 0
 
 
 def _cells(record: str) -> tuple[list[str], bool]:
@@ -170,10 +189,10 @@ def _cells(record: str) -> tuple[list[str], bool]:
 
 def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str], list[str]]:
     """Line of the header, 0 without one, its columns by their names in `known`, and the units that they state."""
-    canonical = frozenset(known.values())
+    canonical, code = frozenset(known.values()), _line_of_code(source) if known is _COORDINATES else 0
     for line, text in enumerate(source.lines, start=1):
         stripped = text.strip()
-        if not stripped or _CRS.match(stripped):
+        if not stripped or _CRS.match(stripped) or line == code:
             continue
         cells, _ = _cells(stripped.lstrip("#").strip())
         columns = [_column(cell, known) for cell in cells]
@@ -193,9 +212,7 @@ def _column(cell: str, known: Mapping[str, str]) -> tuple[str, str]:
     return ("", "") if name == "z" and is_relative(unit) else (name, unit)
 
 
-def _factors(
-    source: Source, line: int, stated: Mapping[str, str], crs: str | None, crs_where: str
-) -> dict[str, float]:
+def _factors(source: Source, line: int, stated: Mapping[str, str], crs: str | None, crs_where: str) -> dict[str, float]:
     """Metres or degrees of one unit of every column: by its name, else by what a comment says; of coordinates in a CRS
     as shares of its own units. stated: the units that the names state. Raises ConfigError."""
     said = stated_units(source.lines)
@@ -224,7 +241,8 @@ def _factors(
 
 
 def _rows(source: Source, header: int) -> list[tuple[int, list[str], bool]]:
-    return [(line, *_cells(record)) for line, record in source.records() if line > header]
+    start = max(header, _line_of_code(source))
+    return [(line, *_cells(record)) for line, record in source.records() if line > start]
 
 
 def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
@@ -246,6 +264,7 @@ def _point(source: Source, line: int, record: Mapping[str, str], factors: Mappin
             degrees = degrees_of(cell, "EW" if column == "longitude" else "NS")
             found = None if degrees is None else degrees * unit
         else:
+            refuse_rounded(source.at(line, column), cell)
             found = metres_of(cell, unit)
         if found is None or not math.isfinite(found):
             raise ConfigError(f"{source.at(line, column)}: {cell!r} is not a number")
@@ -272,6 +291,7 @@ def _stated_crs(source: Source) -> tuple[str | None, str]:
     """CRS and its place: in the file, or in a .prj beside it."""
     for line, text in enumerate(source.lines[:5], start=1):
         stated = _CRS.match(text.strip())
+        stated = stated or (_CODE.fullmatch(text) if line == _line_of_code(source) else None)
         if stated:
             return stated[1].strip(), source.at(line)
     beside = source.beside(source.path.with_suffix(".prj").name)

@@ -17,7 +17,7 @@ from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import Source, image_name
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.blocks.units import degrees_of
+from aeromatch_cli.blocks.units import degrees_of, metres_of
 from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
 from aeromatch_cli.errors import ConfigError
 
@@ -80,6 +80,9 @@ def _row(line: int, record: Mapping[str, Any], said: Counter[str]) -> PoseRow:
     for name in sorted(record, key=lambda key: key.startswith(f"{_FIRST}:")):
         if record[name] not in ("", "-", None):
             tags[name.rpartition(":")[2]] = record[name]
+    both = str(tags.get("GPSPosition", "")).split(",")
+    if len(both) == 2:
+        tags = {"GPSLatitude": both[0].strip(), "GPSLongitude": both[1].strip()} | tags
     latitude, longitude = (_degrees(tags, f"GPS{name}") for name in ("Latitude", "Longitude"))
     height = _metres(tags.get("AbsoluteAltitude", tags.get("GPSAltitude")), tags.get("GPSAltitudeRef"))
     xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
@@ -115,9 +118,8 @@ def _degrees(tags: Mapping[str, Any], name: str) -> float | None:
 
 def _metres(value: Any, reference: Any) -> float:
     """Of `161.96`, `+161.96`, `161.96 m Above Sea Level`; NaN for none."""
-    words = str(value).split()
-    number = tag_number(words[0].replace(",", ".")) if words else None
+    number = metres_of("" if value is None else str(value))
     if number is None:
         return float("nan")
-    below = "below" in str(value).lower() or str(reference).strip() == "1" or "below" in str(reference).lower()
+    below = str(reference).strip() == "1" or "below" in str(reference).lower()
     return -abs(number) if below else number

@@ -21,6 +21,8 @@ from aeromatch_cli.blocks.poses import PositionKind
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 
+# Eastings and northings of UTM, metres.
+_UTM_M = ((160_000.0, 840_000.0), (1_000.0, 10_000_000.0))
 _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 
 
@@ -28,7 +30,8 @@ _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 class StatedCrs:
     """What a file states of its coordinates. crs: code or WKT of the grid in metres, None for a local one and for
     degrees. name: for messages. across_m, up_m: metres of one unit of x and y, and of heights. to_degrees: transforms
-    x and y to WGS84 longitudes and latitudes where the file's are not such. remarks: for a person."""
+    x and y to WGS84 longitudes and latitudes where the file's are not such. stretched: x and y are metres of web maps.
+    remarks: for a person."""
 
     crs: str | None = None
     kind: PositionKind = "grid"
@@ -36,6 +39,7 @@ class StatedCrs:
     across_m: float = 1.0
     up_m: float = 1.0
     to_degrees: Any = None
+    stretched: bool = False
     remarks: tuple[str, ...] = ()
 
     def position(self, where: str, x: float, y: float, z: float) -> tuple[float, float, float]:
@@ -54,6 +58,21 @@ class StatedCrs:
         return y, x, height_m
 
 
+def like_utm(stated: StatedCrs, given: Sequence[tuple[float, float]]) -> list[str]:
+    """What is said where x and y that a file calls metres of a web map are such as UTM has, too. given: x and y."""
+    if not stated.stretched or not given:
+        return []
+    x, y = np.median(np.array(given, dtype=np.float64), axis=0)
+    (west, east), (south, north) = _UTM_M
+    if not (west <= x <= east and south <= abs(y) <= north):
+        return []
+    longitude, latitude = stated.to_degrees.transform(x, y)
+    return [
+        f"the coordinates ({x:.0f}, {y:.0f}) lie at latitude {latitude:.2f}, longitude {longitude:.2f} in "
+        f"{stated.name}, and look like those of UTM: is it the right CRS?"
+    ]
+
+
 def described_crs(where: str, text: str) -> StatedCrs:
     """text: EPSG:code, PROJ, WKT, or words as in `crs.parsed_crs`. Raises ConfigError where it is unknown, geocentric
     or vertical, or counts depths."""
@@ -68,8 +87,11 @@ def described_crs(where: str, text: str) -> StatedCrs:
     if not (crs.is_geographic or crs.is_projected):
         raise ConfigError(f"{where}: {crs.name} has no easting and northing: name a projected CRS, or one in degrees")
     if crs.is_geographic or is_stretched(crs.to_2d()):
-        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=_to_degrees(where, crs))
-    return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, tuple(unit_remarks(where, crs)))
+        degrees = _to_degrees(where, crs)
+        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=degrees, stretched=crs.is_projected)
+    return StatedCrs(
+        metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, remarks=tuple(unit_remarks(where, crs))
+    )
 
 
 def unit_remarks(where: str, crs: Any) -> list[str]:

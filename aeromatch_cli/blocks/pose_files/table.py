@@ -25,9 +25,9 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, like_utm
 from aeromatch_cli.blocks.pose_files.source import Source, is_number, units_of_comments, world_beside
-from aeromatch_cli.blocks.poses import PoseList, has_header, read_poses
+from aeromatch_cli.blocks.poses import PoseList, has_header, is_track, read_poses
 from aeromatch_cli.errors import ConfigError
 
 AUTO = "auto"
@@ -58,17 +58,19 @@ def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
     stated = described_crs(str(source.path), found.crs or "")
     if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
         return replace(found, crs=stated.crs)
-    if found.position_kind == "grid":  # what columns state counts before the unit of the CRS
+    grid = found.position_kind == "grid"
+    if grid:  # what columns state counts before the unit of the CRS
         found = read_poses(source.path, (stated.across_m, stated.up_m))
     one = replace(stated, across_m=1.0, up_m=1.0)
     rows = []
     for row in found.rows:
         if row.position is not None:
             x, y, height_m = row.position
-            across = (x, y) if found.position_kind == "grid" else (y, x)
+            across = (x, y) if grid else (y, x)
             row = replace(row, position=one.position(source.at(row.line), *across, height_m), position_kind=one.kind)
         rows.append(row)
-    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *found.warnings)
+    said = like_utm(stated, [row.position[:2] for row in found.rows if row.position is not None and grid])
+    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *said, *found.warnings)
     return replace(found, rows=tuple(rows), position_kind=one.kind, crs=one.crs, warnings=warnings, format=words)
 
 
@@ -243,6 +245,11 @@ def _by_content(source: Source) -> str:
         return "a list of tracks, which are tie points: give the poses of the images"
     if has_header(source.lines):
         return ""
+    if is_track(source.lines):
+        return (
+            "a flight log or a track, positions by time without image names: give the positions of the images (exif, "
+            "or a list that a geotagging tool writes)"
+        )
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
         return "ODM's geo.txt without its first line, which names the CRS, such as EPSG:32633 or EPSG:4326: add it"
     return ""
