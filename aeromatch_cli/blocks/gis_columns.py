@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 
 _NAMES = frozenset(("wkt", "wkt_geom", "geometry", "geom", "the_geom", "ewkt", "shape"))
-_NUMBER = r"[-+]?\d[\d.]*(?:e[-+]?\d+)?"
+_NUMBER = r"[-+]?\d+(?:\.\d*)?(?:e[-+]?\d{1,3})?"
 _POINT = re.compile(
     rf"\s*(?:SRID=(\d+);)?\s*POINT\s*(?:ZM|Z|M)?\s*\(\s*({_NUMBER})\s+({_NUMBER})(?:\s+({_NUMBER}))?(?:\s+{_NUMBER})?\s*\)\s*",
     re.IGNORECASE,
@@ -40,7 +40,8 @@ def with_coordinates(lines: Sequence[str]) -> list[str]:
 
 
 def _expanded(lines: Sequence[str], header: int, separator: str, column: int) -> list[str]:
-    records = {k: _cells(line, separator) for k, line in enumerate(lines) if k >= header and line.strip()}
+    plain = (k for k, line in enumerate(lines) if k >= header and line.strip() and not line.lstrip().startswith("#"))
+    records = {k: _cells(lines[k], separator) for k in plain}
     points = {k: _POINT.fullmatch(cells[column]) for k, cells in records.items() if k > header and len(cells) > column}
     found = [point for point in points.values() if point is not None]
     if not found:
@@ -49,19 +50,24 @@ def _expanded(lines: Sequence[str], header: int, separator: str, column: int) ->
     own = ("lon", "lat", "alt") if in_degrees else ("x", "y", "z")
     heights, stated = any(point[4] for point in found), any(point[1] for point in found)
     new = [*own[: 3 if heights else 2], *(["crs"] if stated else [])]
-    unread = _COORDINATES | (_HEIGHTS if heights else frozenset())
+    others = _COORDINATES | (_HEIGHTS if heights else frozenset())
+    unread = {place for place, name in enumerate(records[header]) if _bare(name) in others} | {column}
     out = list(lines)
     for k, cells in records.items():
-        kept = [cell for place, cell in enumerate(cells) if place != column]
+        kept = [cell for place, cell in enumerate(cells) if place not in unread]
         if k == header:
-            names = [f"{name}_of_table" if name.strip().lower() in unread else name for name in kept]
-            out[k] = _line([*names, *new], separator)
+            out[k] = _line([*kept, *new], separator)
         elif k in points:
             point = points[k]
             x, y, height, crs = ("", "", "", "") if point is None else (point[2], point[3], point[4], point[1])
             values = [x, y, *([height or ""] if heights else []), *([crs or ""] if stated else [])]
             out[k] = _line([*kept, *values], separator)
     return out
+
+
+def _bare(name: str) -> str:
+    """A column's name without its unit."""
+    return re.split(r"[\[(]", name.strip().lower())[0].strip()
 
 
 def _cells(line: str, separator: str) -> list[str]:

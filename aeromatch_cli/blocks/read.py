@@ -25,8 +25,9 @@ from aeromatch_cli.blocks.cameras import (
     listed,
 )
 from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, outside_area
+from aeromatch_cli.blocks.doubles import in_two_formats
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.blocks.exif_and_xmp import settled
+from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.observations import (
@@ -150,6 +151,8 @@ def block_inputs(
     warnings, failures = _report_scan(passed_over)
     failures += [ReadFailure(name, reason) for name, reason in headers.items() if isinstance(reason, str)]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str)}
+    warnings += _panoramas(facts)
+    facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
     warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:
@@ -169,6 +172,9 @@ def block_inputs(
     warnings += _rasters(facts)
     facts, remarks = settled(facts)
     warnings += remarks if lists.poses == EXIF else []
+    warnings += in_two_formats({name: (fact.width_px, fact.height_px) for name, fact in facts.items()})
+    facts, remarks = with_conventions(facts)
+    warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
@@ -294,6 +300,14 @@ def _cameras_of_poses(
         {**others.focal_sigmas, **found.focal_sigmas},
         len(found.camera_ids),
     )
+
+
+def _panoramas(facts: Mapping[str, ExifFacts]) -> list[str]:
+    """What is said of panoramas, which are left out."""
+    names = [name for name, fact in facts.items() if fact.panorama]
+    kinds = ", ".join(sorted({fact.panorama[:30] for fact in facts.values() if fact.panorama}))
+    what = f"panoramas by their XMP ({kinds}), no pictures of one lens: give the pictures that they were made of"
+    return [f"passed over {len(names)}: {listed(names)}: {what}"] if names else []
 
 
 def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:

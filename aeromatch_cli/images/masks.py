@@ -20,7 +20,7 @@ _SUFFIXES = tuple(form for suffix in (".png", ".jpg", ".jpeg", ".tif", ".tiff") 
 
 def mask_path(masks: str, name: str) -> Path | None:
     """Mask of an image: COLMAP's naming (a/1.jpg.png), Metashape's and ODM's (a/1_mask.png, .jpg or .tif), the bare
-    stem (a/1.png) where the images lie elsewhere, or the one file for all.
+    stem (a/1.png), not beside an image of that name, or the one file for all.
 
     Raises ConfigError where that is no file (a pipe, a device), or a link that leads out of the folder.
     """
@@ -32,7 +32,7 @@ def mask_path(masks: str, name: str) -> Path | None:
     picture = root / name
     candidates = [root / f"{name}.png", root / f"{name}.mask.png"]
     candidates += [picture.with_name(f"{picture.stem}_mask{suffix}") for suffix in _SUFFIXES]
-    candidates += [] if picture.exists() else [picture.with_suffix(".png")]
+    candidates += [picture.with_suffix(".png")] if picture.suffix.lower() != ".png" or not picture.exists() else []
     for candidate in candidates:
         if not candidate.exists():
             continue

@@ -11,6 +11,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
@@ -18,7 +19,7 @@ from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import Source, image_name
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.blocks.units import degrees_of, metres_of
-from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
+from aeromatch_cli.blocks.xmp import from_level, tag_number, xmp_angles
 from aeromatch_cli.errors import ConfigError
 
 _IMAGE = "SourceFile"
@@ -51,6 +52,9 @@ def read_exiftool(source: Source) -> PoseList:
         row = _row(line, record, said)
         unposed += row.position is None
         rows.append(row)
+    pitches = [row.attitude[1] for row in rows if row.attitude is not None and row.forward is False]
+    if from_level(pitches):
+        rows = [replace(row, forward=True) if row.forward is False else row for row in rows]
     if unposed == len(rows):
         raise ConfigError(
             f"{source.path}: no image of this ExifTool table has GPSLatitude and GPSLongitude: write it by "
