@@ -11,9 +11,13 @@ from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_dji, write_image
 from PIL import Image
 from read_inputs import read_inputs
 
+from aeromatch_cli.blocks.camera_files import read_camera_file
+from aeromatch_cli.blocks.cameras import fitted
 from aeromatch_cli.blocks.exif import exif_or_reason, read_exif
 from aeromatch_cli.blocks.other_files import masks_by_content
 from aeromatch_cli.blocks.pose_files import read_pose_file
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.cameras import MODELS, corner_params
 from aeromatch_cli.images.masks import mask_path
 
 COUNT = 4
@@ -142,6 +146,48 @@ def test_files_that_are_no_pictures_say_what_they_are(tmp_path: Path, head: byte
     reason = exif_or_reason(tmp_path / "a.jpg")
     assert isinstance(reason, str)
     assert said in reason
+
+
+@pytest.mark.parametrize(
+    ("sensor", "size_px"),
+    [("17.49998592000000030566x13.12498944000000200560", (4608, 3456)), ("12.82x8.55", (5472, 3648)),
+     ("35.0x23.328125", (8192, 5460))],
+)  # fmt: skip
+def test_a_camera_of_pix4d(tmp_path: Path, sensor: str, size_px: tuple[int, int]) -> None:
+    """Millimetres of its sensor become pixels of the pictures, from the upper left corner, and the lens of the
+    calibrated camera parameters beside it."""
+    width, height = size_px
+    pixel_mm = float(sensor.split("x")[0]) / width
+    px = {"F": 0.85 * width, "Px": 0.49 * width, "Py": 0.48 * height}
+    lens = {"K1": 0.038334, "K2": -0.017509, "K3": 0.020498, "T1": 0.0024, "T2": 0.0029}
+    values = {name: value * pixel_mm for name, value in px.items()} | lens
+    path = tmp_path / "x_pix4d_calibrated_internal_camera_parameters.cam"
+    path.write_text(
+        "Pix4D camera calibration file 0\n"
+        f"#Focal Length mm assuming a sensor width of {sensor}mm\nF {values['F']:.20f}\n#Principal Point mm\n"
+        + "".join(f"{name} {values[name]:.20f}\n" for name in ("Px", "Py"))
+        + "#Symmetrical Lens Distortion Coeffs\n" + "".join(f"{name} {value}\n" for name, value in lens.items())
+    )  # fmt: skip
+    (stated,) = read_camera_file(path).cameras.values()
+    camera = fitted(stated, width, height)
+    assert camera is not None
+    assert (camera.model, camera.width_px, camera.height_px) == ("BROWN", width, height)
+    named = dict(zip(MODELS["BROWN"], corner_params(camera), strict=True))
+    expected = {"f": px["F"], "cx": px["Px"], "cy": px["Py"], "k1": lens["K1"], "p1": lens["T1"], "p2": lens["T2"]}
+    # Rows and columns of the last sensor have no common scale within a thousandth of a pixel each.
+    assert {name: named[name] for name in expected} == pytest.approx(expected, rel=2e-4)
+
+
+def test_what_a_camera_of_pix4d_lacks_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.cam"
+    for text, said in (
+        ("Pix4D camera calibration file 0\n#Focal Length mm assuming a sensor width of 6.2x4.6mm\nF 4\nPx 3\n", "Py"),
+        ("Pix4D camera calibration file 0\nF 4\nPx 3\nPy 2\n", "width and height of the sensor"),
+        ("FOCAL 4.3\n", "is no calibration of Pix4D that is read"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=said):
+            read_camera_file(path)
 
 
 def test_bytes_behind_the_end_of_a_picture_cost_nothing(tmp_path: Path) -> None:

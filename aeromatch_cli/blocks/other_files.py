@@ -3,11 +3,14 @@ read."""
 
 from __future__ import annotations
 
+import struct
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
+from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import heif
+from aeromatch_cli.images.gdal import check_pixels
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
 KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
@@ -18,6 +21,19 @@ _MASK_ENDINGS = ("_mask", ".mask")
 _MASK_FOLDERS = ("mask", "masks")
 # Of masks that have the name of their image: their format, bytes for each pixel at most, and how many are decoded.
 _LOSSLESS = ".png"
+# What Pillow raises on pictures that are cut or scrambled: they are named where they are read.
+_BROKEN = (
+    ItemError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    OverflowError,
+    struct.error,
+)
 _HEADER_BYTES, _MASK_BYTES, _DECODED = 2000, 0.15, 3
 _RAW = (
     *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
@@ -67,30 +83,32 @@ def masks_by_content(folder: Path, names: Iterable[str]) -> set[str]:
 
     A mask compresses to far less than a picture. Of those that do the first few are decoded.
     """
-    pairs = twins(names)
-    likely = [name for same in pairs for name in same if name.lower().endswith(_LOSSLESS) and _is_small(folder / name)]
-    likely = [name for name in likely if any(name in same and not set(same) <= set(likely) for same in pairs)]
-    return set(likely) if all(_has_two_values(folder / name) for name in likely[:_DECODED]) else set()
+    likely: list[str] = []
+    for same in twins(names):
+        small = [name for name in same if name.lower().endswith(_LOSSLESS) and _is_small(folder / name)]
+        likely += small if len(small) < len(same) else []
+    return set(likely) if all(_is_black_and_white(folder / name) for name in likely[:_DECODED]) else set()
 
 
 def _is_small(path: Path) -> bool:
     from PIL import Image
 
+    Image.MAX_IMAGE_PIXELS = None  # nothing is decoded here
     try:
         with Image.open(path) as image:
             return path.stat().st_size <= _HEADER_BYTES + _MASK_BYTES * image.width * image.height
-    except (OSError, ValueError, SyntaxError):
+    except _BROKEN:
         return False
 
 
-def _has_two_values(path: Path) -> bool:
-    """Black and white alone, or one of both."""
+def _is_black_and_white(path: Path) -> bool:
     from PIL import Image
 
     try:
         with Image.open(path) as image:
+            check_pixels(path, image.width, image.height)
             colours = image.getcolors(2) or []
-    except (OSError, ValueError, SyntaxError):
+    except _BROKEN:
         return False
     bands = [colour[:3] if isinstance(colour, tuple) else (colour,) for _, colour in colours]
     return bool(bands) and all(set(one) in ({0}, {1}, {255}) for one in bands)
