@@ -203,6 +203,9 @@ def test_control_points_without_crs_count_in_the_crs_that_the_user_names(
     ("text", "position", "crs"),
     [
         (f"EPSG:32633\t\t\t\nP1\t{X}\t{Y}\t34\n", (X, Y, 34.0), "EPSG:32633"),
+        (f"WGS84 UTM33N\nP1 {X} {Y} 34\n", (X, Y, 34.0), "WGS84 UTM33N"),
+        (f"#, CRS, EPSG:32633,\nid, x, y, z\nP1, {X}, {Y}, 34\n", (X, Y, 34.0), "EPSG:32633"),
+        (f"# CRS: EPSG:32633\nP1,{X},{Y},34\n", (X, Y, 34.0), "EPSG:32633"),
         ("GCP Label,Northing/Latitude,Easting/Longitude,Elevation (ft)\nP1,52.5,13.4,100\n", (13.4, 52.5, 30.48), None),
         (f"Point,Northing (ft),Easting (ft),Elev (ft)\nP1,{Y / 0.3048},{X / 0.3048},100\n", (X, Y, 30.48), None),
         (f'WKT,name\n"POINT Z ({X} {Y} 34)",P1\n', (X, Y, 34.0), None),
@@ -234,6 +237,13 @@ def test_names_of_columns_below_the_crs_of_gcp_list(tmp_path: Path) -> None:
 def test_what_holds_no_control_points_is_named(tmp_path: Path, name: str, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         read_survey(written(tmp_path, text, name), None)
+
+
+def test_points_whose_name_says_that_they_are_check_points(tmp_path: Path) -> None:
+    text = f"EPSG:32633\n{X} {Y} 34 10 20 a.jpg p1\n{X} {Y} 35 30 20 a.jpg CHK-p2\n"
+    found = read_survey(written(tmp_path, text, "gcp_list.txt"), None)
+    assert [(point.name, point.check) for point in found.points] == [("p1", False), ("CHK-p2", True)]
+    assert found.remarks == ("gcp_list.txt: 1 points are check points by their name (CHK-...)",)
 
 
 def test_heights_that_are_all_zero_are_named(tmp_path: Path) -> None:

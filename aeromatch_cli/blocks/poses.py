@@ -117,7 +117,7 @@ _RELATIVE_HEIGHTS = ("relative_altitude", "rltalt", "relalt", "agl", "height_agl
 # What names the CRS of every line.
 _CRS_COLUMNS = ("crs", "srs", "epsg", "cs_name", "coordinate_system")
 _CRS_COMMENT = re.compile(
-    r"#\s*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=]\s*(?P<named>\S.*)"
+    r"#[\s,]*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=,]\s*(?P<named>\S.*)"
     r"|(?P<code>EPSG\s*:\s*\d+(?:\+\d+)?)\s*)",
     re.IGNORECASE,
 )
@@ -261,7 +261,7 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
 def stated_crs(lines: Iterable[str]) -> str | None:
     """What a comment says of the CRS, None where none does."""
     found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
-    return next(((match["named"] or match["code"]).strip() for match in found if match), None)
+    return next(((match["named"] or match["code"]).strip(" \t,;") for match in found if match), None)
 
 
 def is_position(name: str, *, height: bool) -> bool:

@@ -6,9 +6,9 @@ every point in every image, separated by blanks, tabs, commas or semicolons:
   geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z [accuracy_px]]
 
 im_x, im_y: pixels from the upper left corner of the image. A point without a name is known by its coordinates. A point
-with the word "check" (or "checkpoint") behind its name takes no part in the fit. ODM ignores what stands behind the
-name; two or three positive numbers there are standard deviations in metres, and in pixels. Lines that start with # are
-comments.
+with the word "check" (or "checkpoint") behind its name, or whose name begins with CHK-, takes no part in the fit. ODM
+ignores what stands behind the name; two or three positive numbers there are standard deviations in metres, and in
+pixels. Lines that start with # are comments; names of the columns may follow the CRS.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number
 from aeromatch_cli.errors import ConfigError
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
+_CHECK_NAME = "CHK-"
 # Coordinates of one point may differ by rounding alone.
 _SAME = 1e-8
 
@@ -58,9 +59,12 @@ def read_gcp_list(source: Source) -> Survey:
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
         points[point.name] = replace(known, check=known.check or point.check, sigmas_m=known.sigmas_m or point.sigmas_m)
         marks.append(one)
+    named = [name for name in points if name.upper().startswith(_CHECK_NAME)]
+    remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"]
     return Survey(
-        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]), measured_in=source.path
-    )
+        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
+        remarks=tuple(remarks if named else ()), measured_in=source.path,
+    )  # fmt: skip
 
 
 def _is_header(record: str) -> bool:
@@ -94,7 +98,7 @@ def _row(source: Source, line: int, record: str, factors: tuple[float, float, fl
     if not all(0.0 < sigma < float("inf") for sigma in sigmas):
         sigmas = []
     across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
-    check = any(map(is_check, cells[6:]))
+    check = any(map(is_check, cells[6:])) or name.upper().startswith(_CHECK_NAME)
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
     return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px, comma=comma)

@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoin
 from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, is_number
+from aeromatch_cli.blocks.poses import stated_crs
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,
@@ -36,9 +37,10 @@ from aeromatch_cli.blocks.units import (
 )
 from aeromatch_cli.errors import ConfigError
 
-_CRS = re.compile(r"#\s*coordinatesystem\s*:\s*(.*)", re.IGNORECASE)
 # A first line of a table that names the CRS alone, as in the lists of points for editors of gcp_list.txt.
-_CODE = re.compile(r"\s*(EPSG:\d+(?:\+\d+)?|\+proj=[^,;\t]*?)[\s,;]*", re.IGNORECASE)
+_CODE = re.compile(r"\s*(EPSG:\d+(?:\+\d+)?|\+proj=[^,;\t]*?|WGS\s*84[\s/]+UTM[^,;\t]*?)[\s,;]*", re.IGNORECASE)
+# Where the CRS of a table may stand.
+_HEAD_LINES = 5
 # Of a line below a code.
 _POINT_VALUES = 4
 _LARGEST_LONGITUDE_DEG = 180.0
@@ -192,7 +194,7 @@ def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str], l
     canonical, code = frozenset(known.values()), _line_of_code(source) if known is _COORDINATES else 0
     for line, text in enumerate(source.lines, start=1):
         stripped = text.strip()
-        if not stripped or _CRS.match(stripped) or line == code:
+        if not stripped or stated_crs([stripped]) or line == code:
             continue
         cells, _ = _cells(stripped.lstrip("#").strip())
         columns = [_column(cell, known) for cell in cells]
@@ -289,11 +291,12 @@ def _sigmas_m(record: Mapping[str, str], factors: Mapping[str, float]) -> Sigmas
 
 def _stated_crs(source: Source) -> tuple[str | None, str]:
     """CRS and its place: in the file, or in a .prj beside it."""
-    for line, text in enumerate(source.lines[:5], start=1):
-        stated = _CRS.match(text.strip())
-        stated = stated or (_CODE.fullmatch(text) if line == _line_of_code(source) else None)
-        if stated:
-            return stated[1].strip(), source.at(line)
+    code = _line_of_code(source)
+    for line, text in enumerate(source.lines[:_HEAD_LINES], start=1):
+        stated = _CODE.fullmatch(text) if line == code else None
+        found = stated[1] if stated else stated_crs([text])
+        if found:
+            return found, source.at(line)
     beside = source.beside(source.path.with_suffix(".prj").name)
     if beside is not None and beside.text.strip():
         return beside.text.strip(), str(beside.path)
