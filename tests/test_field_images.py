@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import invoke
 from make_images import DJI_XMP, PARROT_XMP, gps_tags, write_dji, write_image
 from PIL import Image
 from read_inputs import read_inputs
@@ -50,6 +51,13 @@ def test_latitudes_as_programs_write_them(tmp_path: Path, gps: dict, latitude: f
     assert read_exif(path).latitude_deg == pytest.approx(latitude, abs=1e-9)
 
 
+@pytest.mark.parametrize(("datum", "said"), [("TOKYO", True), ("WGS-84", False), ("WGS84", False), ("", False)])
+def test_positions_in_another_datum_are_named(tmp_path: Path, datum: str, said: bool) -> None:
+    facts = read_exif(write_image(tmp_path / "a.jpg", gps=gps_tags(35.0, 139.0, 40.0) | {18: datum}))
+    assert facts.latitude_deg == pytest.approx(35.0)
+    assert any("GPSMapDatum is TOKYO, and positions count as WGS84" in note for note in facts.notes) == said
+
+
 @pytest.mark.parametrize(("pitch", "looks", "said"), [(-90, DOWN, True), (0, DOWN, False), (-60, None, True)])
 def test_pitches_that_count_from_level_against_their_tag(
     tmp_path: Path, pitch: float, looks: tuple | None, said: bool
@@ -91,6 +99,23 @@ def test_gimbal_angles_in_elements_and_not_those_of_the_aircraft(tmp_path: Path)
     angles = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp)).angles
     assert angles is not None
     assert (angles.yaw_deg, angles.pitch_deg, angles.roll_deg) == (84.2, -44.5, 0.0)
+
+
+def test_pictures_of_the_way_to_the_first_line_are_named(tmp_path: Path) -> None:
+    """Before and behind the mission the gimbal looks to the horizon."""
+    for row in range(8):
+        pitch = 0.0 if row in (0, 7) else -90.0
+        write_dji(tmp_path / f"a{row}.jpg", 52.5 + 2e-4 * row, 13.4, 140.0, pitch=pitch)
+    said = invoke("check", "baseline", "--images", tmp_path, "--poses", "exif", "--jobs", "1").stderr
+    assert "2 images (a0.jpg, a7.jpg) with the horizon in view" in said
+
+
+def test_gimbal_angles_that_were_never_measured_are_named(tmp_path: Path) -> None:
+    for row in range(COUNT):
+        write_dji(tmp_path / f"a{row}.jpg", 52.5 + 2e-4 * row, 13.4, 140.0, yaw=0, pitch=0, roll=0)
+    said = invoke("check", "baseline", "--images", tmp_path, "--poses", "exif", "--jobs", "1").stderr
+    assert "all angles of 4 images" in said
+    assert "are zero: most likely they were never measured" in said
 
 
 def test_panoramas_among_the_pictures_are_left_out_and_named(tmp_path: Path) -> None:

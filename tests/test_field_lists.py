@@ -104,6 +104,11 @@ def test_coordinates_that_a_spreadsheet_has_rounded_are_refused(tmp_path: Path, 
         read_survey(written(tmp_path, f"EPSG:32633\n{cell}\t5818970\t34\t1\t2\ta.jpg\n", "gcp_list.txt"), None)
 
 
+def test_a_zone_without_its_datum_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="line 1: the CRS 'UTM 33N' is unknown: give the list with a code"):
+        read_pose_file(written(tmp_path, f"UTM 33N\na.jpg {X} {Y} {Z}\n", "geo.txt"))
+
+
 def test_numbers_with_all_their_digits_may_have_an_exponent(tmp_path: Path) -> None:
     found = read_pose_file(written(tmp_path, "image,x,y,z\na.jpg,3.909501740000e+05,5.8189700e6,1.426e2\n"))
     assert found.rows[0].position == pytest.approx((390950.174, 5818970.0, 142.6))
@@ -141,6 +146,38 @@ def test_lists_of_the_raw_pictures_are_those_of_the_developed_ones(tmp_path: Pat
     assert [pose.center_m.tolist() for pose in found.poses.values()] == [[1, 2, 3], [4, 5, 6]]
     found = read_inputs(tmp_path / "images", written(tmp_path, "image,x,y,z\na.ARW,1,2,3\na.jpg,4,5,6\n"))
     assert [pose.center_m.tolist() for pose in found.poses.values()] == [[4, 5, 6]]
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "sides", "expected"),
+    [
+        ("38.025312", "145.28905", ("S", "E"), (-38.025312, 145.28905)),
+        ("-38.025312", "145.28905", ("N", "E"), (-38.025312, 145.28905)),
+        ("-38.025312", "145.28905", ("S", "E"), (-38.025312, 145.28905)),
+        ("38.025312", "122.5", ("North", "West"), (38.025312, -122.5)),
+    ],
+)
+def test_signs_and_letters_of_exiftool(
+    tmp_path: Path, latitude: str, longitude: str, sides: tuple, expected: tuple
+) -> None:
+    head = "SourceFile,GPSLatitude,GPSLongitude,GPSLatitudeRef,GPSLongitudeRef,GPSAltitude"
+    text = f"{head}\n./a.jpg,{latitude},{longitude},{sides[0]},{sides[1]},100\n"
+    assert read_pose_file(written(tmp_path, text)).rows[0].position == (*expected, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "attitude", "sigmas_m"),
+    [
+        ("#imagename,coordinate1,coordinate2,z,yaw,pitch,roll\na.jpg,52.5,13.4,142,38.6,3.5,8.3\n",
+         (38.6, 3.5, 8.3), None),
+        ("a.jpg,52.5,13.4,142,0.02,0.04\n", None, (0.02, 0.02, 0.04)),
+        ("EPSG:4326\n\na.jpg 13.4 52.5 142 nan nan nan 0.02 0.04\n", None, (0.02, 0.02, 0.04)),
+        ("EPSG:4326\na.jpg 13.4 52.5 142 38.6 3.5 8.3\n", (38.6, 3.5, 8.3), None),
+    ],
+)  # fmt: skip
+def test_lists_without_header(tmp_path: Path, text: str, attitude: tuple | None, sigmas_m: tuple | None) -> None:
+    row = read_pose_file(written(tmp_path, text)).rows[0]
+    assert (row.position, row.attitude, row.sigmas_m) == ((52.5, 13.4, 142.0), attitude, sigmas_m)
 
 
 # --- a CRS in feet with --crs -------------------------------------------------------------------------------------
@@ -217,6 +254,27 @@ def test_tables_of_control_points(tmp_path: Path, text: str, position: tuple, cr
     found = read_survey(written(tmp_path, text, "gcp.csv"), None)
     assert (found.points[0].name, found.crs) == ("P1", crs)
     assert found.points[0].position == pytest.approx(position)
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["WGS84\t", "EPSG:4326", "EPSG:4979", "+proj=longlat +datum=WGS84 +no_defs +type=crs", "# remark\nEPSG:4326"],
+)
+def test_gcp_list_in_degrees(tmp_path: Path, head: str) -> None:
+    """The longitude stands first, as in ODM; a line behind # is no measurement."""
+    lines = f"{LONGITUDE}\t{LATITUDE}\t34\t10.5\t20\ta.jpg\tP1\n#{LONGITUDE}\t{LATITUDE}\t34\t1\t2\tb.jpg\tP1\n"
+    path = written(tmp_path, f"{head}\n{lines}", "gcp_list.txt")
+    points, remarks = read_control(str(path), (IMAGE,), "EPSG:32633", (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(points[0].position_m, (390950.4, 5818970.3, 34.0), rtol=0, atol=0.5)
+    np.testing.assert_allclose(points[0].pixels["a"], (10.0, 19.5))
+    assert remarks == []
+
+
+@pytest.mark.parametrize("head", ["PUWG1992", "WGS84 longlat"])
+def test_words_that_are_no_crs(tmp_path: Path, head: str) -> None:
+    path = written(tmp_path, f"{head}\n{X} {Y} 34 10 20 a.jpg P1\n", "gcp_list.txt")
+    with pytest.raises(ConfigError, match=f"line 1: '{head}' is no CRS: write a code"):
+        read_control(str(path), (IMAGE,), "EPSG:32633", (0.0, 0.0, 0.0))
 
 
 def test_names_of_columns_below_the_crs_of_gcp_list(tmp_path: Path) -> None:

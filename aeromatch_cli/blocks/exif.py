@@ -43,7 +43,12 @@ _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM = 37386, 41989, 41988
 _MAKER_NOTE = 37500
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
-_POSITIONING_ERROR = 31  # GPSHPositioningError, metres
+_MAP_DATUM, _POSITIONING_ERROR = 18, 31  # GPSHPositioningError, metres
+# Datums that agree with WGS84 to a metre or two, as cameras name them.
+_LIKE_WGS84 = re.compile(
+    r"WGS[ _-]?(19)?84.*|World Geodetic System 1984|(ITRF|ETRF|ETRS|CGCS|JGD|GDA|NAD[ _-]?83|SIRGAS|PZ|GRS).*|[\W\d_]*",
+    re.IGNORECASE,
+)
 _XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -322,6 +327,9 @@ def _exif_position(
     if abs(latitude) < _NO_FIX_DEG and abs(longitude) < _NO_FIX_DEG:
         notes.append(f"GPS position is (0, 0): no fix{instead}")
         return None, None
+    datum = _text(gps.get(_MAP_DATUM))
+    if datum and not _LIKE_WGS84.fullmatch(datum):
+        notes.append(f"GPSMapDatum is {datum[:30]}, and positions count as WGS84: give a list in that CRS with --poses")
     if bare:
         notes.append(f"GPS position without hemisphere (GPSLatitudeRef, GPSLongitudeRef){instead or _TAKEN_NORTH_EAST}")
         return (None, None) if instead else (latitude, longitude)

@@ -30,7 +30,7 @@ from aeromatch_cli.geometry.rotations import rotation_z
 # What names a CRS, and what no line of a list begins with.
 _CRS = re.compile(
     r"((EPSG|ESRI|IGNF|OGC)\s*:\s*\S.*|.*\+(proj|init)=.*|(PROJ|GEOG|COMPD|GEOD|BOUND)(CS|CRS)\[.*"
-    r"|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
+    r"|UTM[\s_-]*(zone)?[\s_-]*\d{1,2}\s*[A-Z]?|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
     re.IGNORECASE,
 )
 _WITH_ANGLES, _WITH_ACCURACIES = 7, 9
