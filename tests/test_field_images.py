@@ -87,6 +87,18 @@ def test_the_same_in_a_table_of_exiftool(tmp_path: Path) -> None:
         assert read_pose_file(path).rows[0].forward is forward
 
 
+@pytest.mark.parametrize(("side", "longitude"), [("W", -14.1606695), ("E", 14.1606695), ("", 14.1606695)])
+def test_the_hemisphere_of_xmp_in_a_tag_of_its_own(tmp_path: Path, side: str, longitude: float) -> None:
+    tags = f"<exif:GPSLongitude>14.1606695</exif:GPSLongitude><exif:GPSLongitudeRef>{side}</exif:GPSLongitudeRef>"
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description rdf:about="" xmlns:exif="http://ns.adobe.com/exif/1.0/"><exif:GPSLatitude>28.1844783'
+        f"</exif:GPSLatitude>{tags}</rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+    facts = read_exif(write_image(tmp_path / "a.jpg", xmp=xmp))
+    assert (facts.latitude_deg, facts.longitude_deg) == pytest.approx((28.1844783, longitude))
+
+
 def test_gimbal_angles_in_elements_and_not_those_of_the_aircraft(tmp_path: Path) -> None:
     attributes = DJI_XMP.format(yaw="+84.20", pitch="-44.50", roll="+0.00", relative="46").split("drone-dji:")
     pairs = [part.split('"') for part in attributes if "=" in part and "Degree" in part]

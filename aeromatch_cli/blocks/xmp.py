@@ -196,10 +196,13 @@ def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, fl
 
 
 def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float) -> float | None:
-    """Degrees as a number, or in Adobe's way: "52,30.5712N", "52,30,34.27N"."""
+    """Degrees as a number, whose hemisphere may stand in a tag of its own, or in Adobe's way: "52,30.5712N",
+    "52,30,34.27N"."""
     for name in names:
         text = xmp.get(name, "")
         number = tag_number(text)
+        if number is not None and xmp.get(f"{name}Ref", "")[:1].upper() in ("S", "W"):
+            number = -abs(number)
         if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
             number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
             number = -number if parts[4] in "SW" else number
