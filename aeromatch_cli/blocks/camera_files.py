@@ -28,8 +28,8 @@ from aeromatch_cli.geometry.lenses import Nearest, brown, of_colmap
 # Shorter focal lengths, as a share of the longer side, are no pixels: a fisheye's is about 0.3.
 _SHORTEST_FOCAL = 0.05
 _PIX4D = re.compile(r"^Pix4D camera calibration file.*$", re.MULTILINE)
-_PIX4D_VALUE = re.compile(r"^(F|Px|Py|K[123]|T[12])\s+([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d{1,2})?)\s*$", re.MULTILINE)
-_SENSOR = re.compile(r"sensor width of (\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)mm")
+_PIX4D_VALUE = re.compile(r"^(F|Px|Py|K[123]|T[12])\s+([-+]?\d{1,9}(?:\.\d*)?(?:[eE][-+]?\d{1,2})?)\s*$", re.MULTILINE)
+_SENSOR = re.compile(r"sensor width of (\d{1,6}(?:\.\d{1,40})?)x(\d{1,6}(?:\.\d{1,40})?)mm")
 # Pixels of the width of a sensor whose pixels are not stated: usual shapes have a whole number of rows, too.
 _SENSOR_PX = 14_400
 _USUAL_SHAPES = (4 / 3, 3 / 2, 16 / 9, 5 / 4, 1.0)
