@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,21 @@ def test_coordinates_that_a_spreadsheet_has_rounded_are_refused(tmp_path: Path, 
         read_survey(written(tmp_path, f"label;x;y;z\nP1;{cell};5818970;34\n", "gcp.csv"), None)
     with pytest.raises(ConfigError, match="has lost its last digits"):
         read_survey(written(tmp_path, f"EPSG:32633\n{cell}\t5818970\t34\t1\t2\ta.jpg\n", "gcp_list.txt"), None)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.csv", "image;x;y;z\na.jpg;390.945,174;5.818.965,434;142,4\n", "column x: '390.945,174' is not a number"),
+        ("a.csv", "image,lat,lon,alt,yaw\na.jpg,52.5,13.4,142,10\n", "column 'pitch_deg' is missing"),
+        ("a.csv", "image,lat,lon,alt\na.jpg,-31077865,322473932,1401\n", "column lat: -31077865 is out of range"),
+        ("geo.txt", "EPSG:4326\na.jpg -31077865 322473932 1401\n", "are no longitude and latitude"),
+        ("x_events.pos", "% program : RTKLIB\n2020/01/01 10:00:00.000 52.5 13.4 142 1 9\n", "an RTKLIB solution"),
+    ],
+)  # fmt: skip
+def test_lists_that_are_refused_with_their_place(tmp_path: Path, name: str, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        read_pose_file(written(tmp_path, text, name))
 
 
 def test_a_zone_without_its_datum_is_named(tmp_path: Path) -> None:
@@ -295,6 +311,22 @@ def test_names_of_columns_below_the_crs_of_gcp_list(tmp_path: Path) -> None:
 def test_what_holds_no_control_points_is_named(tmp_path: Path, name: str, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         read_survey(written(tmp_path, text, name), None)
+
+
+def test_names_of_images_in_another_case(tmp_path: Path) -> None:
+    path = written(tmp_path, f"EPSG:32633\n{X} {Y} 34 10 20 A.JPG P1\n", "gcp_list.txt")
+    points, _ = read_control(str(path), (IMAGE,), "EPSG:32633", (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(points[0].pixels["a"], (9.5, 19.5))
+
+
+def test_the_page_of_the_cases_names_tests_that_exist() -> None:
+    folder = Path(__file__).parent
+    page = (folder.parent / "docs" / "results" / "field_cases.md").read_text(encoding="utf-8")
+    own = "".join((folder / f"test_field_{kind}.py").read_text(encoding="utf-8") for kind in ("lists", "images"))
+    named = re.findall(r"(?:`(test_\w+\.py)`: )?\b(test_\w+)\b(?!\.py)", page)
+    assert len(named) > 60
+    texts = {file: (folder / file).read_text(encoding="utf-8") if file else own for file, _ in named}
+    assert [name for file, name in named if f"def {name}(" not in texts[file]] == []
 
 
 def test_points_whose_name_says_that_they_are_check_points(tmp_path: Path) -> None:
