@@ -163,6 +163,7 @@ def test_pictures_in_two_formats_are_no_masks_and_are_named(tmp_path: Path) -> N
     assert masks_by_content(tmp_path, both) == set()
     found = read_inputs(tmp_path, "exif")
     assert len(found.images) == 2 * COUNT
+    assert mask_path(str(tmp_path), "a0.jpg") is None
     assert any("4 pictures are there in two formats (a0.jpg and a0.png" in line for line in found.warnings)
     two_values(tmp_path / "alone.png")  # beside no picture of its name
     assert masks_by_content(tmp_path, [*both, "alone.png"]) == set()

@@ -55,12 +55,15 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TIME = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?", re.ASCII)
 # What files with the name of an image hold besides.
 _HEAD_BYTES = 512
-_OTHERS = (
-    (re.compile(rb"version https://git-lfs"), "a pointer of Git LFS: fetch the file itself with git lfs pull"),
-    (re.compile(rb"\s*<(!doctype|html|\?xml)", re.IGNORECASE), "a web page or XML: download the file again"),
-    (re.compile(rb"....ftyp(heic|heix|hevc|mif1|msf1)", re.DOTALL), "HEIC by its content: rename it to .heic"),
-    (re.compile(rb"\0{64}"), "zeros: copy the file again"),
-)
+_DAMAGED = "damaged header or another format"
+_OTHERS = {
+    re.compile(rb"version https://git-lfs"): "a pointer of Git LFS: fetch the file itself with git lfs pull",
+    re.compile(rb"\s*<(!doctype|html|\?xml)", re.IGNORECASE): "a web page or XML: download the file again",
+    re.compile(rb"\0{64}"): "zeros: copy the file again",
+}
+_HEIC_CONTENT = {
+    re.compile(rb"....ftyp(heic|heix|hevc|mif1|msf1)", re.DOTALL): "HEIC by its content: rename it to .heic"
+}
 # Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
 _NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
@@ -261,7 +264,8 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
 def _unreadable(path: Path) -> ItemError:
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
-    kind = next((words for begins, words in _OTHERS if begins.match(head)), "damaged header or another format")
+    others = {} if path.suffix.lower() in heif.SUFFIXES else _HEIC_CONTENT
+    kind = next((words for begins, words in (_OTHERS | others).items() if begins.match(head)), _DAMAGED)
     return ItemError(f"{path.name}: not a readable image ({kind})")
 
 

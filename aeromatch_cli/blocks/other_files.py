@@ -3,14 +3,12 @@ read."""
 
 from __future__ import annotations
 
-import struct
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import heif
-from aeromatch_cli.images.gdal import check_pixels
+from aeromatch_cli.images.masks import compresses_like_a_mask, is_black_and_white
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
 KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
@@ -19,22 +17,8 @@ MASK = "masks of images, not images: give the folder with --masks to use them"
 # Metashape and ODM (a_mask.png, a_mask.jpg), RealityCapture (a.jpg.mask.png).
 _MASK_ENDINGS = ("_mask", ".mask")
 _MASK_FOLDERS = ("mask", "masks")
-# Of masks that have the name of their image: their format, bytes for each pixel at most, and how many are decoded.
-_LOSSLESS = ".png"
-# What Pillow raises on pictures that are cut or scrambled: they are named where they are read.
-_BROKEN = (
-    ItemError,
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    EOFError,
-    OverflowError,
-    struct.error,
-)
-_HEADER_BYTES, _MASK_BYTES, _DECODED = 2000, 0.15, 3
+# Of masks that have the name of their image: their format, and how many are decoded.
+_LOSSLESS, _DECODED = ".png", 3
 _RAW = (
     *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
     *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw"),
@@ -85,33 +69,9 @@ def masks_by_content(folder: Path, names: Iterable[str]) -> set[str]:
     """
     likely: list[str] = []
     for same in twins(names):
-        small = [name for name in same if name.lower().endswith(_LOSSLESS) and _is_small(folder / name)]
+        small = [name for name in same if name.lower().endswith(_LOSSLESS) and compresses_like_a_mask(folder / name)]
         likely += small if len(small) < len(same) else []
-    return set(likely) if all(_is_black_and_white(folder / name) for name in likely[:_DECODED]) else set()
-
-
-def _is_small(path: Path) -> bool:
-    from PIL import Image
-
-    Image.MAX_IMAGE_PIXELS = None  # nothing is decoded here
-    try:
-        with Image.open(path) as image:
-            return path.stat().st_size <= _HEADER_BYTES + _MASK_BYTES * image.width * image.height
-    except _BROKEN:
-        return False
-
-
-def _is_black_and_white(path: Path) -> bool:
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            check_pixels(path, image.width, image.height)
-            colours = image.getcolors(2) or []
-    except _BROKEN:
-        return False
-    bands = [colour[:3] if isinstance(colour, tuple) else (colour,) for _, colour in colours]
-    return bool(bands) and all(set(one) in ({0}, {1}, {255}) for one in bands)
+    return set(likely) if all(is_black_and_white(folder / name) for name in likely[:_DECODED]) else set()
 
 
 def unread_kind(name: str) -> str:
