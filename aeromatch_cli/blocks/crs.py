@@ -95,7 +95,9 @@ def parsed_crs(text: str) -> Any:
     utm = _UTM.fullmatch(text)
     northern = utm is not None and utm[2].upper() >= "N" and utm[2].upper() != "S"
     crs: Any = CRS.from_user_input(f"EPSG:{(32600 if northern else 32700) + int(utm[1])}" if utm else text)
-    return crs.source_crs if crs.is_bound else crs
+    crs = crs.source_crs if crs.is_bound else crs
+    crs.to_2d()  # of damaged WKT this alone may fail, and all that use a CRS do it
+    return crs
 
 
 def is_local(text: str) -> bool:
