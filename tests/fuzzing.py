@@ -141,6 +141,19 @@ def _texts(files: Mapping[str, str | bytes]) -> dict[str, bytes]:
     return {name: text if isinstance(text, bytes) else text.encode() for name, text in files.items()}
 
 
+_OTHER_LISTS = {
+    "layer.csv": 'WKT,filename,altitude\n"POINT Z (13.4 52.5 140)",a.jpg,1\n"POINT Z (13.5 52.5 141)",b.jpg,2\n',
+    "layer.txt": "geom\timage\nSRID=32633;PointZ (390951.2 5818970.1 140)\ta.jpg\n",
+    "tags.csv": 'SourceFile,GPSPosition,GPSAltitude,Yaw,Pitch,Roll\na.jpg,"52 N, 13.4 E",9 m Above Sea Level,1,-90,0\n',
+    "both.csv": "Photo,Latitude,Longitude,Ellipsoidal height,Easting,Northing\na.jpg,52.5,13.4,140,390951,5818970.1\n",
+    "web.txt": "EPSG:3857\na.jpg 390951.2 5818970.1 140\n",
+}
+_CAM = (
+    "Pix4D camera calibration file 0\n#Focal Length mm assuming a sensor width of 6.2x4.65mm\nF 4.3\n"
+    "#Principal Point mm\nPx 3.1\nPy 2.3\nK1 0.01\nK2 0.02\nK3 0\nT1 0.001\nT2 0\n"
+)
+
+
 def readers() -> dict[str, Reader]:
     """Every reader of files that come from outside, or that a fault of the disk may change."""
     rng = np.random.default_rng(0)
@@ -181,10 +194,14 @@ def readers() -> dict[str, Reader]:
         "images.csv": read_images, "cameras.csv": read_cameras, "poses.csv": read_poses, "pairs.csv": read_pairs,
     }  # fmt: skip
     return {
-        "poses": Reader(read_pose_file, _texts({**WORLD, **LOCAL, "patb.ori": patb(transposed=False), **ori})),
+        "poses": Reader(
+            read_pose_file, _texts({**WORLD, **LOCAL, "patb.ori": patb(transposed=False), **ori, **_OTHER_LISTS})
+        ),
         "cameras": Reader(
             read_camera_file,
-            _texts({"c.json": camera, "c.yaml": camera, "cameras.txt": "1 OPENCV 40 30 9 9 20 15 0 0 0 0\n"}),
+            _texts(
+                {"c.json": camera, "c.yaml": camera, "cameras.txt": "1 OPENCV 40 30 9 9 20 15 0 0 0 0\n", "p.cam": _CAM}
+            ),
         ),
         "control": Reader(
             lambda path: read_control(str(path), images, "EPSG:32633", (391000.0, 5818000.0, 0.0)),
@@ -192,6 +209,8 @@ def readers() -> dict[str, Reader]:
                 {
                     "gcp_list.txt": control,
                     "pix4d.csv": "north,390951.2,5818970.1,34.0,0.02,0.03\nsouth,390990,5818999,33.8,0.02,0.03\n",
+                    "layer.csv": "fid;name;geom\n1;north;SRID=32633;POINT Z (390951.2 5818970.1 34.0)\n",
+                    "points.txt": "EPSG:32633\nnorth 390951.2 5818970.1 34.0\n",
                     "marks.txt": "a.jpg,north,10.5,9.5,1\na.jpg,south,12.5,9.5,1\n",
                     "markers.xml": "<document><chunk><cameras><camera id='3' label='a'/></cameras><markers>"
                     "<marker id='0' label='north'><reference x='390951.2' y='5818970.1' z='34' sx='0.01' "

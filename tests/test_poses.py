@@ -92,7 +92,7 @@ def test_a_fault_of_every_line_is_one_warning(tmp_path: Path) -> None:
         ("image,lat,lon,agl\na,1,2,3\n", "'alt' is missing.*'agl' counts from the ground"),
         ("image,x,y,z,omega_deg,phi_deg\na,1,2,3,4,5\n", "'kappa_deg' is missing"),
         ("image,x,y,z,omega_deg,phi_deg,kapa_deg\na,1,2,3,4,5,6\n", "did you mean 'kappa_deg'"),
-        ("image,x,y,z,lat,lon,alt\na,1,2,3,4,5,6\n", "two forms of position"),
+        ("image,x,y,z,qw,qx,qy,qz,yaw,pitch,roll\na,1,2,3,1,0,0,0,4,5,6\n", "two forms of attitude"),
         ("image,x,y,z,x\na,1,2,3,4\n", "'x' is named twice"),
         ("image,x,y,z\na,1,2,3\na,1,2,3\n", "line 3, column image: 'a' stands in line 2 already"),
         ("image,x,y,z\na,1,2\n", "line 2: 3 values, but the header names 4"),

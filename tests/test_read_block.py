@@ -426,7 +426,7 @@ def test_masks_beside_the_images_are_no_images(tmp_path: Path, names: tuple[str,
         assert [one.name for one in passed_over] == masks
         assert not any(one.image_lost for one in passed_over)
     said = read_inputs(tmp_path).warnings
-    assert any("masks of images by their names, not images: give the folder" in line for line in said) == bool(masks)
+    assert any("masks of images, not images: give the folder" in line for line in said) == bool(masks)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Cameras from files: COLMAP's cameras.txt, YAML or JSON, the block.json of a shared block, OpenSfM's and ODM's
-cameras.json, and the calibration that Metashape writes as XML.
+cameras.json, the calibration that Metashape writes as XML, and Pix4D's
+*_pix4d_calibrated_internal_camera_parameters.cam.
 
 Parameters follow COLMAP: its order and its corner origin (cx = W / 2 is the centre); here they become this project's.
 BROWN, which COLMAP does not have, stands there in the same way.
@@ -11,6 +12,7 @@ YAML and JSON: NAME: {model, width, height, params}, for every camera, or the sa
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +23,16 @@ from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes
 from aeromatch_cli.geometry.cameras import FULL_OPENCV, MODELS, corner_params, focal_px
-from aeromatch_cli.geometry.lenses import Nearest, of_colmap
+from aeromatch_cli.geometry.lenses import Nearest, brown, of_colmap
 
 # Shorter focal lengths, as a share of the longer side, are no pixels: a fisheye's is about 0.3.
 _SHORTEST_FOCAL = 0.05
+_PIX4D = re.compile(r"^Pix4D camera calibration file.*$", re.MULTILINE)
+_PIX4D_VALUE = re.compile(r"^(F|Px|Py|K[123]|T[12])\s+([-+]?\d{1,9}(?:\.\d*)?(?:[eE][-+]?\d{1,2})?)\s*$", re.MULTILINE)
+_SENSOR = re.compile(r"sensor width of (\d{1,6}(?:\.\d{1,40})?)x(\d{1,6}(?:\.\d{1,40})?)mm")
+# Pixels of the width of a sensor whose pixels are not stated: usual shapes have a whole number of rows, too.
+_SENSOR_PX = 14_400
+_USUAL_SHAPES = (4 / 3, 3 / 2, 16 / 9, 5 / 4, 1.0)
 _ENTRY_KEYS = ("model", "width", "height", "params")
 
 
@@ -50,6 +58,8 @@ def read_camera_file(path: Path) -> CameraFile:
         ) from error
     if text.lstrip().startswith("<"):
         content = _calibration(path, text)
+    elif _PIX4D.search(text) or path.suffix.lower() == ".cam":
+        content = _pix4d(path, text)
     else:
         content = _colmap(path, text) if path.suffix.lower() == ".txt" else _tree(path, text)
     if not content.cameras:
@@ -93,6 +103,42 @@ def _calibration(path: Path, text: str) -> CameraFile:
     if lens is None:
         raise ConfigError(f"camera file {path}: the focal length f is missing, or something is no number")
     return _file(path, {path.stem: _plausible(str(path), lens)})
+
+
+def _pix4d(path: Path, text: str) -> CameraFile:
+    """Pix4D's, in millimetres of a sensor whose size is stated, and that of the pictures is not: cameras of as many
+    pixels as keep its shape, which are resized to the pictures."""
+    cameras: dict[str, Nearest] = {}
+    for number, part in enumerate(_PIX4D.split(text)[1:]):
+        where = f"{path}, camera {number}"
+        sensor = _SENSOR.search(part)
+        found = {name: float(value) for name, value in _PIX4D_VALUE.findall(part)}
+        missing = [name for name in ("F", "Px", "Py") if name not in found]
+        if sensor is None or missing or not float(sensor[1]) > 0.0 or not float(sensor[2]) > 0.0:
+            what = missing[0] if missing else "the line with the width and height of the sensor"
+            raise ConfigError(f"{where}: {what} is missing")
+        width_mm = float(sensor[1])
+        px = _SENSOR_PX / width_mm
+        size = _SENSOR_PX, max(1, round(_SENSOR_PX / _shape(sensor[1], sensor[2])))
+        radial = [found.get(name, 0.0) for name in ("K1", "K2", "K3")]
+        tangential = found.get("T1", 0.0), found.get("T2", 0.0)
+        focal, middle = (found["F"] * px, found["F"] * px), (found["Px"] * px, found["Py"] * px)
+        cameras[f"{path.stem}_{number}" if number else path.stem] = _plausible(
+            where, brown(size, focal, middle, radial, tangential)
+        )
+    if not cameras:
+        raise ConfigError(
+            f"camera file {path} is no calibration of Pix4D that is read: give "
+            "*_pix4d_calibrated_internal_camera_parameters.cam, or *_calibrated_camera_parameters.txt with --poses"
+        )
+    return _file(path, cameras)
+
+
+def _shape(width: str, height: str) -> float:
+    """Width by height of a sensor: a usual one where the digits of both leave that open (12.82x8.55 is 3:2)."""
+    shape = float(width) / float(height)
+    rounding = sum(0.5 * 10.0 ** -len(text.partition(".")[2]) / float(text) for text in (width, height))
+    return next((usual for usual in _USUAL_SHAPES if abs(usual / shape - 1.0) <= rounding), shape)
 
 
 def _tree(path: Path, text: str) -> CameraFile:

@@ -16,9 +16,11 @@ import numpy as np
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.control_files import Mark, Survey, read_survey
 from aeromatch_cli.blocks.crs import (
+    AUTO,
     LOCAL,
     across_unit_m,
     converted_heights,
+    has_other_units,
     height_unit_m,
     heights_of,
     heights_words,
@@ -40,6 +42,7 @@ _FAR_EXTENTS, _FAR_M = 5.0, 2000.0
 _FEW_OUTSIDE, _SHARE_OUTSIDE = 2, 0.25
 _LARGEST_SIZE = 8
 _WGS84 = "EPSG:4326"
+_ZEROS = 3  # so many heights of exactly 0 are none
 _LATITUDE_DEG, _LONGITUDE_DEG = 90.0, 180.0
 
 
@@ -53,18 +56,20 @@ def read_control(
     poses: Mapping[str, Pose] | None = None,
     use: ControlUse = "adjust",
     heights: str = "",
+    usual_crs: str = AUTO,
 ) -> tuple[tuple[ControlPoint, ...], list[str]]:
     """Points in the world frame that images of the block show, and remarks; nothing of no file ("").
 
     crs, origin_m: of the block; a local block takes the coordinates as they are. marks: file of the image measurements
     where they stand apart, "" to look for it beside. poses: of the block, to tell exchanged coordinates and degrees by.
-    use: "check": all are check points. heights: what those of the world count from, as of `crs.heights_of`. Raises
-    ConfigError with file and line where a file is malformed, or its CRS cannot be brought to the block's.
+    use: "check": all are check points. heights: what those of the world count from, as of `crs.heights_of`. usual_crs:
+    what the user says that coordinates of a file without CRS count in, where that is one in feet. Raises ConfigError
+    with file and line where a file is malformed, or its CRS cannot be brought to the block's.
     """
     if not name:
         return (), []
     path = Path(name)
-    survey = read_survey(path, Path(marks) if marks else None)
+    survey = read_survey(path, Path(marks) if marks else None, _in_feet(usual_crs))
     places_m, remarks = _places(survey, path, crs, np.array(origin_m), poses or {})
     places_m, converted = _in_world_heights(survey, path, crs, np.array(origin_m), places_m, heights)
     measured, said = _measured(survey.marks, survey.measured_in, images)
@@ -86,7 +91,15 @@ def read_control(
     if measured:
         what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
+    heights = [point.position[2] for point in survey.points]
+    if len(heights) >= _ZEROS and not any(heights):
+        remarks.append(f"{path.name}: all {len(heights)} control points have the height 0: were heights surveyed?")
     return tuple(points), remarks + far_control(points, poses or {}, name)
+
+
+def _in_feet(crs: str) -> str | None:
+    """The CRS, None where it counts in metres or degrees."""
+    return None if crs.strip().lower() in ("", AUTO, LOCAL) or not has_other_units(parsed_crs(crs)) else crs
 
 
 def far_control(points: Sequence[ControlPoint], poses: Mapping[str, Pose], name: str) -> list[str]:

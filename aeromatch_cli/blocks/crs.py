@@ -31,7 +31,8 @@ _SAME_M = 0.001
 # What heights count from where no vertical CRS does.
 ELLIPSOID = "ellipsoid"
 _LOCAL_WKT = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
-_UTM = re.compile(r"WGS\s*84[\s/]+UTM\s*(?:zone\s*)?(\d{1,2})\s*([NS])", re.IGNORECASE)
+# N and S are hemispheres, other letters bands of latitude, which begin at 80 S and are northern from N on.
+_UTM = re.compile(r"WGS\s*84[\s/]+UTM\s*(?:zone\s*)?(\d{1,2})\s*([C-HJ-NP-X])", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -75,15 +76,32 @@ def checked_crs(code: str) -> str:
     return ":".join(authority) if authority else code.strip()
 
 
+def world_crs(given: str) -> str:
+    """What the user gave for the world's CRS; one in feet as the same grid in metres."""
+    if given.strip().lower() in ("", AUTO, LOCAL):
+        return given
+    crs = _crs(given)
+    return metric_crs(crs) if has_other_units(crs) else given
+
+
+def has_other_units(crs: Any) -> bool:
+    """Whether coordinates or heights of a projected CRS count in another unit than metres."""
+    return bool(crs.is_projected) and (across_unit_m(crs) != 1.0 or height_unit_m(crs.name, crs) != 1.0)
+
+
 def parsed_crs(text: str) -> Any:
-    """The CRS of a code, a PROJ string, WKT or words ("WGS84", "WGS84 UTM 33N", "WGS 84 / UTM zone 33N"); that without
-    its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none."""
+    """The CRS of a code, a PROJ string, WKT or words ("WGS84", "WGS84 UTM 33N", "WGS84 UTM 33U", "WGS 84 / UTM zone
+    33N"); that without its shift to WGS84 where one is written with it. Raises pyproj's CRSError where there is none.
+    """
     from pyproj import CRS
 
     text = text.strip(" \t;,\"'")  # as spreadsheets leave it
     utm = _UTM.fullmatch(text)
-    crs: Any = CRS.from_user_input(f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text)
-    return crs.source_crs if crs.is_bound else crs
+    northern = utm is not None and utm[2].upper() >= "N" and utm[2].upper() != "S"
+    crs: Any = CRS.from_user_input(f"EPSG:{(32600 if northern else 32700) + int(utm[1])}" if utm else text)
+    crs = crs.source_crs if crs.is_bound else crs
+    crs.to_2d()  # of damaged WKT this alone may fail, and all that use a CRS do it
+    return crs
 
 
 def is_local(text: str) -> bool:

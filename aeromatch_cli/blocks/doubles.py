@@ -1,4 +1,4 @@
-"""Files that are there twice under different names."""
+"""Files that are there twice under different names, and pictures in two formats."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from aeromatch_cli.blocks.cameras import listed
+from aeromatch_cli.blocks.other_files import twins
 
 # Files of equal size differ in their first or last bytes, or nowhere: these many are compared before whole ones.
 _EDGE_BYTES = 65_536
@@ -44,6 +45,15 @@ def remarks_on(found: Mapping[str, str], total: int) -> list[str]:
         return []
     pairs = [f"{name} is {first}" for name, first in found.items()]
     return [f"{len(found)} of {total} images are there twice ({listed(pairs)}): remove one of each"]
+
+
+def in_two_formats(sizes_px: Mapping[str, tuple[int, int]]) -> list[str]:
+    """What is said of pictures that are there in two formats. sizes_px: of every picture by name."""
+    pairs = [same for same in twins(sizes_px) if len({sizes_px[name] for name in same}) == 1]
+    if not pairs:
+        return []
+    shown = listed([" and ".join(same) for same in pairs])
+    return [f"{len(pairs)} pictures are there in two formats ({shown}): remove one of each"]
 
 
 def _edges(path: Path, size: int) -> bytes:

@@ -43,11 +43,27 @@ _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _DIGITAL_ZOOM = 37386, 41989, 41988
 _MAKER_NOTE = 37500
 _EXIF_WIDTH, _EXIF_HEIGHT = 40962, 40963
 _FOCAL_PLANE_X, _FOCAL_PLANE_UNIT = 41486, 41488
-_POSITIONING_ERROR = 31  # GPSHPositioningError, metres
+_MAP_DATUM, _POSITIONING_ERROR = 18, 31  # GPSHPositioningError, metres
+# Datums that agree with WGS84 to a metre or two, as cameras name them.
+_LIKE_WGS84 = re.compile(
+    r"WGS[ _-]?(19)?84.*|World Geodetic System 1984|(ITRF|ETRF|ETRS|CGCS|JGD|GDA|NAD[ _-]?83|SIRGAS|PZ|GRS).*|[\W\d_]*",
+    re.IGNORECASE,
+)
 _XMP_CAMERA_SERIAL = "drone-dji:CameraSerialNumber"
 _GEOTIFF = frozenset({33550, 34264})  # ModelPixelScale, ModelTransformation: where pixels lie on the map
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TIME = re.compile(r"(\d{4})[:/.-](\d\d)[:/.-](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d+))?", re.ASCII)
+# What files with the name of an image hold besides.
+_HEAD_BYTES = 512
+_DAMAGED = "damaged header or another format"
+_OTHERS = {
+    re.compile(rb"version https://git-lfs"): "a pointer of Git LFS: fetch the file itself with git lfs pull",
+    re.compile(rb"\s*<(!doctype|html|\?xml)", re.IGNORECASE): "a web page or XML: download the file again",
+    re.compile(rb"\0{64}"): "zeros: copy the file again",
+}
+_HEIC_CONTENT = {
+    re.compile(rb"....ftyp(heic|heix|hevc|mif1|msf1)", re.DOTALL): "HEIC by its content: rename it to .heic"
+}
 # Positions nearer to (0, 0) stand for none; altitudes that are higher are overflown numbers.
 _NO_FIX_DEG, _HIGHEST_M, _ALTITUDE_ROUNDING_M = 1e-7, 30_000.0, 2.0
 _TAKEN_NORTH_EAST = ": it counts as north and east; where that is wrong, write the letters (exiftool) or give --poses"
@@ -67,10 +83,10 @@ class ExifFacts:
     take-off point. calibrated: the camera by XMP. sigmas_m: standard deviations of the position to the east, to the
     north and of the height, by an RTK receiver or as GPS tags state them; sigma_angle_deg: of the angles. serial:
     number of the aircraft, else that of the camera. camera_serial: of the camera's body, else that of the aircraft.
-    lens: model and serial number. band: of a multispectral camera. panel: shows a
-    panel of known reflectance. utc_offset: of `time`, such as "+02:00".
-    speed_m_s: of the aircraft, to true north, to the east and down. georeferenced: the file says where its pixels lie
-    on the map, as orthophotos do. notes: what was found and could not be used.
+    lens: model and serial number. band: of a multispectral camera. panel: shows a panel of known reflectance. panorama:
+    its projection, "" for other pictures. utc_offset: of `time`, such as "+02:00". speed_m_s: of the aircraft, to true
+    north, to the east and down. georeferenced: the file says where its pixels lie on the map, as orthophotos do. notes:
+    what was found and could not be used.
     """
 
     width_px: int
@@ -99,6 +115,7 @@ class ExifFacts:
     lens: str = ""
     band: str = ""
     panel: bool = False
+    panorama: str = ""
     utc_offset: str = ""
     speed_m_s: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
@@ -167,6 +184,7 @@ def read_exif(path: Path) -> ExifFacts:
         lens=" ".join(part for part in (_text(exif.get(_LENS_MODEL)), _serial(exif.get(_LENS_SERIAL))) if part),
         band=xmp_band(xmp),
         panel=xmp_panel(xmp),
+        panorama=xmp.get("GPano:ProjectionType", ""),
         utc_offset=_utc_offset(exif),
         speed_m_s=xmp_speed_m_s(xmp),
         notes=tuple(notes),
@@ -244,7 +262,11 @@ def _header_of_other(path: Path, notes: list[str]) -> _Header:
 
 
 def _unreadable(path: Path) -> ItemError:
-    return ItemError(f"{path.name}: not a readable image (damaged header or another format)")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    others = {} if path.suffix.lower() in heif.SUFFIXES else _HEIC_CONTENT
+    kind = next((words for begins, words in (_OTHERS | others).items() if begins.match(head)), _DAMAGED)
+    return ItemError(f"{path.name}: not a readable image ({kind})")
 
 
 def _readers(table: Callable[[], Any]) -> tuple[Callable[[], Mapping[int, Any]], ...]:
@@ -309,6 +331,9 @@ def _exif_position(
     if abs(latitude) < _NO_FIX_DEG and abs(longitude) < _NO_FIX_DEG:
         notes.append(f"GPS position is (0, 0): no fix{instead}")
         return None, None
+    datum = _text(gps.get(_MAP_DATUM))
+    if datum and not _LIKE_WGS84.fullmatch(datum):
+        notes.append(f"GPSMapDatum is {datum[:30]}, and positions count as WGS84: give a list in that CRS with --poses")
     if bare:
         notes.append(f"GPS position without hemisphere (GPSLatitudeRef, GPSLongitudeRef){instead or _TAKEN_NORTH_EAST}")
         return (None, None) if instead else (latitude, longitude)

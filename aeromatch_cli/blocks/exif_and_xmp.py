@@ -1,4 +1,5 @@
-"""Positions and heights that EXIF and XMP of the same images both state, and that contradict each other.
+"""Positions and heights that EXIF and XMP of the same images both state, and that contradict each other; angles that
+contradict the definition of their tags.
 
 EXIF counts, since corrected positions (PPK) are written there, unless it is the broken one: coarser than XMP (cut to
 minutes, the same for all), or in single images far from where all others are, and XMP is not.
@@ -7,12 +8,14 @@ minutes, the same for all), or in single images far from where all others are, a
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from aeromatch_cli.blocks.exif import ExifFacts
+from aeromatch_cli.blocks.xmp import from_level
 from aeromatch_cli.data import BoolArray, FloatArray
 
 _METRES_PER_DEGREE = 111_320.0
@@ -49,6 +52,28 @@ def settled(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[
         found |= {name: replace(found[name], altitude_m=found[name].xmp_position[2]) for name in taken}
     heights, remark = _without_zeros(found)
     return found | heights, remarks + remark
+
+
+def with_conventions(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:
+    """Headers with the convention that the angles of each camera can have, and what is said where it is not that of the
+    tags."""
+    cameras: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, fact in facts.items():
+        if fact.angles is not None and fact.angles.convention == "nadir":
+            cameras[fact.make, fact.model].append(name)
+    found, remarks = dict(facts), []
+    for names in cameras.values():
+        angles = {name: one for name in names if (one := facts[name].angles) is not None}
+        pitches = [one.pitch_deg for one in angles.values()]
+        if not from_level(pitches):
+            continue
+        found |= {name: replace(facts[name], angles=replace(one, convention="gimbal")) for name, one in angles.items()}
+        remarks.append(
+            f"{_some(names, np.ones(len(names), dtype=bool))} have a pitch of {np.median(pitches):.0f} degrees, which "
+            "by its tag (Pix4D's Camera:Pitch) looks backwards: it is taken as counted from level, where -90 looks "
+            "down; --set block.angles=nadir reads it by its tag"
+        )
+    return found, remarks
 
 
 def _without_zeros(facts: Mapping[str, ExifFacts]) -> tuple[dict[str, ExifFacts], list[str]]:

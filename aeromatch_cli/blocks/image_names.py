@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 
 from aeromatch_cli.blocks.cameras import listed
 from aeromatch_cli.blocks.captures import numbers_of_exposures
+from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.errors import ConfigError
 
@@ -21,8 +22,9 @@ def matched_rows(
 ) -> tuple[dict[str, PoseRow], list[str]]:
     """Image name -> its line, and remarks on lines without image and images without line.
 
-    An exact relative path comes first; then the same path in another case, the bare file name, and the name without
-    suffix (Metashape's labels); of several, the one whose folders are named, too. A path does not fall back
+    An exact relative path comes first; then the same path in another case, the bare file name, the name without suffix
+    (Metashape's labels), and that with another suffix (a list of the raw pictures, or of PNG that became JPEG); of
+    several, the one whose folders are named, too. A path does not fall back
     to an image that has a line of its own, nor, where the list has several of its file name, to one of another folder.
     Running numbers (PATB) stand in the names, of one folder; those of exposures with times (DJI's MRK) are matched by
     order and time (`captures`). times: of the images, ISO text by name. Raises ConfigError where two images fit a line,
@@ -78,7 +80,12 @@ def _matches(
         if row.image in exact:
             continue
         # Programs write paths of the machine that they ran on.
-        found = by_key.get(row.image.lower()) or by_key.get(PurePosixPath(row.image).name.lower(), [])
+        written_as = row.image.lower()
+        found = by_key.get(written_as) or by_key.get(PurePosixPath(written_as).name, [])
+        if not found and IMAGE.fullmatch(written_as):
+            stem = PurePosixPath(written_as).stem
+            # An image that has a line of its own is not meant by another.
+            found = [name for name in by_key.get(stem, []) if PurePosixPath(name).name.lower() not in alike]
         if row.numbered and not found:
             found = by_number.get(int(float(row.image)), [])
             if found and len({PurePosixPath(name).parent for name in found}) == 1:

@@ -53,10 +53,10 @@ def of_metashape(calibration: Any, kind: str, width_px: int, height_px: int) -> 
     try:
         facts = {child.tag: float(child.text) for child in calibration if child.tag in _METASHAPE and child.text}
         f = facts["f"]
+        middle = width_px / 2.0 + facts.get("cx", 0.0), height_px / 2.0 + facts.get("cy", 0.0)
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     focal = f + facts.get("b1", 0.0), f
-    middle = width_px / 2.0 + facts.get("cx", 0.0), height_px / 2.0 + facts.get("cy", 0.0)
     radial = [facts.get(f"k{k}", 0.0) for k in (1, 2, 3, 4)]
     tangential = facts.get("p2", 0.0), facts.get("p1", 0.0)
     read = fisheye if kind == "fisheye" else brown

@@ -1,20 +1,24 @@
-"""Files of a folder of images that are none of the block, by their names: masks, and what is not
+"""Files of a folder of images that are none of the block, by their names and by what they hold: masks, and what is not
 read."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from aeromatch_cli.images import heif
+from aeromatch_cli.images.masks import compresses_like_a_mask, is_black_and_white
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".jp2", ".j2k")
 KINDS = ", ".join(suffix[1:] for suffix in _SUFFIXES)  # as messages say it
-MASK = "masks of images by their names, not images: give the folder with --masks to use them"
+MASK = "masks of images, not images: give the folder with --masks to use them"
 
 # Metashape and ODM (a_mask.png, a_mask.jpg), RealityCapture (a.jpg.mask.png).
 _MASK_ENDINGS = ("_mask", ".mask")
 _MASK_FOLDERS = ("mask", "masks")
+# Of masks that have the name of their image: their format, and how many are decoded.
+_LOSSLESS, _DECODED = ".png", 3
 _RAW = (
     *(".dng", ".arw", ".cr2", ".cr3", ".nef", ".nrw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".iiq", ".3fr", ".fff"),
     *(".raw", ".gpr", ".rwl", ".x3f", ".erf", ".kdc", ".mrw"),
@@ -48,6 +52,26 @@ def masks_among(names: Iterable[str]) -> set[str]:
         if is_mask:
             masks.add(name)
     return masks
+
+
+def twins(names: Iterable[str]) -> list[list[str]]:
+    """Pictures of one name with different suffixes in one folder, those together."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for name in names:
+        found[str(PurePosixPath(name).with_suffix("")).lower()].append(name)
+    return [same for same in found.values() if len(same) > 1]
+
+
+def masks_by_content(folder: Path, names: Iterable[str]) -> set[str]:
+    """Those of these pictures that are masks of one of the same name (a.png beside a.jpg): of two values alone.
+
+    A mask compresses to far less than a picture. Of those that do the first few are decoded.
+    """
+    likely: list[str] = []
+    for same in twins(names):
+        small = [name for name in same if name.lower().endswith(_LOSSLESS) and compresses_like_a_mask(folder / name)]
+        likely += small if len(small) < len(same) else []
+    return set(likely) if all(is_black_and_white(folder / name) for name in likely[:_DECODED]) else set()
 
 
 def unread_kind(name: str) -> str:

@@ -42,6 +42,7 @@ from typing import Any, Literal, cast
 from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_sigma_m
 from aeromatch_cli.blocks.crs import ELLIPSOID
 from aeromatch_cli.blocks.fields import with_name, words_of
+from aeromatch_cli.blocks.gis_columns import with_coordinates
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,
@@ -51,6 +52,7 @@ from aeromatch_cli.blocks.units import (
     kind_of,
     metres_of,
     named_column,
+    refuse_rounded,
     stated_units,
 )
 from aeromatch_cli.data import Camera
@@ -78,16 +80,17 @@ _LONGEST_NAME = 100  # characters of a column
 
 def _axis_names(column: str, *axes: str) -> dict[str, str]:
     """Other names of a standard deviation's column: std_x, sd_x, sdx, x_accuracy, easting_rms, ..."""
-    words = ("sigma", "std", "sd", "rms", "accuracy")
+    words = ("sigma", "std", "sd", "rms", "accuracy", "stddev", "std_dev", "stdev")
     joined = {f"{word}_{axis}" for word in words for axis in axes} | {
         f"{axis}_{word}" for word in words for axis in axes
     }
-    return dict.fromkeys(sorted(joined | {f"sd{axis}" for axis in axes} | {f"{name}_m" for name in joined}), column)
+    bare = {f"{word}{axis}" for word in ("sd", "std", "accuracy") for axis in axes}
+    return dict.fromkeys(sorted(joined | bare | {f"{name}_m" for name in joined}), column)
 
 
 _ALIASES = {
     **dict.fromkeys(("filename", "file", "name", "label", "photo", "image_name", "imagename", "file_name"), "image"),
-    **dict.fromkeys(("photo_name", "sourcefile", "image_path", "picture"), "image"),
+    **dict.fromkeys(("photo_name", "photoname", "sourcefile", "image_path", "picture"), "image"),
     **{"easting": "x", "x/easting": "x", "northing": "y", "y/northing": "y", "z/altitude": "z"},
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "long": "lon", "altitude": "alt"},
     **{"gpslatitude": "lat", "gpslongitude": "lon", "gpsaltitude": "alt"},
@@ -95,25 +98,28 @@ _ALIASES = {
     **{"x/longitude": "lon", "y/latitude": "lat", "longitude/x": "lon", "latitude/y": "lat", "height/z": "alt"},
     **_axis_names("sigma_x_m", "x", "e", "easting"),
     **_axis_names("sigma_y_m", "y", "n", "northing"),
-    **_axis_names("sigma_z_m", "z", "u", "elevation", "vertical", "vert", "altitude"),
-    **_axis_names("sigma_xy_m", "xy", "horizontal", "horz"),
+    **_axis_names("sigma_z_m", "z", "u", "elevation", "vertical", "vert", "altitude", "height"),
+    **_axis_names("sigma_xy_m", "xy", "horizontal", "horz", "horizon"),
     **{"hrms": "sigma_xy_m", "vrms": "sigma_z_m", "gpsxyaccuracy": "sigma_xy_m", "gpszaccuracy": "sigma_z_m"},
     **dict.fromkeys(("accuracy", "accuracy_m", "sigma_position"), "sigma_position_m"),
     **{"sigma_angle": "sigma_angle_deg"} | {f"sigma_{name}": f"sigma_{name}_deg" for name in ("omega", "phi", "kappa")},
     **{name: f"{name}_deg" for name in ("omega", "phi", "kappa", "yaw", "pitch", "roll")},
+    "heading": "yaw_deg",
 }
 # Columns that are taken for z or alt where there is none, the likeliest first.
-_OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "ellipsoidal_height", "ellipsoid_height", "orthometric_height",
-                  "altitude_above_sealevel", "altitude_msl", "height", "elevation", "h")  # fmt: skip
+_OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "absalt", "abs_alt", "ellipsoidal_height", "ellipsoid_height",
+                  "orthometric_height", "altitude_above_sealevel", "altitude_msl", "height", "elevation",
+                  "h")  # fmt: skip
 # Those that are taken beside heights above ground, too.
 _FROM_DATUM = _OTHER_HEIGHTS[2:-3]
 # Heights above ground, or above where the flight began.
-_RELATIVE_HEIGHTS = ("relative_altitude", "agl", "height_agl", "altitude_agl", "rel_alt", "salt", "height_above_ground",
-                     "height_above_takeoff", "altitude_above_ground", "altitude_above_takeoff")  # fmt: skip
+_RELATIVE_HEIGHTS = ("relative_altitude", "rltalt", "relalt", "agl", "height_agl", "altitude_agl", "rel_alt", "salt",
+                     "height_above_ground", "height_above_takeoff", "altitude_above_ground",
+                     "altitude_above_takeoff")  # fmt: skip
 # What names the CRS of every line.
 _CRS_COLUMNS = ("crs", "srs", "epsg", "cs_name", "coordinate_system")
 _CRS_COMMENT = re.compile(
-    r"#\s*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=]\s*(?P<named>\S.*)"
+    r"#[\s,]*(?:(?:crs|srs|projection|coordinate\s*(?:reference\s*)?system)\s*[:=,]\s*(?P<named>\S.*)"
     r"|(?P<code>EPSG\s*:\s*\d+(?:\+\d+)?)\s*)",
     re.IGNORECASE,
 )
@@ -197,6 +203,7 @@ class _Layout:
     factors: Mapping[str, float]  # metres or degrees of one unit, by column
     height: str = ""  # the column that is taken for z or alt under another name
     crs_column: int = -1
+    not_taken: str = ""  # columns of a second form of position
 
 
 def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str | None = None) -> PoseList:
@@ -206,7 +213,7 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
     file's. Raises ConfigError with file, line and column where the list is malformed.
     """
     text = _text(path) if text is None else text
-    lines = [line for line in enumerate(text.splitlines(), start=1) if line[1].strip()]
+    lines = [line for line in enumerate(with_coordinates(text.splitlines()), start=1) if line[1].strip()]
     if lines and _SEPARATOR_LINE.fullmatch(lines[0][1].strip()):
         lines = lines[1:]
     header, layout, records = _header(path, lines)
@@ -239,6 +246,10 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
             f"{path.name}: {datum!r}: ground and control points must count from the same zero, or state their own "
             "(EPSG:32633+5773)"
         )
+    if layout.not_taken:
+        kind = "whose CRS is named" if layout.position_kind == "grid" else "since no CRS of the others is named"
+        taken = ", ".join(_POSITIONS[layout.position_kind][:2])
+        ignored.append(f"{path.name}: of two forms of position {taken} count, {kind}; {layout.not_taken} do not")
     if layout.height:
         own = _POSITIONS[layout.position_kind][2]
         ignored.append(f"{path.name}: {layout.height} is taken for the height {own}, which counts from the datum")
@@ -256,7 +267,7 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
 def stated_crs(lines: Iterable[str]) -> str | None:
     """What a comment says of the CRS, None where none does."""
     found = (_CRS_COMMENT.fullmatch(line.strip()) for line in lines)
-    return next(((match["named"] or match["code"]).strip() for match in found if match), None)
+    return next(((match["named"] or match["code"]).strip(" \t,;") for match in found if match), None)
 
 
 def is_position(name: str, *, height: bool) -> bool:
@@ -275,6 +286,12 @@ def has_header(lines: Sequence[str]) -> bool:
         if "image" in columns and {*_POSITIONS["grid"][:2], *_POSITIONS["geographic"][:2]} & set(columns):
             return True
     return False
+
+
+def is_track(lines: Sequence[str]) -> bool:
+    """Whether the first line names latitudes and longitudes, and no image."""
+    _, columns, _ = _columns(next((line.strip().lstrip("#").strip() for line in lines if line.strip()), ""))
+    return {"lat", "lon"} <= set(columns) and "image" not in columns
 
 
 def _with_latitudes(path: Path, rows: list[PoseRow]) -> tuple[list[PoseRow], list[str]]:
@@ -339,7 +356,8 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
         if "image" in columns and len(columns) > 1:
             records = [(n, text) for n, text in lines[place + 1 :] if not text.lstrip().startswith("#")]
             said = stated_units(text for _, text in lines)
-            return number, _layout(path, number, separator, columns, units, said), records
+            crs_named = stated_crs(text for _, text in lines) is not None
+            return number, _layout(path, number, separator, columns, units, said, crs_named=crs_named), records
     number, line = lines[min(first, len(lines) - 1)]
     found = ", ".join(_columns(line.strip())[1])[:120]
     raise ConfigError(
@@ -398,7 +416,7 @@ def _factors(where: str, columns: Sequence[str], units: Sequence[str], said: Map
 
 def _layout(
     path: Path, number: int, separator: str | None, columns: tuple[str, ...], units: tuple[str, ...],
-    said: Mapping[str, str],
+    said: Mapping[str, str], *, crs_named: bool,
 ) -> _Layout:  # fmt: skip
     where = f"{path}, line {number}"
     first = columns.index("image")
@@ -407,10 +425,11 @@ def _layout(
     if twice:
         raise ConfigError(f"{where}: column {twice[0]!r} is named twice: keep one")
     factors = _factors(where, columns, units, said)
+    crs_column = next((place for place, name in enumerate(columns) if name in _CRS_COLUMNS), -1)
+    columns, not_taken = _one_position(columns, crs_named=crs_named or crs_column >= 0)
     columns, height = _with_height(columns)
     if height in factors:
         factors |= {own: factors[height] for own in ("z", "alt") if own in columns}
-    crs_column = next((place for place, name in enumerate(columns) if name in _CRS_COLUMNS), -1)
     unknown = tuple(name for name in columns if name and name not in _KNOWN and name not in _CRS_COLUMNS)
     for name in unknown:
         near = difflib.get_close_matches(name, [known for known in _KNOWN if known not in columns], n=1, cutoff=0.75)
@@ -434,7 +453,21 @@ def _layout(
         factors,
         height,
         crs_column,
+        not_taken,
     )
+
+
+def _one_position(columns: tuple[str, ...], *, crs_named: bool) -> tuple[tuple[str, ...], str]:
+    """Columns with one form of position, and the columns that do not count: of grid coordinates beside degrees the
+    former count where their CRS is named."""
+    if not {"x", "y", "lat", "lon"} <= set(columns):
+        return columns, ""
+    own, other = ("grid", "geographic") if crs_named else ("geographic", "grid")
+    left_out = set(_POSITIONS[cast(PositionKind, other)])
+    if _POSITIONS[cast(PositionKind, own)][2] not in columns:
+        left_out -= {"z", "alt"}
+    kept = tuple("" if name in left_out else name for name in columns)
+    return kept, ", ".join(name for name in columns if name in left_out)
 
 
 def _with_height(columns: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
@@ -550,6 +583,8 @@ def _number(path: Path, line: int, column: str, cell: str, unit: float) -> float
         return None
     kind = _kind(column)
     if kind == "length":
+        if column not in _ALL_SIGMAS:
+            refuse_rounded(where, cell)
         value = metres_of(cell, unit)
     else:
         plain = degrees_of(cell, {"lat": "NS", "lon": "EW"}.get(column, ""))

@@ -35,8 +35,9 @@ from aeromatch_cli.blocks.crs import (
     heights_words,
     outside_area,
 )
+from aeromatch_cli.blocks.doubles import in_two_formats
 from aeromatch_cli.blocks.exif import ExifFacts
-from aeromatch_cli.blocks.exif_and_xmp import settled
+from aeromatch_cli.blocks.exif_and_xmp import settled, with_conventions
 from aeromatch_cli.blocks.ground_shots import ground_shots, remarks_on
 from aeromatch_cli.blocks.image_names import matched_rows
 from aeromatch_cli.blocks.left_out import excluded
@@ -127,17 +128,22 @@ class GivenLists:
 
 
 def read_lists(
-    poses: str | None, cameras: str = EXIF, angles: AngleConvention = "auto", pose_format: str = pose_files.AUTO
+    poses: str | None,
+    cameras: str = EXIF,
+    angles: AngleConvention = "auto",
+    pose_format: str = pose_files.AUTO,
+    crs: str = AUTO,
 ) -> GivenLists:
     """Read the pose list and the camera file. To be called first: they are quick, and a mistake in them should not
     cost a walk over 10,000 files.
 
     poses: path of a pose list, "exif", or "" / None for none. cameras: path of a camera file, "exif" or "folder".
-    pose_format: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera file.
+    pose_format, crs: as in `pose_files.read_pose_file`. Raises ConfigError for a bad argument, pose list or camera
+    file.
     """
     if angles not in get_args(AngleConvention):
         raise ConfigError(f"angles {angles!r} is unknown: use one of {', '.join(get_args(AngleConvention))}")
-    pose_list = pose_files.read_pose_file(Path(poses), pose_format) if poses and poses != EXIF else None
+    pose_list = pose_files.read_pose_file(Path(poses), pose_format, crs) if poses and poses != EXIF else None
     camera_file = read_camera_file(Path(cameras)) if cameras not in (EXIF, FOLDER) else None
     return GivenLists(poses or "", cameras, angles, pose_list, camera_file)
 
@@ -159,10 +165,10 @@ def block_inputs(
     """Everything that is known of a block, except its ground.
 
     images_dir: named in messages. headers: by relative name, sorted: the facts of each picture's header, or the reason
-    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code,
-    "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run in the same workspace, kept so
-    that a growing block does not move. exclude: as of `left_out.excluded`. drop_ground_shots: leave out pictures that
-    were taken on the ground. given_heights: of positions.
+    why it is unusable (`exif.exif_or_reason`). passed_over: what the search of the folder left out. crs: a code of one
+    in metres (`crs.world_crs`), "local" or "auto". sigmas: of a pose that states none. known_frame: of an earlier run
+    in the same workspace, kept so that a growing block does not move. exclude: as of `left_out.excluded`.
+    drop_ground_shots: leave out pictures that were taken on the ground. given_heights: of positions.
 
     Raises ConfigError for lists that do not fit the images, InputError where no image is left.
     """
@@ -171,6 +177,8 @@ def block_inputs(
     warnings += remarks
     failures += [ReadFailure(name, why) for name, why in headers.items() if isinstance(why, str) and name not in out]
     facts = {name: fact for name, fact in headers.items() if not isinstance(fact, str) and name not in out}
+    warnings += _panoramas(facts)
+    facts = {name: fact for name, fact in facts.items() if not fact.panorama}
     shots = ground_shots(facts)
     warnings += remarks_on(shots, len(facts), dropped=drop_ground_shots)
     if drop_ground_shots:
@@ -190,6 +198,9 @@ def block_inputs(
     warnings += _rasters(facts)
     facts, remarks = settled(facts)
     warnings += remarks if lists.poses == EXIF else []
+    warnings += in_two_formats({name: (fact.width_px, fact.height_px) for name, fact in facts.items()})
+    facts, remarks = with_conventions(facts)
+    warnings += remarks if lists.poses == EXIF and lists.angles == "auto" else []
     observations, remarks = _observations(lists, rows, facts)
     warnings += remarks
     camera_file = lists.camera_file
@@ -318,6 +329,14 @@ def _cameras_of_poses(
         {**others.focal_sigmas, **found.focal_sigmas},
         len(found.camera_ids),
     )
+
+
+def _panoramas(facts: Mapping[str, ExifFacts]) -> list[str]:
+    """What is said of panoramas, which are left out."""
+    names = [name for name, fact in facts.items() if fact.panorama]
+    kinds = ", ".join(sorted({fact.panorama[:30] for fact in facts.values() if fact.panorama}))
+    what = f"panoramas by their XMP ({kinds}), no pictures of one lens: give the pictures that they were made of"
+    return [f"passed over {len(names)}: {listed(names)}: {what}"] if names else []
 
 
 def _rasters(facts: Mapping[str, ExifFacts]) -> list[str]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from aeromatch_cli.blocks.other_files import MASK, image_suffixes, masks_among, unread_kind
+from aeromatch_cli.blocks.other_files import MASK, image_suffixes, masks_among, masks_by_content, unread_kind
 from aeromatch_cli.errors import ConfigError
 
 _FOLDER_MARK = "--"
@@ -89,7 +89,10 @@ def scan_images(folder: Path, exclude: Iterable[Path] = ()) -> tuple[list[str], 
                 failures.append(failure)
             elif not name.startswith("."):
                 names.append(relative)
-    return _sorted_out(names, failures)
+    kept, failures = _sorted_out(names, failures)
+    masks = masks_by_content(folder, kept)
+    failures += [ScanFailure(name, MASK, False) for name in sorted(masks)]
+    return [name for name in kept if name not in masks], sorted(failures, key=lambda failure: failure.name)
 
 
 def scan_files(sizes_bytes: Mapping[str, int | None]) -> tuple[list[str], list[ScanFailure]]:

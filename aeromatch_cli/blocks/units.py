@@ -210,12 +210,32 @@ def degrees_of(text: str, sides: str = "") -> float | None:
     return -total if sign == "-" or (side and side == sides[1]) else total
 
 
+# As ExifTool writes heights.
+_SEA_LEVEL = re.compile(r"\s(above|below) sea level$", re.IGNORECASE)
+# Long numbers of a spreadsheet whose column is too narrow: those from a hundred on of which no decimal is left.
+_ROUNDED = re.compile(r"[-+]?\d(?:[.,](\d*))?e\+?(\d+)", re.IGNORECASE)
+_LONG = 2
+
+
+def refuse_rounded(where: str, cell: str) -> None:
+    """Raises ConfigError for a coordinate that a spreadsheet has rounded: 3.91E+05."""
+    match = _ROUNDED.fullmatch(cell.strip())
+    if match and int(match[2][:9]) >= _LONG and len(match[1] or "") <= int(match[2][:9]):
+        raise ConfigError(
+            f"{where}: {cell[:30]} has lost its last digits, as spreadsheets write long numbers: format the column as "
+            "numbers with decimals, and save the list again"
+        )
+
+
 def metres_of(text: str, usual_m: float = 1.0) -> float | None:
-    """Metres of `467.84`, `467,84`, `142.6 m`, `467.84 ft`; None of anything else. usual_m: one unit where none stands
-    behind the number."""
-    match = re.fullmatch(
-        r"([-+]?[\d.,]+(?:e[-+]?\d+)?|nan|[-+]?inf(?:inity)?)\s*([a-z][a-z _-]*)?", text.strip()[:80], re.I
-    )
+    """Metres of `467.84`, `467,84`, `142.6 m`, `467.84 ft`, `142.6 m Above Sea Level`; None of anything else. usual_m:
+    one unit where none stands behind the number."""
+    text = text.strip()[:80]
+    level = _SEA_LEVEL.search(text)
+    if level is not None:
+        value = metres_of(text[: level.start()], usual_m)
+        return -value if value is not None and level[1].lower() == "below" else value
+    match = re.fullmatch(r"([-+]?[\d.,]+(?:e[-+]?\d+)?|nan|[-+]?inf(?:inity)?)\s*([a-z][a-z _-]*)?", text, re.I)
     if match is None:
         return None
     number, unit = match[1], _bare(match[2] or "")

@@ -3,7 +3,8 @@
 Angles come from the camera's tags, never the aircraft's (Flight*Degree): DJI's and newer Autels' Gimbal*Degree,
 Skydio's CameraOrientationNED and Parrot's Camera*Degree count from level (`gimbal`: pitch -90 looks down);
 Camera:Yaw, Pitch, Roll of the Pix4D namespace (senseFly, MicaSense, Sequoia, older Autels, integrators of Sony
-cameras) from straight down with the image's top to the north (`nadir`). Yaw is against true north in all.
+cameras) from straight down with the image's top to the north (`nadir`; but see `from_level`). Yaw is against true
+north in all.
 
 DJI's FlightXSpeed, FlightYSpeed and FlightZSpeed are those of the aircraft to true north, to the east and, in the
 same axes as its angles (NED), down, in metres per second (Mavic 3E and Zenmuse P1 user manuals, list of XMP fields).
@@ -13,8 +14,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
 _LATITUDES = ("drone-dji:GpsLatitude", "drone-dji:Latitude", "drone-skydio:Latitude", "exif:GPSLatitude")
@@ -34,6 +36,7 @@ _COPIED = {
         "GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree", "AbsoluteAltitude", "RelativeAltitude",
         "GpsLatitude", "GpsLongitude",
     ), "drone-dji"),
+    "ProjectionType": "GPano",
     **dict.fromkeys(("CalibrationPicture", "Albedo", "ReflectArea", "PanelSerial"), "Camera"),
 }  # fmt: skip
 _BAND = "BandName"
@@ -53,6 +56,8 @@ _WIDE = {
 }  # fmt: skip
 _ADOBE_DEGREES = re.compile(r"(\d+),(\d+(?:\.\d+)?)(?:,(\d+(?:\.\d+)?))?([NSEW])")
 _LARGEST_ANGLE_DEG = 360.0
+# A camera that looks further back than this from straight down.
+_BACKWARDS_DEG = -45.0
 _MALFORMED = "XMP block is malformed: what can be read of it is used"
 _DECLARATION = re.compile(r"<\?xml\s[^>]*\?>")
 _NO_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
@@ -69,6 +74,12 @@ class CameraAngles:
     pitch_deg: float
     roll_deg: float
     convention: str
+
+
+def from_level(pitches_deg: Sequence[float]) -> bool:
+    """Whether pitches of one camera under the Pix4D namespace count from level, against its definition, as some Autels
+    write them: cameras look down, and hardly ever backwards."""
+    return bool(pitches_deg) and median(pitches_deg) < _BACKWARDS_DEG
 
 
 class _Collector:
@@ -185,10 +196,13 @@ def xmp_position(xmp: Mapping[str, str]) -> tuple[float | None, float | None, fl
 
 
 def _first_degrees(xmp: Mapping[str, str], names: Iterable[str], largest: float) -> float | None:
-    """Degrees as a number, or in Adobe's way: "52,30.5712N", "52,30,34.27N"."""
+    """Degrees as a number, whose hemisphere may stand in a tag of its own, or in Adobe's way: "52,30.5712N",
+    "52,30,34.27N"."""
     for name in names:
         text = xmp.get(name, "")
         number = tag_number(text)
+        if number is not None and xmp.get(f"{name}Ref", "")[:1].upper() in ("S", "W"):
+            number = -abs(number)
         if number is None and (parts := _ADOBE_DEGREES.fullmatch(text)):
             number = float(parts[1]) + float(parts[2]) / 60.0 + float(parts[3] or 0.0) / 3600.0
             number = -number if parts[4] in "SW" else number

@@ -100,6 +100,7 @@ def frames(
     ] = 0.8,
     log_file: LogFile = None,
     json_: Json = False,
+    progress: ProgressFormat = ProgressKind.AUTO,
     quiet: Quiet = False,
 ) -> None:
     """Write pictures of a video that overlap as those of a flight do, with a list of their positions."""
@@ -109,7 +110,7 @@ def frames(
         from aeromatch_cli.stages.frames import write_frames
         from aeromatch_cli.stages.run import Result
 
-        with Executor("serial", 1, progress_shown(quiet)) as executor:
+        with Executor("serial", 1, progress_shown(progress, quiet=quiet)) as executor:
             lines, facts = write_frames(video, out, executor, track=track, start=start, overlap=overlap)
         return Result(tuple(lines), facts)
 

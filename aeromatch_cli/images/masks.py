@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -9,18 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Pose
-from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.errors import ConfigError, ItemError
 from aeromatch_cli.geometry.cameras import world_rays
 from aeromatch_cli.geometry.footprints import sees_horizon
 from aeromatch_cli.images.depth import strips
+from aeromatch_cli.images.gdal import check_pixels
 
+# Of masks without a name of their own.
+_HEADER_BYTES, _MASK_BYTES = 2000, 0.15  # of a file, and for each of its pixels, at most
+# What Pillow raises on pictures that are cut or scrambled: they are named where they are read.
+_BROKEN = (
+    *(ItemError, OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError),
+    struct.error,
+)
 # Of masks, in both cases: file systems tell them apart.
 _SUFFIXES = tuple(form for suffix in (".png", ".jpg", ".jpeg", ".tif", ".tiff") for form in (suffix, suffix.upper()))
 
 
 def mask_path(masks: str, name: str) -> Path | None:
     """Mask of an image: COLMAP's naming (a/1.jpg.png), Metashape's and ODM's (a/1_mask.png, .jpg or .tif), the bare
-    stem (a/1.png) where the images lie elsewhere, or the one file for all.
+    stem (a/1.png), black and white where it lies beside the image, or the one file for all.
 
     Raises ConfigError where that is no file (a pipe, a device), or a link that leads out of the folder.
     """
@@ -32,7 +41,10 @@ def mask_path(masks: str, name: str) -> Path | None:
     picture = root / name
     candidates = [root / f"{name}.png", root / f"{name}.mask.png"]
     candidates += [picture.with_name(f"{picture.stem}_mask{suffix}") for suffix in _SUFFIXES]
-    candidates += [] if picture.exists() else [picture.with_suffix(".png")]
+    bare = picture.with_suffix(".png")
+    # Beside an image of that name it may be another picture.
+    if not picture.exists() or (bare != picture and compresses_like_a_mask(bare) and is_black_and_white(bare)):
+        candidates.append(bare)
     for candidate in candidates:
         if not candidate.exists():
             continue
@@ -45,6 +57,34 @@ def mask_path(masks: str, name: str) -> Path | None:
             )
         return candidate
     return None
+
+
+def compresses_like_a_mask(path: Path) -> bool:
+    """Whether a picture is far smaller than photographs are; without decoding it."""
+    from PIL import Image
+
+    Image.MAX_IMAGE_PIXELS = None  # nothing is decoded here
+    if not path.is_file():  # a pipe is not waited for
+        return False
+    try:
+        with Image.open(path) as image:
+            return path.stat().st_size <= _HEADER_BYTES + _MASK_BYTES * image.width * image.height
+    except _BROKEN:
+        return False
+
+
+def is_black_and_white(path: Path) -> bool:
+    """Whether a picture has no other values than 0 and the largest one, or 0 and 1."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            check_pixels(path, image.width, image.height)
+            colours = image.getcolors(2) or []
+    except _BROKEN:
+        return False
+    bands = [colour[:3] if isinstance(colour, tuple) else (colour,) for _, colour in colours]
+    return bool(bands) and all(set(one) in ({0}, {1}, {255}) for one in bands)
 
 
 def sees_sky(camera: Camera, pose: Pose | None) -> bool:

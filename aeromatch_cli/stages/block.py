@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.blocks.control import read_control
-from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs
+from aeromatch_cli.blocks.crs import AUTO, WorldFrame, checked_crs, world_crs
 from aeromatch_cli.blocks.doubles import doubles, remarks_on
 from aeromatch_cli.blocks.exif import ExifFacts, exif_or_reason
 from aeromatch_cli.blocks.ground import ConstantGround
@@ -83,6 +83,7 @@ def read_block(settings: Settings, workspace: Workspace, executor: Executor) -> 
         poses=inputs.poses,
         use=settings.block.gcp_use,
         heights=inputs.heights,
+        usual_crs=settings.block.crs,
     )
     block = Block(
         images=inputs.images,
@@ -178,7 +179,8 @@ def _read_inputs(
 ) -> tuple[BlockInputs, dict[str, str], dict[str, RemoteFile]]:
     """Inputs, the fingerprint of every image by image_id, and by name those that lie elsewhere."""
     given, root = settings.block, Path(settings.block.images)
-    lists = read_lists("" if given.poses == "none" else given.poses, given.cameras, given.angles, given.pose_format)
+    poses = "" if given.poses == "none" else given.poses
+    lists = read_lists(poses, given.cameras, given.angles, given.pose_format, given.crs)
     remote: dict[str, RemoteFile] = {}
     if is_remote(given.images):
         with executor.step("list"):
@@ -201,7 +203,7 @@ def _read_inputs(
         lists,
         {name: outcome.value[0] if outcome.value else outcome.error for name, outcome in outcomes.items()},
         passed_over,
-        crs=given.crs,
+        crs=world_crs(given.crs),
         sigma_position_m=given.sigma_position_m,
         sigma_angle_deg=given.sigma_angle_deg,
         known_frame=frame if frame is not None and _same_crs(given.crs, frame.crs) else None,
@@ -217,7 +219,7 @@ def _read_inputs(
 
 def _same_crs(given: str, known: str) -> bool:
     """Whether the user asks for no other CRS than the one of an earlier run."""
-    return given.strip().lower() in ("", AUTO) or checked_crs(given) == known
+    return given.strip().lower() in ("", AUTO) or checked_crs(world_crs(given)) == known
 
 
 def _read_header(picture: Path | RemoteFile) -> tuple[ExifFacts | str, str]:

@@ -6,9 +6,9 @@ every point in every image, separated by blanks, tabs, commas or semicolons:
   geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z [accuracy_px]]
 
 im_x, im_y: pixels from the upper left corner of the image. A point without a name is known by its coordinates. A point
-with the word "check" (or "checkpoint") behind its name takes no part in the fit. ODM ignores what stands behind the
-name; two or three positive numbers there are standard deviations in metres, and in pixels. Lines that start with # are
-comments.
+with the word "check" (or "checkpoint") behind its name, or whose name begins with CHK-, takes no part in the fit. ODM
+ignores what stands behind the name; two or three positive numbers there are standard deviations in metres, and in
+pixels. Lines that start with # are comments; names of the columns may follow the CRS.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoint, is_check, mark
 from aeromatch_cli.blocks.fields import fields_of, with_name
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, is_number, number, units_of_comments
+from aeromatch_cli.blocks.pose_files.source import Source, coordinate, is_number, units_of_comments
 from aeromatch_cli.errors import ConfigError
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name] [check] [accuracy_xy accuracy_z]"
+_CHECK_NAME = "CHK-"
 # Coordinates of one point may differ by rounding alone.
 _SAME = 1e-8
 
@@ -32,6 +33,17 @@ def read_gcp_list(source: Source) -> Survey:
     records = list(source.records())
     if len(records) < 2:
         raise ConfigError(f"{source.path}: no control points: the first line names the CRS, then {_COLUMNS}")
+    if is_number(fields_of(records[0][1])[0][0]):
+        raise ConfigError(
+            f"{source.at(records[0][0])}: the first line names the CRS of the coordinates, such as EPSG:32633: add it"
+        )
+    if _is_header(records[1][1]):
+        del records[1]
+    elif not _starts_with_numbers(records[1][1]):
+        raise ConfigError(
+            f"{source.path} is no file of control points that is known (it begins with {records[0][1][:60]!r}): write "
+            f"the CRS, then {_COLUMNS}; or a table whose first line names label, x, y, z or label, lat, lon, alt"
+        )
     said = units_of_comments(source)
     factors = 1.0, 1.0, 1.0
     if said.across_m or said.up_m:  # what comments state counts before the unit of the CRS
@@ -47,9 +59,23 @@ def read_gcp_list(source: Source) -> Survey:
             raise ConfigError(f"{source.at(line)}: {point.name} has other coordinates than before: one is wrong")
         points[point.name] = replace(known, check=known.check or point.check, sigmas_m=known.sigmas_m or point.sigmas_m)
         marks.append(one)
+    named = [name for name in points if name.upper().startswith(_CHECK_NAME)]
+    remarks = [f"{source.path.name}: {len(named)} points are check points by their name ({_CHECK_NAME}...)"]
     return Survey(
-        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]), measured_in=source.path
-    )
+        tuple(points.values()), tuple(marks), records[0][1], source.at(records[0][0]),
+        remarks=tuple(remarks if named else ()), measured_in=source.path,
+    )  # fmt: skip
+
+
+def _is_header(record: str) -> bool:
+    """Whether a line names the columns, as they stand in this order."""
+    names = [name.lower() for name in fields_of(record)[0][:6]]
+    return len(names) == 6 and names[5].startswith(("image", "file", "photo")) and not any(map(is_number, names))
+
+
+def _starts_with_numbers(record: str) -> bool:
+    cells = fields_of(record)[0]
+    return bool(cells) and is_number(cells[0])
 
 
 def _row(source: Source, line: int, record: str, factors: tuple[float, float, float]) -> tuple[SurveyedPoint, Mark]:
@@ -60,7 +86,7 @@ def _row(source: Source, line: int, record: str, factors: tuple[float, float, fl
     if len(cells) < 6:
         raise ConfigError(f"{source.at(line)}: {len(cells)} columns, expected {_COLUMNS}")
     x, y, z = (
-        number(source.at(line, what), cell, decimal_comma=comma) * one
+        coordinate(source.at(line, what), cell, decimal_comma=comma) * one
         for what, cell, one in zip(("x", "y", "z"), cells[:3], factors, strict=True)
     )
     named = len(cells) > 6 and not is_check(cells[6])
@@ -72,7 +98,7 @@ def _row(source: Source, line: int, record: str, factors: tuple[float, float, fl
     if not all(0.0 < sigma < float("inf") for sigma in sigmas):
         sigmas = []
     across_m, up_m, sigma_px = (*sigmas, None, None, None)[:3]
-    check = any(map(is_check, cells[6:]))
+    check = any(map(is_check, cells[6:])) or name.upper().startswith(_CHECK_NAME)
     sigmas_m = completed_sigmas_m(z_m=up_m, across_m=across_m)
     point = SurveyedPoint(name, source.at(line), (x, y, z), sigmas_m, check)
     return point, mark(source, line, (name, cells[5], cells[3], cells[4]), sigma_px, comma=comma)

@@ -16,6 +16,13 @@ from aeromatch_cli.formats.reading import given_bytes
 _SUFFIXES, _LARGEST_BYTES = (".csv", ".txt", ".xml"), 20_000_000
 
 
+# What people have besides, by the end of its name, and what to do.
+_OTHERS = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "a workbook: save the sheet as CSV"),
+    **dict.fromkeys((".kml", ".kmz", ".gpx", ".shp", ".gpkg", ".geojson", ".dxf"), "a layer of GIS: export it as CSV"),
+}
+
+
 @dataclass(frozen=True)
 class _Format:
     recognises: Callable[[Source], bool]
@@ -29,29 +36,34 @@ _MARKERS = _Format(metashape.is_markers, metashape.read_markers)
 _FORMATS = (_MARKERS, _MARKS, _COORDINATES)
 
 
-def read_survey(path: Path, marks: Path | None) -> Survey:
+def read_survey(path: Path, marks: Path | None, usual_crs: str | None = None) -> Survey:
     """Coordinates and image measurements of a file, or of two; where one holds only the former or the latter, the other
-    may lie beside it.
+    may lie beside it. usual_crs: of a table of grid coordinates that names none.
 
     Raises ConfigError where a file cannot be read or is malformed, where the other half is missing, and where several
     files could be it.
     """
-    found = _read(path)
+    found = _read(path, usual_crs)
     if marks is not None:
-        return _joined(path, found, marks, _read(marks))
+        return _joined(path, found, marks, _read(marks, usual_crs))
     if found.points and found.marks:
         return found
     other = _beside(path, _COORDINATES if not found.points else _MARKS)
-    return _joined(path, found, other, _read(other))
+    return _joined(path, found, other, _read(other, usual_crs))
 
 
-def _read(path: Path) -> Survey:
+def _read(path: Path, usual_crs: str | None) -> Survey:
     source = _opened(path)
     known = next((one for one in _FORMATS if one.recognises(source)), None)
+    if known is _COORDINATES:
+        return tables.read_coordinates(source, usual_crs)
     return odm.read_gcp_list(source) if known is None else known.read(source)
 
 
 def _opened(path: Path) -> Source:
+    other = next((words for end, words in _OTHERS.items() if path.name.lower().endswith(end)), "")
+    if other and path.is_file():
+        raise ConfigError(f"control points {path} are {other}, with label, x, y, z or label, lat, lon, alt")
     try:
         given_bytes(path)
     except OSError as error:

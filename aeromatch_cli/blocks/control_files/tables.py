@@ -1,8 +1,8 @@
 """Tables of coordinates, and tables of image measurements.
 
 Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_vertical][,type]`; in degrees the
-latitude stands first; a CRS is not stated, unless a .prj of the same name lies beside. With a header the columns go by
-their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
+latitude stands first; a CRS is not stated, unless a first line is its code, or a .prj of the same name lies beside.
+With a header the columns go by their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
 `#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
 a check point. `type`: check points are named as such, all else is a control point. Names of columns and comments may
 state units, as in pose lists (`poses`).
@@ -23,6 +23,7 @@ from aeromatch_cli.blocks.control_files.survey import Mark, Survey, SurveyedPoin
 from aeromatch_cli.blocks.fields import IMAGE
 from aeromatch_cli.blocks.pose_files.geodesy import described_crs
 from aeromatch_cli.blocks.pose_files.source import Source, is_number
+from aeromatch_cli.blocks.poses import stated_crs
 from aeromatch_cli.blocks.units import (
     Kind,
     degrees_of,
@@ -31,11 +32,17 @@ from aeromatch_cli.blocks.units import (
     kind_of,
     metres_of,
     named_column,
+    refuse_rounded,
     stated_units,
 )
 from aeromatch_cli.errors import ConfigError
 
-_CRS = re.compile(r"#\s*coordinatesystem\s*:\s*(.*)", re.IGNORECASE)
+# A first line of a table that names the CRS alone, as in the lists of points for editors of gcp_list.txt.
+_CODE = re.compile(r"\s*(EPSG:\d+(?:\+\d+)?|\+proj=[^,;\t]*?|WGS\s*84[\s/]+UTM[^,;\t]*?)[\s,;]*", re.IGNORECASE)
+# Where the CRS of a table may stand.
+_HEAD_LINES = 5
+# Of a line below a code.
+_POINT_VALUES = 4
 _LARGEST_LONGITUDE_DEG = 180.0
 # A mark that is less exact than this, in pixels, is none: Pix4D may write the zoom of the picture there.
 _LARGEST_SIGMA_PX = 10.0
@@ -49,7 +56,9 @@ _COORDINATES: Mapping[str, str] = {
     **dict.fromkeys(("y", "northing", "north", "n"), "y"),
     **dict.fromkeys(("lon", "longitude", "lng", "long"), "longitude"),
     **dict.fromkeys(("lat", "latitude"), "latitude"),
-    **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "h", "up", "ellipsoidal_height"), "z"),
+    **dict.fromkeys(("z", "alt", "altitude", "height", "elevation", "elev", "h", "up", "ellipsoidal_height"), "z"),
+    **dict.fromkeys(("easting/longitude", "x/longitude", "x/lon", "longitude/x", "lon/x"), "x"),
+    **dict.fromkeys(("northing/latitude", "y/latitude", "y/lat", "latitude/y", "lat/y"), "y"),
     **dict.fromkeys(("type", "role", "usage", "use"), "type"),
     **dict.fromkeys(("cs_name", "crs", "srs", "epsg", "coordinate_system"), "crs"),
     **{"easting_rms": "sigma_x", "northing_rms": "sigma_y", "elevation_rms": "sigma_z", "lateral_rms": "sigma_xy"},
@@ -72,7 +81,11 @@ def is_coordinates(source: Source) -> bool:
     header, names, _ = _header(source, _COORDINATES)
     if header:
         return {"label", "z"} <= set(names) and ({"x", "y"} <= set(names) or {"longitude", "latitude"} <= set(names))
-    cells = _first(source)
+    return _is_points(_first(source))
+
+
+def _is_points(cells: Sequence[str]) -> bool:
+    """Whether a line is a name and three coordinates, and no image measurement."""
     return len(cells) >= 4 and all(map(is_number, cells[1:4])) and not any(map(IMAGE.fullmatch, cells))
 
 
@@ -89,34 +102,41 @@ def is_marks(source: Source) -> bool:
     return bool(IMAGE.fullmatch(cells[0]) or IMAGE.fullmatch(cells[1])) or not is_number(cells[1])
 
 
-def read_coordinates(source: Source) -> Survey:
-    """Raises ConfigError with file and line."""
+def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
+    """usual_crs: of grid coordinates where the file names none. Raises ConfigError with file and line."""
     header, names, units = _header(source, _COORDINATES)
     records = list(_rows(source, header))
     crs, crs_where = _stated_crs(source)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
-    factors = _factors(source, header, names, units)
-    if crs is not None and factors.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
-        stated = described_crs(crs_where, crs)
-        factors |= {name: factors.get(name, stated.across_m) / stated.across_m for name in "xy"}
-        factors["z"] = factors.get("z", stated.up_m) / stated.up_m
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
         for line, cells, _ in records
     ]
+    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys("xyz", "")
+    points = _points(source, rows, _factors(source, header, stated, crs or usual_crs, crs_where))
+    geographic = "latitude" in names or _in_degrees(points)
+    if crs is None and usual_crs is not None and geographic:
+        points = _points(source, rows, _factors(source, header, stated, None, crs_where))
+    elif crs is None:
+        crs = usual_crs
+    if not header and crs is None and geographic:  # the latitude stands first
+        points = [_exchanged(point) for point in points]
+    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
+        crs = None  # of coordinates that the file does not have
+    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
+
+
+def _points(
+    source: Source, rows: Sequence[tuple[int, Mapping[str, str]]], factors: Mapping[str, float]
+) -> list[SurveyedPoint]:
     points = [_point(source, line, record, factors) for line, record in rows]
     if not points:
         raise ConfigError(f"{source.path}: no control points follow the header")
     twice = next((point for n, point in enumerate(points) if point.name in {one.name for one in points[:n]}), None)
     if twice is not None:
         raise ConfigError(f"{twice.where}: the point {twice.name} stands in the file twice: keep one of the two lines")
-    geographic = "latitude" in names or _in_degrees(points)
-    if not header and crs is None and geographic:  # the latitude stands first
-        points = [_exchanged(point) for point in points]
-    if "latitude" in names and crs is not None and described_crs(crs_where, crs).kind == "grid":
-        crs = None  # of coordinates that the file does not have
-    return Survey(tuple(points), (), crs, crs_where, geographic, remarks)
+    return points
 
 
 def read_marks(source: Source) -> Survey:
@@ -146,7 +166,15 @@ def read_marks(source: Source) -> Survey:
 
 
 def _first(source: Source) -> list[str]:
-    return next((_cells(record)[0] for _, record in source.records()), [])
+    """Values of the first line, of that below a CRS."""
+    first = next((_cells(record)[0] for line, record in source.records() if line > _line_of_code(source)), [])
+    return [] if _line_of_code(source) and len(first) != _POINT_VALUES else first  # gcp_list.txt
+
+
+def _line_of_code(source: Source) -> int:
+    """Number of a first line that is a code of a CRS, 0 for none."""
+    line, record = next(iter(source.records()), (0, ""))
+    return line if _CODE.fullmatch(record) else 0
 
 
 def _cells(record: str) -> tuple[list[str], bool]:
@@ -163,10 +191,10 @@ def _cells(record: str) -> tuple[list[str], bool]:
 
 def _header(source: Source, known: Mapping[str, str]) -> tuple[int, list[str], list[str]]:
     """Line of the header, 0 without one, its columns by their names in `known`, and the units that they state."""
-    canonical = frozenset(known.values())
+    canonical, code = frozenset(known.values()), _line_of_code(source) if known is _COORDINATES else 0
     for line, text in enumerate(source.lines, start=1):
         stripped = text.strip()
-        if not stripped or _CRS.match(stripped):
+        if not stripped or stated_crs([stripped]) or line == code:
             continue
         cells, _ = _cells(stripped.lstrip("#").strip())
         columns = [_column(cell, known) for cell in cells]
@@ -186,15 +214,15 @@ def _column(cell: str, known: Mapping[str, str]) -> tuple[str, str]:
     return ("", "") if name == "z" and is_relative(unit) else (name, unit)
 
 
-def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[str]) -> dict[str, float]:
-    """Metres or degrees of one unit of every column: by its name, else by what a comment says. Raises ConfigError."""
+def _factors(source: Source, line: int, stated: Mapping[str, str], crs: str | None, crs_where: str) -> dict[str, float]:
+    """Metres or degrees of one unit of every column: by its name, else by what a comment says; of coordinates in a CRS
+    as shares of its own units. stated: the units that the names state. Raises ConfigError."""
     said = stated_units(source.lines)
     if "relative" in said:
         raise ConfigError(
             f"{source.path}: {said['relative']!r} says that heights do not count from a datum: give heights above the "
             "ellipsoid or sea level"
         )
-    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys(("x", "y", "z"), "")
     found = {}
     for name, unit in stated.items():
         subjects: tuple[str, ...]
@@ -207,11 +235,16 @@ def _factors(source: Source, line: int, names: Sequence[str], units: Sequence[st
             text = unit or next(others, "")
             if text:
                 found[name] = factor(source.at(line), name, text, kind)
+    if crs is not None and found.keys() & set("xyz"):  # what the columns state counts before the unit of the CRS
+        own = described_crs(crs_where, crs)
+        found |= {name: found.get(name, own.across_m) / own.across_m for name in "xy"}
+        found["z"] = found.get("z", own.up_m) / own.up_m
     return found
 
 
 def _rows(source: Source, header: int) -> list[tuple[int, list[str], bool]]:
-    return [(line, *_cells(record)) for line, record in source.records() if line > header]
+    start = max(header, _line_of_code(source))
+    return [(line, *_cells(record)) for line, record in source.records() if line > start]
 
 
 def _unnamed(source: Source, line: int, cells: list[str]) -> dict[str, str]:
@@ -233,6 +266,7 @@ def _point(source: Source, line: int, record: Mapping[str, str], factors: Mappin
             degrees = degrees_of(cell, "EW" if column == "longitude" else "NS")
             found = None if degrees is None else degrees * unit
         else:
+            refuse_rounded(source.at(line, column), cell)
             found = metres_of(cell, unit)
         if found is None or not math.isfinite(found):
             raise ConfigError(f"{source.at(line, column)}: {cell!r} is not a number")
@@ -257,10 +291,12 @@ def _sigmas_m(record: Mapping[str, str], factors: Mapping[str, float]) -> Sigmas
 
 def _stated_crs(source: Source) -> tuple[str | None, str]:
     """CRS and its place: in the file, or in a .prj beside it."""
-    for line, text in enumerate(source.lines[:5], start=1):
-        stated = _CRS.match(text.strip())
-        if stated:
-            return stated[1].strip(), source.at(line)
+    code = _line_of_code(source)
+    for line, text in enumerate(source.lines[:_HEAD_LINES], start=1):
+        stated = _CODE.fullmatch(text) if line == code else None
+        found = stated[1] if stated else stated_crs([text])
+        if found:
+            return found, source.at(line)
     beside = source.beside(source.path.with_suffix(".prj").name)
     if beside is not None and beside.text.strip():
         return beside.text.strip(), str(beside.path)

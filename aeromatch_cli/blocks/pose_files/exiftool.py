@@ -11,14 +11,15 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.calibration import angle_sigma_deg, position_sigmas_m
 from aeromatch_cli.blocks.pose_files.source import Source, image_name
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
-from aeromatch_cli.blocks.units import degrees_of
-from aeromatch_cli.blocks.xmp import tag_number, xmp_angles
+from aeromatch_cli.blocks.units import degrees_of, metres_of
+from aeromatch_cli.blocks.xmp import from_level, tag_number, xmp_angles
 from aeromatch_cli.errors import ConfigError
 
 _IMAGE = "SourceFile"
@@ -51,6 +52,9 @@ def read_exiftool(source: Source) -> PoseList:
         row = _row(line, record, said)
         unposed += row.position is None
         rows.append(row)
+    pitches = [row.attitude[1] for row in rows if row.attitude is not None and row.forward is False]
+    if from_level(pitches):
+        rows = [replace(row, forward=True) if row.forward is False else row for row in rows]
     if unposed == len(rows):
         raise ConfigError(
             f"{source.path}: no image of this ExifTool table has GPSLatitude and GPSLongitude: write it by "
@@ -80,6 +84,9 @@ def _row(line: int, record: Mapping[str, Any], said: Counter[str]) -> PoseRow:
     for name in sorted(record, key=lambda key: key.startswith(f"{_FIRST}:")):
         if record[name] not in ("", "-", None):
             tags[name.rpartition(":")[2]] = record[name]
+    both = str(tags.get("GPSPosition", "")).split(",")
+    if len(both) == 2:
+        tags = {"GPSLatitude": both[0].strip(), "GPSLongitude": both[1].strip()} | tags
     latitude, longitude = (_degrees(tags, f"GPS{name}") for name in ("Latitude", "Longitude"))
     height = _metres(tags.get("AbsoluteAltitude", tags.get("GPSAltitude")), tags.get("GPSAltitudeRef"))
     xmp = {f"{space}:{name}": str(v) for name, v in tags.items() for form, space in _NAMESPACES if form.fullmatch(name)}
@@ -115,9 +122,8 @@ def _degrees(tags: Mapping[str, Any], name: str) -> float | None:
 
 def _metres(value: Any, reference: Any) -> float:
     """Of `161.96`, `+161.96`, `161.96 m Above Sea Level`; NaN for none."""
-    words = str(value).split()
-    number = tag_number(words[0].replace(",", ".")) if words else None
+    number = metres_of("" if value is None else str(value))
     if number is None:
         return float("nan")
-    below = "below" in str(value).lower() or str(reference).strip() == "1" or "below" in str(reference).lower()
+    below = str(reference).strip() == "1" or "below" in str(reference).lower()
     return -abs(number) if below else number

@@ -23,6 +23,8 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.ellipsoid import enu_from_geocentric, geocentric
 
+# Eastings and northings of UTM, metres.
+_UTM_M = ((160_000.0, 840_000.0), (1_000.0, 10_000_000.0))
 _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 
 
@@ -30,8 +32,8 @@ _LARGEST_LATITUDE_DEG, _LARGEST_LONGITUDE_DEG = 90.0, 360.0
 class StatedCrs:
     """What a file states of its coordinates. crs: code or WKT of the grid in metres, None for a local one and for
     degrees. name: for messages. across_m, up_m: metres of one unit of x and y, and of heights. to_degrees: transforms
-    x and y to WGS84 longitudes and latitudes where the file's are not such. remarks: for a person. heights: as of
-    `crs.heights_of`."""
+    x and y to WGS84 longitudes and latitudes where the file's are not such. stretched: x and y are metres of web maps.
+    remarks: for a person. heights: as of `crs.heights_of`."""
 
     crs: str | None = None
     kind: PositionKind = "grid"
@@ -39,6 +41,7 @@ class StatedCrs:
     across_m: float = 1.0
     up_m: float = 1.0
     to_degrees: Any = None
+    stretched: bool = False
     remarks: tuple[str, ...] = ()
     heights: str = ""
 
@@ -58,6 +61,21 @@ class StatedCrs:
         return y, x, height_m
 
 
+def like_utm(stated: StatedCrs, given: Sequence[tuple[float, float]]) -> list[str]:
+    """What is said where x and y that a file calls metres of a web map are such as UTM has, too. given: x and y."""
+    if not stated.stretched or not given:
+        return []
+    x, y = np.median(np.array(given, dtype=np.float64), axis=0)
+    (west, east), (south, north) = _UTM_M
+    if not (west <= x <= east and south <= abs(y) <= north):
+        return []
+    longitude, latitude = stated.to_degrees.transform(x, y)
+    return [
+        f"the coordinates ({x:.0f}, {y:.0f}) lie at latitude {latitude:.2f}, longitude {longitude:.2f} in "
+        f"{stated.name}, and look like those of UTM: is it the right CRS?"
+    ]
+
+
 def described_crs(where: str, text: str) -> StatedCrs:
     """text: EPSG:code, PROJ, WKT, or words as in `crs.parsed_crs`. Raises ConfigError where it is unknown, geocentric
     or vertical, or counts depths."""
@@ -73,9 +91,14 @@ def described_crs(where: str, text: str) -> StatedCrs:
         raise ConfigError(f"{where}: {crs.name} has no easting and northing: name a projected CRS, or one in degrees")
     if crs.is_geographic or is_stretched(crs.to_2d()):
         degrees = _to_degrees(where, crs)
-        return StatedCrs(None, "geographic", crs.name, up_m=up_m, to_degrees=degrees, heights=heights_of(crs))
-    remarks = tuple(unit_remarks(where, crs))
-    return StatedCrs(metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, None, remarks, heights_of(crs))
+        return StatedCrs(
+            None, "geographic", crs.name, up_m=up_m, to_degrees=degrees, stretched=crs.is_projected,
+            heights=heights_of(crs),
+        )  # fmt: skip
+    return StatedCrs(
+        metric_crs(crs), "grid", crs.name, across_unit_m(crs), up_m, remarks=tuple(unit_remarks(where, crs)),
+        heights=heights_of(crs),
+    )  # fmt: skip
 
 
 def unit_remarks(where: str, crs: Any) -> list[str]:

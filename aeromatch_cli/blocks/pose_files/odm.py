@@ -20,8 +20,8 @@ import numpy as np
 from aeromatch_cli.blocks.accuracies import completed_sigmas_m
 from aeromatch_cli.blocks.crs import convergence_deg, utm_crs
 from aeromatch_cli.blocks.fields import fields_of, with_name
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, image_name, number, rotation_row, units_of_comments
+from aeromatch_cli.blocks.pose_files.geodesy import described_crs, like_utm
+from aeromatch_cli.blocks.pose_files.source import Source, coordinate, image_name, rotation_row, units_of_comments
 from aeromatch_cli.blocks.poses import PoseList, PoseRow
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
@@ -30,7 +30,7 @@ from aeromatch_cli.geometry.rotations import rotation_z
 # What names a CRS, and what no line of a list begins with.
 _CRS = re.compile(
     r"((EPSG|ESRI|IGNF|OGC)\s*:\s*\S.*|.*\+(proj|init)=.*|(PROJ|GEOG|COMPD|GEOD|BOUND)(CS|CRS)\[.*"
-    r"|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
+    r"|UTM[\s_-]*(zone)?[\s_-]*\d{1,2}\s*[A-Z]?|(WGS|NAD|ETRS|GDA|NZGD|SIRGAS|RGF|JGD|ED|OSGB|CH)[\s_]*\d{2,4}\+?([\s/(].*)?)",
     re.IGNORECASE,
 )
 _WITH_ANGLES, _WITH_ACCURACIES = 7, 9
@@ -51,6 +51,7 @@ def read_geo_txt(source: Source) -> PoseList:
     stated = replace(stated, across_m=said.across_m or stated.across_m, up_m=said.up_m or stated.up_m)
     turn_deg = said.angle_deg or 1.0
     rows: list[PoseRow] = []
+    as_written: list[tuple[float, float]] = []
     for line, record in records[1:]:
         cells, comma = fields_of(record)
         fields = with_name(cells, 0)
@@ -60,6 +61,7 @@ def read_geo_txt(source: Source) -> PoseList:
         x, y, z = [*values, np.nan, np.nan][:3]
         angles = [turn_deg * angle for angle in values[3:6]] if len(fields) >= _WITH_ANGLES else [np.nan] * 3
         across_m, up_m = values[6:8] if len(fields) >= _WITH_ACCURACIES else (None, None)
+        as_written.append((x, y))
         place = stated.position(source.at(line), x, y, z)
         whole = bool(np.isfinite(angles).all())
         rows.append(
@@ -72,7 +74,7 @@ def read_geo_txt(source: Source) -> PoseList:
         )  # fmt: skip
     given = [row.attitude for row in rows if row.attitude is not None]
     words = "yaw, pitch, roll" if given else "positions"
-    remarks = stated.remarks
+    remarks = (*stated.remarks, *like_utm(stated, as_written))
     if given and len(rows) >= 3 and all(0.0 < angle < _LIKE_SIGMAS for three in given for angle in three):
         remarks += (f"{source.path.name}: columns 5 to 7 are angles in ODM's geo.txt, and look like accuracies here",)
     title = f"ODM geo.txt, {text}, {words}"
@@ -80,7 +82,7 @@ def read_geo_txt(source: Source) -> PoseList:
 
 
 def _value(where: str, cell: str, comma: bool) -> float:
-    return float("nan") if cell.lower() in ("nan", "") else number(where, cell, decimal_comma=comma)
+    return float("nan") if cell.lower() in ("nan", "") else coordinate(where, cell, decimal_comma=comma)
 
 
 def is_shots(source: Source) -> bool:

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli.blocks.gis_columns import with_coordinates
 from aeromatch_cli.blocks.lenses import remark
 from aeromatch_cli.blocks.poses import PoseRow, PositionKind
-from aeromatch_cli.blocks.units import Kind, factor, kind_of, stated_units
+from aeromatch_cli.blocks.units import Kind, factor, kind_of, refuse_rounded, stated_units
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.reading import given_bytes, text_encoding
@@ -66,7 +67,8 @@ class Source:
 
     @cached_property
     def lines(self) -> list[str]:
-        return self.text.splitlines()
+        """Columns of points are columns of coordinates here."""
+        return with_coordinates(self.text.splitlines())
 
     @cached_property
     def tree(self) -> Any:
@@ -169,6 +171,12 @@ class CameraShelf:
     def key(self, wanted: str) -> str:
         """The name for a row, "" where there is no such camera."""
         return wanted if wanted in self.found else ""
+
+
+def coordinate(where: str, cell: str, *, decimal_comma: bool = False) -> float:
+    """`number`. Raises ConfigError for one that a spreadsheet has rounded, too."""
+    refuse_rounded(where, cell)
+    return number(where, cell, decimal_comma=decimal_comma)
 
 
 def number(where: str, cell: str, *, decimal_comma: bool = False) -> float:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from aeromatch_cli.blocks.crs import AUTO as AUTO_CRS
+from aeromatch_cli.blocks.crs import LOCAL
 from aeromatch_cli.blocks.fields import IMAGE, fields_of
 from aeromatch_cli.blocks.pose_files import (
     blocks_exchange,
@@ -23,9 +25,9 @@ from aeromatch_cli.blocks.pose_files import (
     scenes,
     tables,
 )
-from aeromatch_cli.blocks.pose_files.geodesy import described_crs
-from aeromatch_cli.blocks.pose_files.source import Source, is_number, world_beside
-from aeromatch_cli.blocks.poses import PoseList, has_header, read_poses
+from aeromatch_cli.blocks.pose_files.geodesy import StatedCrs, described_crs, like_utm
+from aeromatch_cli.blocks.pose_files.source import Source, is_number, units_of_comments, world_beside
+from aeromatch_cli.blocks.poses import PoseList, has_header, is_track, read_poses
 from aeromatch_cli.errors import ConfigError
 
 AUTO = "auto"
@@ -56,17 +58,19 @@ def _in_stated_crs(source: Source, found: PoseList) -> PoseList:
     stated = described_crs(str(source.path), found.crs or "")
     if found.position_kind == "geographic" and stated.kind == "grid":  # the world's
         return replace(found, crs=stated.crs, heights=stated.heights or found.heights)
-    if found.position_kind == "grid":  # what columns state counts before the unit of the CRS
+    grid = found.position_kind == "grid"
+    if grid:  # what columns state counts before the unit of the CRS
         found = read_poses(source.path, (stated.across_m, stated.up_m))
     one = replace(stated, across_m=1.0, up_m=1.0)
     rows = []
     for row in found.rows:
         if row.position is not None:
             x, y, height_m = row.position
-            across = (x, y) if found.position_kind == "grid" else (y, x)
+            across = (x, y) if grid else (y, x)
             row = replace(row, position=one.position(source.at(row.line), *across, height_m), position_kind=one.kind)
         rows.append(row)
-    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *found.warnings)
+    said = like_utm(stated, [row.position[:2] for row in found.rows if row.position is not None and grid])
+    words, warnings = f"{found.format}, {stated.name}", (*stated.remarks, *said, *found.warnings)
     heights = stated.heights or found.heights
     return replace(
         found,
@@ -169,12 +173,20 @@ _OTHERS: Mapping[str, str] = {
 }
 
 
-def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
-    """Poses of any format. pose_format: a key of POSE_FORMATS, or "auto" to go by the content.
+def read_pose_file(path: Path, pose_format: str = AUTO, crs: str = AUTO_CRS) -> PoseList:
+    """Poses of any format. pose_format: a key of POSE_FORMATS, or "auto" to go by the content. crs: what the user says
+    that grid coordinates count in, whose units are those of a file that states none.
 
     Raises ConfigError where the file cannot be read, is of no known format, or is malformed.
     """
     source = Source(path)
+    found = _read(source, pose_format)
+    stated = _in_other_units(crs) if found.crs is None and found.position_kind == "grid" else None
+    return found if stated is None else _in_units_of(source, found, stated)
+
+
+def _read(source: Source, pose_format: str) -> PoseList:
+    path = source.path
     if pose_format != AUTO:
         if pose_format not in POSE_FORMATS:
             raise ConfigError(f"pose format {pose_format!r} is unknown: use one of auto, {', '.join(POSE_FORMATS)}")
@@ -201,6 +213,31 @@ def read_pose_file(path: Path, pose_format: str = AUTO) -> PoseList:
     return _named_columns(source)
 
 
+def _in_other_units(crs: str) -> StatedCrs | None:
+    """A projected CRS that counts in another unit than metres, None for any other text."""
+    if crs.strip().lower() in ("", AUTO_CRS, LOCAL):
+        return None
+    stated = described_crs("--crs", crs)
+    return stated if stated.kind == "grid" and (stated.across_m, stated.up_m) != (1.0, 1.0) else None
+
+
+def _in_units_of(source: Source, found: PoseList, stated: StatedCrs) -> PoseList:
+    """In metres. What columns and comments of the file state counts before the units of the CRS."""
+    across_m, up_m = stated.across_m, stated.up_m
+    if found.format == PoseList.format:
+        found = read_poses(source.path, (across_m, up_m))
+    else:
+        said = units_of_comments(source)
+        across_m, up_m = 1.0 if said.across_m else across_m, 1.0 if said.up_m else up_m
+        rows = []
+        for row in found.rows:
+            x, y, z = row.position or (0.0, 0.0, 0.0)
+            place = None if row.position is None else (x * across_m, y * across_m, z * up_m)
+            rows.append(replace(row, position=place))
+        found = replace(found, rows=tuple(rows))
+    return replace(found, warnings=(*stated.remarks, *found.warnings))
+
+
 def _by_content(source: Source) -> str:
     """What a file of no known format is, and what to do; "" where nothing tells."""
     tree = source.tree
@@ -217,6 +254,11 @@ def _by_content(source: Source) -> str:
         return "a list of tracks, which are tie points: give the poses of the images"
     if has_header(source.lines):
         return ""
+    if is_track(source.lines):
+        return (
+            "a flight log or a track, positions by time without image names: give the positions of the images (exif, "
+            "or a list that a geotagging tool writes)"
+        )
     if len(cells) in (3, 4, 5, 6, 7, 9) and IMAGE.fullmatch(cells[0]) and all(map(is_number, cells[1:])):
         return "ODM's geo.txt without its first line, which names the CRS, such as EPSG:32633 or EPSG:4326: add it"
     return ""
