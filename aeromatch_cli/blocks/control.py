@@ -91,9 +91,9 @@ def read_control(
     if measured:
         what = f"{len(measured)} point{'s' if len(measured) > 1 else ''} without coordinates"
         remarks.append(f"{survey.measured_in.name} measures {what} in images: left out: {listed(measured)}")
-    heights = [point.position[2] for point in survey.points]
-    if len(heights) >= _ZEROS and not any(heights):
-        remarks.append(f"{path.name}: all {len(heights)} control points have the height 0: were heights surveyed?")
+    surveyed = [point.position[2] for point in survey.points]
+    if len(surveyed) >= _ZEROS and not any(surveyed):
+        remarks.append(f"{path.name}: all {len(surveyed)} control points have the height 0: were heights surveyed?")
     return tuple(points), remarks + far_control(points, poses or {}, name)
 
 
