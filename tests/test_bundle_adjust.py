@@ -22,6 +22,8 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.orientation.bundle.adjust import Options, adjust
 from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
 from aeromatch_cli.orientation.bundle.network import LENS, Network, Unknowns
+from aeromatch_cli.orientation.bundle.projection import project
+from aeromatch_cli.orientation.bundle.shared import lenses_if_freed
 
 FINAL, ROUGH = Options(1e-6, final=True), Options(1e-4, final=False)
 SEEDS = pytest.mark.parametrize("seed", range(3))
@@ -178,3 +180,35 @@ def test_a_rough_adjustment_states_no_deviations_and_frees_nothing() -> None:
     assert found.found is None
     np.testing.assert_array_equal(found.network.flight_sigmas, 0.0)
     assert np.linalg.norm(found.state.centers_m - truth.centers_m, axis=1).max() < 1.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_focal_length_far_from_its_prior_counts_only_where_the_residuals_tell_it(seed: int) -> None:
+    """EXIF states 1000 +- 30 px. On ground as flat as a meadow 1300 px are hardly told, and stay as stated; over relief
+    1150 px are."""
+    network, truth = simulated(strips(2, 5), seed=seed, points=150, true_lens=lens(f=1300.0))
+    truth = replace(truth, points_m=truth.points_m * [1.0, 1.0, 0.1])
+    rng = np.random.default_rng(seed)
+    network = replace(network, xy_px=project(network, truth) + rng.normal(0.0, 0.5, network.xy_px.shape))
+    network = with_positions(network, truth, np.random.default_rng(seed + 50), 5.0)
+    flat = adjust(with_lens_prior(network, PLAIN, f=30.0), start_of(network, truth, seed), FINAL)
+    assert (flat.state.lens[0, 0], flat.network.lens_sigmas[0, 0]) == (PLAIN[0], 0.0)
+    network, truth = block(seed, true_lens=lens(f=1150.0))
+    network = with_lens_prior(with_positions(network, truth, rng, 5.0), PLAIN, f=30.0)
+    relief = adjust(network, start_of(network, truth, seed), FINAL)
+    assert relief.state.lens[0, 0] == pytest.approx(1150.0, rel=0.01)
+    assert relief.network.lens_sigmas[0, 0] == 30.0
+
+
+def test_what_pictures_say_of_a_lens_that_is_held() -> None:
+    network, truth = block(0, true_lens=lens(f=1012.0))
+    network = with_positions(network, truth, np.random.default_rng(50), 0.05)
+    unknown = np.zeros((1, 12))
+    unknown[0, 0] = 30.0
+    for held, change, worth in ((1000.0, 12.0, 1.0), (1012.0, 0.0, 0.0)):
+        given = replace(network, lens_prior=lens(f=held)[None])
+        found = adjust(given, replace(start_of(given, truth, 0), lens=given.lens_prior), FINAL)
+        changes, worths = lenses_if_freed(found.network, found.state, unknown, 1e-6)
+        assert changes[0, 0] == pytest.approx(change, abs=1.0)
+        assert (worths > 1.0) == (worth > 0.0)
+        np.testing.assert_array_equal(changes[0, 1:], 0.0)

@@ -175,6 +175,11 @@ def test_control_points_place_a_block_and_a_wrong_one_is_named() -> None:
     before, after = check_errors_px(block, without, rows), check_errors_px(block, with_three, rows)
     assert after[0] <= before[0]
     assert after[1] <= before[1]
+    raised = tuple(replace(point, position_m=point.position_m + np.array([0.0, 0.0, 200.0])) for point in points)
+    lifted, facts = adjusted(block, start, control=raised)
+    assert facts["control"]["used"] == ["gcp0", "gcp1", "gcp2"]
+    heights_m = [np.mean([pose.center_m[2] for pose in one.poses.values()]) for one in (with_three, lifted)]
+    assert heights_m[1] - heights_m[0] == pytest.approx(200.0, abs=0.05)
     points, rows = surveyed(block, 5, {1: np.array([0.5, -0.4, 0.6])})
     with_five, facts = adjusted(block, start, control=points)
     assert facts["control"]["wrong"] == ["gcp1"]
