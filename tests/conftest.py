@@ -22,6 +22,7 @@ import cv2
 import forked
 import pytest
 import typer.testing
+from hypothesis import settings
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
@@ -29,6 +30,10 @@ from aeromatch_cli.orientation import process
 from aeromatch_cli.synthetic import block, render_block, truth
 from aeromatch_cli.synthetic.raycast import RayCaster
 from aeromatch_cli.synthetic.scene import build_scene
+
+# Under load single examples take seconds; what is too slow shows in the durations.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 
 IMAGES, WIDTH, HEIGHT = 5, 320, 240
 # Quick settings: few keypoints, one process.

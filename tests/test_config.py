@@ -255,8 +255,12 @@ def test_overrides_reach_strategies_and_chains() -> None:
     ],
 )
 def test_lists_of_parameters_are_written_like_chains(text: str, names: tuple[str, ...]) -> None:
-    found = load("baseline", [f"adjust.hold={text}", f"adjust.free={text}"]).adjust
-    assert (found.hold, found.free) == (names, names)
+    assert load("baseline", [f"adjust.hold={text}"]).adjust.hold == names
+    assert load("baseline", [f"adjust.free={text}"]).adjust.free == names
+
+
+def test_a_parameter_is_not_free_and_held() -> None:
+    assert "free and hold both name k1" in fault("baseline", "adjust.hold=k1+b1", "adjust.free=f+k1")
 
 
 def test_an_unknown_parameter_of_a_list_is_named() -> None:

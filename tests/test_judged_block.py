@@ -89,7 +89,8 @@ def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Si
 
     site.rewrite_poses(exchanged)
     outcome = site("run")
-    assert outcome.code == 0
+    assert outcome.code == 1
+    assert "given positions is used, the pictures contradict them" in outcome.stdout
     assert "in a frame of its own: scale, north and place are arbitrary" in outcome.stderr
     export = site.work / "export" / "colmap"
     world = json.loads((export / "world.json").read_text())
@@ -101,7 +102,7 @@ def test_positions_that_do_not_fit_leave_a_result_in_a_frame_of_its_own(site: Si
     assert all(abs(float(row["omega_deg"])) < 20.0 for row in rows)
     assert np.median([float(row["z"]) for row in rows]) == pytest.approx(100.0, rel=0.1)
     before = {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()}
-    assert site("run").code == 0
+    assert site("run").code == 1
     assert {path: path.read_bytes() for path in site.work.rglob("*") if path.is_file()} == before
 
 

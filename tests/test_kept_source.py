@@ -97,7 +97,9 @@ def test_skipped_images_have_no_enhanced_picture_and_are_counted(site: Site) -> 
         assert pictures() == ids[:2]
     facts = read_json(site.work / "reports" / "extract.json")["facts"]
     assert facts["images_skipped_same_illumination"] == 3
-    assert "images skipped same illumination 3" in (site.work / "report" / "index.html").read_text(encoding="utf-8")
+    assert "3 images not enhanced (same illumination)" in (site.work / "report" / "index.html").read_text(
+        encoding="utf-8"
+    )
     # Enhanced once, skipped now: nobody is to take the picture for one that is used.
     assert site("enhance", *chained, "--set", "enhance.same_illumination_minutes=0").counts("enhance") == (5, 0, 0)
     assert pictures() == ids

@@ -435,7 +435,7 @@ def test_masks_beside_the_images_are_no_images(tmp_path: Path, names: tuple[str,
         ("DJI_0001.DNG", "raw pictures are not read: develop them to JPEG or TIFF"),
         ("IMG_1.HEIC", "HEIC is read where pillow-heif is installed"),
         ("IMG_1.webp", "WEBP is not read: convert to JPEG or TIFF"),
-        ("DJI_0001.MP4", "videos are not read: extract pictures"),
+        ("DJI_0001.MP4", "videos are not read: `aeromatch frames VIDEO --out DIR`"),
     ],
 )
 def test_pictures_that_are_not_read_are_named(

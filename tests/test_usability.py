@@ -301,4 +301,4 @@ def test_the_estimate_times_pairs_where_a_run_matches_them(site, monkeypatch):
     assert site("check").code == 0
     whole, first_pass = [("_try_image", len(site.names())), ("_try_pair", 3)], [("_try_image", 2), ("_try_pair", 1)]
     # All sampled pairs are looked at, to judge the given poses.
-    assert labels == [("_read_header", len(site.names())), *whole, *(3 * first_pass)]
+    assert labels == [("_read_header", len(site.names())), ("_measure", len(site.names())), *whole, *(3 * first_pass)]
