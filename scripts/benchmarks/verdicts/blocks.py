@@ -299,7 +299,12 @@ FAULTS: Mapping[str, tuple[Plan, Callable[[Task], Task]]] = MappingProxyType({
         _CONTROLLED, lambda t: _surveyed(t, lambda k, place: place + 0.5 * _UP * (k == 0))),
     "a check point 0.5 m off": (_CONTROLLED, lambda t: _surveyed(t, lambda k, place: place + 0.5 * _UP * (k == 2))),
     "names of two control points exchanged": (_CONTROLLED, _names_exchanged),
-    "control points 40 m higher than positions": (_CONTROLLED, lambda t: _surveyed(t, lambda _, p: p + 40.0 * _UP)),
+    "control points 40 m east of positions": (_CONTROLLED, lambda t: _surveyed(t, lambda _, p: p + [40.0, 0.0, 0.0])),
+    "control points in feet": (_CONTROLLED, lambda t: _surveyed(t, lambda _, place: place / 0.3048)),
+    "control points with x and y exchanged": (_CONTROLLED, lambda t: _surveyed(t, lambda _, place: place[[1, 0, 2]])),
+    "focal length held 2 % too long": (
+        Plan(), lambda t: _stated(t, lambda c: _with_params(c, {"f": lambda f: 1.02 * f}), 0.03).observing(
+            switches={"f": False})),
     "20 % wrong matches": (Plan(wrong_share=0.2), lambda t: t),
     "tracks of two images only": (Plan(), _pairs_only),
     "two halves tied by ten matches": (Plan(), _loose),
@@ -317,6 +322,8 @@ GOOD: Mapping[str, tuple[Plan, Callable[[Task], Task]]] = MappingProxyType({
        for flight in ("nadir", "cross", "mixed", "two-heights")
        for positions in ("rtk2cm", "gps5m") for seed in (1, 2)},
     "cross, rtk2cm, 9 control points": (_CONTROLLED, lambda t: t),
+    "cross, rtk2cm, 9 control points 40 m higher, as geoid and ellipsoid are apart": (
+        _CONTROLLED, lambda t: _surveyed(t, lambda _, place: place + 40.0 * _UP)),
     "nadir, gps5m, 9 control points": (Plan(flight="nadir", positions="gps5m", control=9), lambda t: t),
     "cross, rtk2cm, factory calibration": (Plan(), lambda t: _stated(t, lambda c: c, 0.01)),
     "cross, rtk2cm, two flights": (Plan(), _flights),
