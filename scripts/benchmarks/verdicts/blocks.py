@@ -270,7 +270,7 @@ def _names_exchanged(task: Task) -> Task:
 
 _GPS, _NONE = Plan(positions="gps5m"), Plan(flight="nadir", positions="nothing")
 _CONTROLLED = Plan(control=9)
-_UP = np.array([0.0, 0.0, 1.0])
+_EAST, _UP = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 # Name -> what is simulated, and how it is spoilt.
 FAULTS: Mapping[str, tuple[Plan, Callable[[Task], Task]]] = MappingProxyType({
@@ -299,7 +299,7 @@ FAULTS: Mapping[str, tuple[Plan, Callable[[Task], Task]]] = MappingProxyType({
         _CONTROLLED, lambda t: _surveyed(t, lambda k, place: place + 0.5 * _UP * (k == 0))),
     "a check point 0.5 m off": (_CONTROLLED, lambda t: _surveyed(t, lambda k, place: place + 0.5 * _UP * (k == 2))),
     "names of two control points exchanged": (_CONTROLLED, _names_exchanged),
-    "control points 40 m east of positions": (_CONTROLLED, lambda t: _surveyed(t, lambda _, p: p + [40.0, 0.0, 0.0])),
+    "control points 40 m east of positions": (_CONTROLLED, lambda t: _surveyed(t, lambda _, p: p + 40.0 * _EAST)),
     "control points in feet": (_CONTROLLED, lambda t: _surveyed(t, lambda _, place: place / 0.3048)),
     "control points with x and y exchanged": (_CONTROLLED, lambda t: _surveyed(t, lambda _, place: place[[1, 0, 2]])),
     "focal length held 2 % too long": (
