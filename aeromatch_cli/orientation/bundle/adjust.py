@@ -190,8 +190,8 @@ def _hold_undetermined(network: Network, state: Unknowns, found: Covariance) -> 
 
 
 def _with_plausible_focal_lengths(network: Network, state: Unknowns, options: Options) -> tuple[Network, Unknowns]:
-    """The network with focal lengths held that go where no lens is though the residuals hardly tell, and with them where
-    these lenses are centred; and its solution. The same where there are none."""
+    """The network with focal lengths held that go where no lens is though the residuals hardly tell, and with them
+    where these lenses are centred; and its solution. The same where there are none."""
     row = LENS.index("f")
     prior, sigmas = network.lens_prior[:, row], network.lens_sigmas[:, row]
     far = np.abs(state.lens[:, row] - prior) > _IMPLAUSIBLE_SIGMAS * np.where(sigmas > 0.0, sigmas, np.inf)
@@ -204,9 +204,9 @@ def _with_plausible_focal_lengths(network: Network, state: Unknowns, options: Op
     if solved.cost > (1.0 + _TELLING_SHARE) * cost(network, state):
         return network, state
     # What such image points say of where a lens is centred is no better.
-    central = [LENS.index(name) for name in ("cx", "cy", "p1", "p2", "b1", "b2")]
-    held[np.ix_(far, central)] = 0.0
-    lens = np.where(held > 0.0, solved.state.lens, network.lens_prior)
+    central = np.isin(LENS, ("cx", "cy", "p1", "p2", "b1", "b2"))
+    held[far[:, None] & central] = 0.0
+    lens = np.asarray(np.where(held > 0.0, solved.state.lens, network.lens_prior))
     tried = replace(network, lens_sigmas=held)
     return _with_image_sigma(tried, replace(solved.state, lens=lens), options)
 
