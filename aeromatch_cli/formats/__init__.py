@@ -150,13 +150,14 @@ deviations that were stated, each axis in its own. All are empty where nothing w
     known before and its standard deviation, cx and cy from the corner of the first pixel; `correlations`: up to five
     pairs above 0.9: two names, correlation; `flights`: of its flights but the largest that tell of a lens, `flight`,
     `images`, `change` (name -> by how much a lens of its own differs) and `worth` (by how much that lowers the sum of
-    squares over what is asked for: above 1 the flights do not share a calibration).
+    squares over what is asked for: above 1 the flights do not share a calibration); `if_freed`: the same `change` and
+    `worth` of what settings hold, if it were unknown.
   - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
     middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
     both are of), `pixel_m` (what a pixel is on the ground), `points`: x, y and standard deviation of points over the
     block. In a frame of its own, whose units are arbitrary, the names are `sigma`, `bowl`, `tilt`, `reach`, `pixel`.
-  - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `held_out` (`check points`, or `leave
-    one out`), `held_out_rms_m` and `without_rms_m` (at these, with control and without), `kept` (whether control
+  - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `fault` (what is wrong with the list as a
+    whole, "" for nothing), `held_out` (`check points`, or `leave one out`), `held_out_rms_m` and `without_rms_m` (at these, with control and without), `kept` (whether control
     makes them better).
 - `control`: the block beside all surveyed points. `points`, `control`, `check` (counts), `not_measured_in_two_images`,
   `rays_do_not_meet`, `doubtful` (names); `transformation` (the similarity onto the control points: `scale`,
