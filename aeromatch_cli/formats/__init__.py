@@ -157,8 +157,8 @@ deviations that were stated, each axis in its own. All are empty where nothing w
     both are of), `pixel_m` (what a pixel is on the ground), `points`: x, y and standard deviation of points over the
     block. In a frame of its own, whose units are arbitrary, the names are `sigma`, `bowl`, `tilt`, `reach`, `pixel`.
   - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `fault` (what is wrong with the list as a
-    whole, "" for nothing), `held_out` (`check points`, or `leave one out`), `held_out_rms_m` and `without_rms_m` (at these, with control and without), `kept` (whether control
-    makes them better).
+    whole, "" for nothing), `held_out` (`check points`, or `leave one out`), `held_out_rms_m` and `without_rms_m` (at
+    these, with control and without), `kept` (whether control makes them better).
 - `control`: the block beside all surveyed points. `points`, `control`, `check` (counts), `not_measured_in_two_images`,
   `rays_do_not_meet`, `doubtful` (names); `transformation` (the similarity onto the control points: `scale`,
   `rotation_vector_deg`, `shift_m`; null with fewer than three of them) and after it `residuals` (name -> x, y, z,
