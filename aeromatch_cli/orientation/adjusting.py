@@ -142,7 +142,7 @@ class Work:
 class Outcome:
     """result: of the adjustment; images, points, cameras, flights: numbers of its rows. placement: None where the model
     had its place. steps_m: (N,) by row of what was given, steps of height of the flights that were taken out before.
-    if_freed: `lenses_if_freed` of what settings hold, None where they hold nothing.
+    if_freed: `lenses_if_freed` of what settings hold, None before the final adjustment.
     """
 
     result: Adjusted
@@ -257,8 +257,8 @@ def _adjust(
     result = adjust(network, start, work.options)
     _take(work, model, ids, points, numbers, result.state)
     unknown = np.array([work.held_sigmas.get(n, np.zeros(len(LENS))) * (n not in held) for n in numbers])
-    tried = work.options.final and unknown.any()
-    freed = lenses_if_freed(result.network, result.state, unknown, work.options.tolerance) if tried else None
+    final, tolerance = work.options.final, work.options.tolerance
+    freed = lenses_if_freed(result.network, result.state, unknown, tolerance) if final else None
     return Outcome(result, ids, points, numbers, np.unique(given.flights[rows]).tolist(), if_freed=freed)
 
 

@@ -91,8 +91,9 @@ def with_control(
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
+    start = base.moved(-offset_m)
     while True:
-        solved = base.moved(-offset_m).adjusted(work, used)
+        solved = start.adjusted(work, used)
         rests = [solved.without([other for other in used if other is not point]) for point in used]
         worst = _worst(solved, rests, len(used)) if len(used) >= _TELLING else None
         if worst is None:

@@ -101,8 +101,7 @@ def adjust(network: Network, start: Unknowns, options: Options) -> Adjusted:
     network, state = _with_image_sigma(network, start, options, near=False)
     network, state = _with_plausible_focal_lengths(network, state, options)
     if options.final:
-        known = covariance(network, state) if options.choose else None
-        held = network if known is None else _hold_undetermined(network, state, known)
+        held = _hold_undetermined(network, state, covariance(network, state)) if options.choose else network
         if held is not network:
             state = replace(state, lens=np.where(held.lens_sigmas > 0.0, state.lens, held.lens_prior))
             network, state = _with_image_sigma(held, state, options)

@@ -192,8 +192,7 @@ def _factors(state: Unknowns, normals: Reduced, frame: _Frame) -> Factors:
     some = np.linspace(0, len(seen) - 1, min(len(seen), _HOLDING)).astype(int)
     holding = seen[some] if images > _TOGETHER else np.arange(images)
     scale = np.zeros((len(diagonal), 1))
-    at = (6 * holding[:, None] + np.arange(6)).ravel()
-    scale[at, 0] = np.sqrt(diagonal[at])
+    scale.reshape(-1, 6)[holding] = np.sqrt(diagonal.reshape(-1, 6)[holding])
     held = sparse.csr_matrix(scale * np.linalg.qr(scale * frame.free)[0])
     return Factors((normals.matrix + held @ held.T).tocsr(), state.centers_m[:, :2], holding)
 

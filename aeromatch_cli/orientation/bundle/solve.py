@@ -1,4 +1,4 @@
-"""The bundle adjustment: least squares of a network by Levenberg and Marquardt's method, and its covariance."""
+"""The bundle adjustment: least squares of a network by Levenberg and Marquardt's method."""
 
 from __future__ import annotations
 
