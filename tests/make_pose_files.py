@@ -367,3 +367,8 @@ def patb(*, transposed: bool) -> str:
         center = np.array([E, N, H]) + 60.0 * k * step
         out += [f"{k + 1:16d}" + "".join(f"{v:16.5f}" for v in center), "".join(cells[:5]), "".join(cells[5:])]
     return lines(*out)
+
+
+def written(folder: Path, text: str | bytes, name: str = "list.csv") -> Path:
+    """A list as it is given, its line ends included."""
+    return write(folder, name, text)

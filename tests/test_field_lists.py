@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from make_images import gps_tags, write_image
+from make_pose_files import written
 from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.control import read_control
@@ -22,12 +23,6 @@ LATITUDE, LONGITUDE = 52.50993, 13.39315
 CALIFORNIA, CX, CY, CZ = "EPSG:26943", 1850000.0, 650000.0, 90.0
 IMAGE = Image(image_id="a", name="a.jpg", width_px=100, height_px=100, camera_id="1", exif_orientation=1)
 MARK = "a.jpg,P1,10,20\n"
-
-
-def written(folder: Path, text: str, name: str = "list.csv") -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 # --- poses --------------------------------------------------------------------------------------------------------

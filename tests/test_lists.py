@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make_pose_files import written
 
 from aeromatch_cli.blocks.agreement import refuse_degrees
 from aeromatch_cli.blocks.camera_files import read_camera_file
@@ -19,12 +20,6 @@ from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 
 NAMES = ["2022-09-26 15-24-40 DJI_0290.JPG", "2022-09-26 15-24-41 DJI_0291.JPG"]
-
-
-def written(folder: Path, text: str | bytes, name: str) -> Path:
-    path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
 
 
 def images(*names: str, size: tuple[int, int] = (500, 330)) -> tuple[Image, ...]:

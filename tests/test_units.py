@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from make_pose_files import written
 from pyproj import CRS
 
 from aeromatch_cli.blocks.control import read_control
@@ -22,12 +23,6 @@ FT, US_FT = 0.3048, 1200.0 / 3937.0
 X, Y, Z = 390949.297, 5818924.122, 142.597
 LATITUDE, LONGITUDE = 52.50951757, 13.39314938
 OMEGA, PHI, KAPPA = 1.25, -2.5, 91.5
-
-
-def written(folder: Path, text: str, name: str = "list.csv") -> Path:
-    path = folder / name
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 @pytest.mark.parametrize(
