@@ -87,6 +87,26 @@ def test_positions_and_image_points_alone_give_the_poses(fisheye: bool) -> None:
     assert max(angle_between_deg(a, b) for a, b in zip(found.rotations, truth.rotations, strict=True)) < 1e-5
 
 
+def test_a_turn_that_positions_hardly_hold_takes_a_few_steps() -> None:
+    """One strip whose positions are exact to 5 m tells hardly how it lies about its own line."""
+    from scipy.spatial.transform import Rotation
+
+    network, truth = simulated(strips(1, 8), points=200)
+    network = with_positions(network, truth, np.random.default_rng(0), 5.0, noise_m=3.0)
+    settled = solve(network, truth, 1e-9)
+    along = truth.centers_m[-1] - truth.centers_m[0]
+    turn, middle_m = Rotation.from_rotvec(np.deg2rad(8.0) * along / np.linalg.norm(along)), truth.centers_m.mean(axis=0)
+    turned = replace(
+        settled.state,
+        rotations=settled.state.rotations @ turn.as_matrix().T,
+        centers_m=middle_m + turn.apply(settled.state.centers_m - middle_m),
+        points_m=middle_m + turn.apply(settled.state.points_m - middle_m),
+    )
+    found = solve(network, turned, 1e-9)
+    assert max(settled.steps, found.steps) < 30
+    assert found.cost == pytest.approx(settled.cost, abs=1e-6)
+
+
 def test_derivatives_of_all_observations_are_those_of_differences() -> None:
     """At the truth, where residuals are zero and the loss weighs nothing; the boresight is small."""
     network, truth = everything(points=25)

@@ -12,7 +12,7 @@ from aeromatch_cli.orientation.bundle.network import Network, Unknowns
 from aeromatch_cli.orientation.bundle.normal_equations import Layout, Reduced, cost, equations, reduced
 
 # The damping of the first step, the bounds, and by how much it changes from step to step.
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e6
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-13, 1e6
 _EASED, _RAISED = 0.2, 6.0
 # Near the solution steps begin with less; only with less than this does a small step mean that it is reached: damping
 # holds back what the observations hardly tell apart, such as affinity and rolling shutter, or focal length and height.
@@ -70,10 +70,36 @@ def _moved(network: Network, state: Unknowns, normals: Reduced) -> tuple[Unknown
         return None, np.inf
     turned, lens, mount, flight = Layout.of(network).parts(change)
     by_images = normals.point_right + (normals.coupling.T @ change).reshape(-1, 3)
-    points_m = state.points_m - np.einsum("pij,pj->pi", normals.inverses, by_images)
-    rotations = Rotation.from_rotvec(turned[:, :3]).as_matrix() @ state.rotations
-    parts = state.centers_m + turned[:, 3:], points_m, state.lens + lens, state.mount + mount, state.flight + flight
+    to_points_m = -np.einsum("pij,pj->pi", normals.inverses, by_images)
+    turn, middle_m = _turn_of_all(network, state, turned), state.centers_m.mean(axis=0)
+    rotations = Rotation.from_rotvec(turned[:, :3] + state.rotations @ turn).as_matrix() @ state.rotations
+    rotations = rotations @ Rotation.from_rotvec(turn).as_matrix().T
+    centers_m = state.centers_m + _along_arc(state.centers_m - middle_m, turned[:, 3:], turn)
+    points_m = state.points_m + _along_arc(state.points_m - middle_m, to_points_m, turn)
+    parts = centers_m, points_m, state.lens + lens, state.mount + mount, state.flight + flight
     return Unknowns(rotations, *parts), float(np.sqrt(max(change @ (normals.matrix @ change), 0.0)))
+
+
+def _turn_of_all(network: Network, state: Unknowns, turned: FloatArray) -> FloatArray:
+    """(3,) rotation vector about the world's axes by which a step (N, 6) turns the whole block, none where images are
+    held.
+
+    Inexact positions, and those of one strip, hardly hold such a turn, so that it may be large. Straight on it would
+    move points off their rays by the square of its angle, and only small steps would lower the cost.
+    """
+    if network.held.any():
+        return np.zeros(3)
+    return np.asarray(-np.einsum("nji,nj->ni", state.rotations, turned[:, :3]).mean(axis=0))
+
+
+def _along_arc(places_m: FloatArray, moves_m: FloatArray, turn: FloatArray) -> FloatArray:
+    """(K, 3) the moves (K, 3) of places (K, 3), of which `turn` (3,) about the origin is a part, that part along its arc
+    instead of straight on."""
+    from scipy.spatial.transform import Rotation
+
+    rest_m = moves_m - np.cross(turn, places_m)
+    ends_m = places_m + rest_m
+    return np.asarray(rest_m + Rotation.from_rotvec(turn).apply(ends_m) - ends_m)
 
 
 def _solution(normals: Reduced, places: FloatArray) -> FloatArray:
