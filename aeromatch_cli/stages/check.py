@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from aeromatch_cli.data import Features, FloatArray, Pair
+from aeromatch_cli.blocks.ground import ConstantGround
+from aeromatch_cli.data import Features, FloatArray, Pair, Pose
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.orientation.judgement import EXPLAINED_SHARE, MIN_MATCHES, PairPoints, explained_share
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
+from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import candidates, pair_seed
 from aeromatch_cli.stages.match import compared
@@ -39,6 +41,8 @@ _BYTES_OF_PAGE, _BYTES_PER_PIXEL, _BYTES_PER_PICTURE = 0.8e6, 0.16, 0.12e6
 # How many pairs are tried, and how much smaller the picture is with which a worker gets ready.
 _SAMPLED_PAIRS = 3
 _WARM_UP_SCALE = 0.25
+# From where images look at the ground in trials, as nothing is known of them.
+_TRIAL_HEIGHT_M = 100.0
 # Seconds of mapping, and per image: measured 0.04 (300 images of 480 x 360) to 0.4 (8 images, and ochota).
 _MAPPING_S, _MAPPING_S_PER_IMAGE = 1.5, 0.15
 # Seconds of measuring, adjustment, consistency, export and report for one of orientation, features and matching: 0.20
@@ -136,8 +140,9 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
     """
     images = list(context.block.images)
     sampled = _sample(context)
+    seen = context if oriented else _looking_down(context)
     ids = {image_id for pair in sampled for image_id in (pair.image_id0, pair.image_id1)}
-    trials = [_Trial(extract.make_task(context, image), image.image_id in ids) for image in images]
+    trials = [_Trial(extract.make_task(seen, image), image.image_id in ids) for image in images]
     largest_px = max(map(_pixels, trials))
     outcomes = context.executor.run(_try_image, trials, "check")
     failures = tuple((i.name, o.error) for i, o in zip(images, outcomes, strict=True) if o.value is None)
@@ -154,13 +159,32 @@ def run(context: Context, reading_s: float, lost: int, *, oriented: bool) -> Che
         estimate["disk_mb"] = round(
             estimate["disk_mb"] + len(images) * first_keypoints * _BYTES_PER_DESCRIPTOR / 1e6, 1
         )
-    estimate["seconds_of_further_steps"] = _further_s(context, sampled)
+    estimate["seconds_of_further_steps"] = _further_s(seen, sampled)
     if estimate["seconds"] is not None:
         own_s = estimate["seconds"] - estimate["seconds_to_start"] + (estimate["seconds_to_orient"] or 0.0)
         page_s = _PAGE_S if context.settings.run.report else 0.0
         estimate["seconds_after_matching"] = round(own_s * _later(context) + page_s, 1)
         estimate["seconds"] = round(estimate["seconds_to_start"] + own_s + estimate["seconds_after_matching"], 1)
     return Check(_lines(context, estimate, len(images) + lost), estimate, failures)
+
+
+def _looking_down(context: Context) -> Context:
+    """The block as `orient` may find it, where no image has an attitude: their views and neighbours cost as much as
+    those of images that look straight down from one height. Only for trials."""
+    block = context.block
+    found = isinstance(context.settings.orient, FirstPass) and not context.settings.match.reads_pixels
+    if not found or any(pose.world_rotation is not None for pose in block.poses.values()):
+        return context
+    nowhere = Pose(np.zeros(3), None, math.inf, math.inf)
+    poses = {
+        image.image_id: replace(
+            pose, center_m=np.array([*pose.center_m[:2], _TRIAL_HEIGHT_M]), world_rotation=np.diag([1.0, -1.0, -1.0])
+        )
+        for image in block.images
+        for pose in [block.poses.get(image.image_id, nowhere)]
+    }
+    block = replace(block, poses=poses, ground=ConstantGround(0.0))
+    return replace(context, block=with_gsd(block, (None, None), context.settings.block.max_size_px))
 
 
 def _later(context: Context) -> float:

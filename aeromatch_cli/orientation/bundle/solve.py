@@ -93,8 +93,8 @@ def _turn_of_all(network: Network, state: Unknowns, turned: FloatArray) -> Float
 
 
 def _along_arc(places_m: FloatArray, moves_m: FloatArray, turn: FloatArray) -> FloatArray:
-    """(K, 3) the moves (K, 3) of places (K, 3), of which `turn` (3,) about the origin is a part, that part along its arc
-    instead of straight on."""
+    """(K, 3) the moves (K, 3) of places (K, 3), with that part of them which is `turn` (3,) about the origin along its
+    arc instead of straight on."""
     from scipy.spatial.transform import Rotation
 
     rest_m = moves_m - np.cross(turn, places_m)
