@@ -245,7 +245,7 @@ def readers() -> dict[str, Reader]:
         "adjusted": Reader(read_adjusted, {"adjusted.npz": _archive(write_adjusted, block)}),
         "dropped": Reader(read_dropped, {"d.npz": _archive(write_dropped, {("a", "b"): ("f", np.arange(3))}, 15)}),
         "tables": Reader(lambda path: by_name[path.name](path), tables),
-        "json": Reader(read_json, {"a.json": b'{"facts": {"images": 3}, "failures": [["a", "b"]]}'}),
+        "json": Reader(read_json, {"a.json": b'{"result": {"images": 3}, "failures": [["a", "b"]]}'}),
     }
 
 

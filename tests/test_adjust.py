@@ -90,7 +90,7 @@ def test_disturbed_poses_are_adjusted_to_the_truth(truth: Truth) -> None:
     assert off_deg.max() < 0.5
     assert len(adjusted.points_m) >= 0.95 * truth.tied
     assert float(np.mean(adjusted.errors_px)) < 2 * NOISE_PX
-    assert (figures[0]["images"], figures[0]["points"]) == (6, len(adjusted.points_m))
+    assert (figures[0].images, figures[0].points) == (6, len(adjusted.points_m))
 
 
 def test_points_are_those_that_their_keypoints_see(truth: Truth) -> None:
@@ -128,7 +128,7 @@ def test_surveyed_poses_stay_and_get_points(truth: Truth) -> None:
 
 def test_an_image_outside_is_tied_by_its_points(truth: Truth) -> None:
     adjusted, figures = refined(truth, images=IMAGE_IDS[:5])
-    assert figures[0]["registered"] == ["img5"]
+    assert figures[0].registered == ["img5"]
     off_m, off_deg = errors(truth, adjusted)
     assert sorted(adjusted.poses) == list(IMAGE_IDS)
     assert np.abs(off_m[5]).max() < 0.5
@@ -149,7 +149,7 @@ def test_groups_that_matches_tie_become_one(truth: Truth) -> None:
     groups = [Group("positions", ("img0", "img1", "img3")), Group("level", ("img2", "img4", "img5"))]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
     adjusted, figures = refine_block(apart, observed, groups, fixed=False)
-    assert [(one["kind"], one["images"]) for one in figures] == [("positions", 6)]
+    assert [(one.kind, one.images) for one in figures] == [("positions", 6)]
     off_m, off_deg = errors(truth, adjusted)
     assert np.abs(off_m).max() < 0.5
     assert off_deg.max() < 0.5
@@ -175,7 +175,7 @@ def test_every_group_ties_its_images_outside(truth: Truth) -> None:
     groups = [Group("positions", IMAGE_IDS[:5]), Group("positions", tuple(ids[i] for i in IMAGE_IDS[:5]))]
     contents = ExportContents(block, keypoints.__getitem__, (*truth.pairs, *pairs))
     adjusted, figures = refine_block(contents, Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=False)
-    assert [one["registered"] for one in figures] == [["img5"], ["otherimg5"]]
+    assert [one.registered for one in figures] == [["img5"], ["otherimg5"]]
     for image_id in ("img5", "otherimg5"):
         true = truth.block.poses["img5"]
         assert np.abs(adjusted.poses[image_id].center_m - true.center_m).max() < 0.5
@@ -209,7 +209,7 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     groups = [Group("positions", ("img0", "img1", "img3", "img4")), Group("positions", ("img2", "img5"))]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
     adjusted, figures = refine_block(replace(contents, pairs=apart), observed, groups, fixed=False)
-    assert [one["images"] for one in figures] == [4, 2]
+    assert [one.images for one in figures] == [4, 2]
     assert sorted(adjusted.poses) == list(IMAGE_IDS)
     seen = np.concatenate([track[:, 1] for track in adjusted.tracks.values()])
     assert set(seen.tolist()) == set(range(len(adjusted.points_m)))
@@ -220,7 +220,7 @@ def test_a_group_whose_images_share_no_point_is_left_out(truth: Truth) -> None:
     within = [p for p in truth.pairs if {p.pair.image_id0, p.pair.image_id1} <= set(IMAGE_IDS[:4])]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
     adjusted, figures = refine_block(replace(contents, pairs=within), observed, groups, fixed=False)
-    assert [one["images"] for one in figures] == [4]
+    assert [one.images for one in figures] == [4]
     assert sorted(adjusted.poses) == list(IMAGE_IDS[:4])
 
 
@@ -249,7 +249,7 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
     doubled = ExportContents(both, keypoints.__getitem__, (*truth.pairs, *more))
     groups = [Group("positions", IMAGE_IDS), Group("positions", tuple(names.values()))]
     adjusted, figures = refine_block(doubled, Observed(moved(given), FOCAL_SIGMAS, {}), groups, fixed=False)
-    assert [one["images"] for one in figures] == [6, 6]
+    assert [one.images for one in figures] == [6, 6]
     for group, figure in zip(groups, figures, strict=True):
         off_px = []
         for image_id in group.images:
@@ -257,7 +257,7 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
             camera = adjusted.cameras["ab"[int(image_id[-1]) % 2]]
             seen_px = project(camera, pose.rotation, pose.center_m, adjusted.points_m[track[:, 1]])
             off_px.append(np.linalg.norm(seen_px - keypoints[image_id][track[:, 0]], axis=1))
-        assert float(np.concatenate(off_px).mean()) == pytest.approx(figure["reprojection_error_px"], rel=0.15)
+        assert float(np.concatenate(off_px).mean()) == pytest.approx(figure.reprojection_error_px, rel=0.15)
 
 
 def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> None:
@@ -278,7 +278,7 @@ def test_no_image_is_in_two_groups(truth: Truth) -> None:
     groups = [Group("positions", IMAGE_IDS[:2]), Group("positions", IMAGE_IDS[2:5])]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
     adjusted, figures = refine_block(disturbed(truth, 0), observed, groups, fixed=False)
-    assert sum(one["images"] for one in figures) == len(adjusted.poses) <= len(IMAGE_IDS)
+    assert sum(one.images for one in figures) == len(adjusted.poses) <= len(IMAGE_IDS)
     seen = np.bincount(np.concatenate([track[:, 1] for track in adjusted.tracks.values()]))
     assert (seen >= 2).all()
 
@@ -354,7 +354,7 @@ def test_why_no_read_out_time_was_tried_is_said(changed: list[str], velocities: 
 @pytest.mark.slow
 def test_the_stage_writes_the_block_once(done_site: Site, rendered: Path) -> None:
     record = json.loads((done_site.work / "orientation" / "adjusted.json").read_text())
-    facts = record["facts"]
+    facts = record["result"]
     assert (facts["images"], facts["outside"]) == (IMAGES, {})
     assert facts["points"] > 80
     adjusted = read_adjusted(done_site.work / "orientation" / "adjusted.npz")
@@ -378,7 +378,7 @@ def test_matches_are_exported_where_the_adjustment_fails(done_site: Site, monkey
     outcome = done_site("run", "--overwrite")
     assert outcome.code == 1
     assert done_site.failures() == [("adjust", "all images")]
-    assert outcome.facts["stages"]["adjust"]["facts"]["images"] == 0  # not those of the adjustment before
+    assert outcome.facts["stages"]["adjust"]["result"]["images"] == 0  # not those of the adjustment before
     export = done_site.work / "export" / "colmap"
     assert (export / "database.db").is_file()
     assert not (export / "orientation.csv").exists()
@@ -391,7 +391,7 @@ def test_an_image_without_texture_is_named(site: Site) -> None:
     shape = cv2.imread(str(site.image(4))).shape
     cv2.imwrite(str(site.image(4)), np.full(shape, 128, np.uint8))
     outcome = site("run")
-    reasons = outcome.facts["stages"]["adjust"]["facts"]["outside"]
+    reasons = outcome.facts["stages"]["adjust"]["result"]["outside"]
     assert list(reasons) == [site.names()[4]]
     assert "no texture, or blurred" in next(iter(reasons.values()))
     assert f"not oriented: {site.names()[4]}: " in outcome.stdout

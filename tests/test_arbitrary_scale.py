@@ -108,12 +108,12 @@ def test_a_run_without_positions_says_no_metre(site: Site) -> None:
     said = [line for line in outcome.stdout.splitlines() if not line.startswith(("scale ", "{"))]
     assert not [line for line in said if METRES.search(line)]
     stages = outcome.facts["stages"]
-    assert stages["pairs"]["facts"]["block"]["metric"] is False
-    assert stages["pairs"]["facts"]["block"]["gsd_m"] is None
-    assert stages["adjust"]["facts"]["images"] > 0
-    assert stages["adjust"]["facts"]["sigma_position_m"] is None
+    assert stages["pairs"]["result"]["block"]["metric"] is False
+    assert stages["pairs"]["result"]["block"]["gsd_m"] is None
+    assert stages["adjust"]["result"]["images"] > 0
+    assert stages["adjust"]["result"]["sigma_position_m"] is None
     assert lengths(stages) == {"origin_m"}  # of a frame that has none
-    (group,) = stages["adjust"]["facts"]["groups"]
+    (group,) = stages["adjust"]["result"]["groups"]
     assert 0.0 < group["heights"]["sigma"] / group["heights"]["pixel"] < 10.0
     shown = invoke("show", site.work, site.names()[0]).stdout
     assert "units of arbitrary length" in shown

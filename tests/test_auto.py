@@ -81,7 +81,7 @@ def test_a_hard_pair_takes_the_learned_step_and_says_why(site: Site) -> None:
     assert all(row["reasons"].startswith("guided: ") and "; learned: " in row["reasons"] for row in taken)
     page = (site.work / "report" / "index.html").read_text()
     assert page.count(">first+guided+learned<br>") == len(taken)
-    facts = outcome.facts["stages"]["match"]["facts"]
+    facts = outcome.facts["stages"]["match"]["result"]
     settled = Counter(row["settled_by"] for row in rows)
     assert facts["settled_by"] == {name: settled[name] for name in ("first", "guided", "learned")}
     assert facts["not_settled"] == sum(row["settled_by"] == "" for row in rows)

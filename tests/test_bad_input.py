@@ -83,16 +83,16 @@ def test_folders_and_metadata_with_names_of_images(site):
     assert outcome.code == 0
     assert "x.jpg: is a folder with the name of an image" in outcome.stderr
     assert "._x.jpg" in outcome.stderr
-    assert outcome.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+    assert outcome.facts["stages"]["pairs"]["result"]["images"] == IMAGES
 
 
 def test_image_without_keypoints(site):
     cv2.imwrite(str(site.image(1)), np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
     outcome = site("run")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["extract"]["facts"]["images_without_keypoints"] == 1
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"]["not verifiable"] == IMAGES - 1
-    assert outcome.facts["stages"]["filter"]["facts"]["weakly_tied"] == [site.image(1).name]
+    assert outcome.facts["stages"]["extract"]["result"]["images_without_keypoints"] == 1
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"]["not verifiable"] == IMAGES - 1
+    assert outcome.facts["stages"]["filter"]["result"]["weakly_tied"] == [site.image(1).name]
     assert site("run").done() == {}
 
 
@@ -279,7 +279,7 @@ def test_masks_inside_the_images_folder(site):
     cv2.imwrite(str(masks / f"{site.names()[0]}.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
     outcome = site("run", "--masks", masks)
     assert outcome.code == 0
-    assert outcome.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+    assert outcome.facts["stages"]["pairs"]["result"]["images"] == IMAGES
 
 
 def test_masks_beside_the_images_are_used_where_that_is_asked_for(site):
@@ -290,7 +290,7 @@ def test_masks_beside_the_images_are_used_where_that_is_asked_for(site):
     first = site.names()[0]
     outcome = site("extract", "--masks", site.images)
     assert outcome.code == 0
-    assert outcome.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+    assert outcome.facts["stages"]["pairs"]["result"]["images"] == IMAGES
     assert "masks of images" not in outcome.stderr
     points = read_features(site.work / "features" / f"{first.replace('.', '_')}.npz").keypoints_px
     assert len(points) > 20

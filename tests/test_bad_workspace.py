@@ -82,7 +82,7 @@ def test_workspace_inside_the_images_folder(site):
     again = site("run", "--keep-images", "--workspace", inside)
     assert (again.code, again.done()) == (0, {})
     other = site("run", "--workspace", site.root / "other")  # nor are those of another workspace
-    assert other.facts["stages"]["pairs"]["facts"]["images"] == IMAGES
+    assert other.facts["stages"]["pairs"]["result"]["images"] == IMAGES
     outcome = site("run", "--workspace", site.images)
     assert (outcome.code, "choose another --workspace" in outcome.stderr) == (2, True)
 

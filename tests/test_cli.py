@@ -117,9 +117,9 @@ def test_the_summary_tells_what_views_cost(site, command):
     more = ("--set", "simulate.keep_source=true")
     for _ in range(2):  # the second time it is up to date
         outcome = site(command, *more)
-        facts = outcome.facts["stages"][stage]["facts"]
-        assert facts["views_per_image"] == 2.0
-        line = f"views per image: 2, {facts['view_megapixels_per_image']:.3g} megapixels together"
+        found = outcome.facts["stages"][stage]["result"]
+        assert found["views"] == 2 * found["images"]
+        line = f"views per image: 2, {found['view_megapixels'] / found['images']:.3g} megapixels together"
         assert outcome.stdout.count(line) == 1
 
 
@@ -319,7 +319,7 @@ def test_settings_come_from_a_file_and_options_win(site):
     outcome = invoke("extract", config, "--set", "extract.keypoints=200", "--json")
     assert outcome.code == 0
     assert outcome.facts["workspace"] == str(site.root / "from-file")
-    assert 100 < outcome.facts["stages"]["extract"]["facts"]["keypoints"] <= 200 * IMAGES
+    assert 100 < outcome.facts["stages"]["extract"]["result"]["keypoints"] <= 200 * IMAGES
     assert "keypoints: 200" in (site.root / "from-file" / "config.yaml").read_text()
 
 
@@ -331,7 +331,7 @@ def test_run_as_a_process(site: Site):
     done = run_process("run", "baseline", *site.options("--json", "--jobs", "2", *PAGE), cwd="/")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout.splitlines()[-1])
-    assert facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
     assert "Traceback" not in done.stderr
     for name in ("config.yaml", "images.csv", "cameras.csv", "poses.csv", "pairs.csv", "failures.csv", "block.json"):
         assert (site.work / name).is_file()

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from make_results import filled
 
+from aeromatch_cli.results.stages import BlockResults
 from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.quality import quality_of
 
@@ -23,16 +25,17 @@ def lines_of(**changes: Any) -> list[str]:
         "outside": {}, "groups": [PLACED], "images": 4, "positions_given": 4, "track_length": 3.9, "held_by_pairs": 0,
         "reprojection_error_px": 0.2, "ground_pixel_m": 0.05,
     }  # fmt: skip
-    facts = {
+    found = {
         "filter": {"components": [4], "weakly_tied": [], **changes.get("filter", {})},
         "refine": {"keypoints": 100, "measured": 90},
         "adjust": adjusted | changes.get("adjust", {}),
         "consistency": {"spread": {i: [9, 0, 100] for i in "abcd"} | changes.get("spread", {})}
         | changes.get("consistency", {}),
     }
-    quality = quality_of(facts, NAMES)
+    results = filled(BlockResults, found)
+    quality = quality_of(results, NAMES)
     assert quality is not None
-    return closing_lines(quality, facts, NAMES)
+    return closing_lines(quality, results, NAMES)
 
 
 def test_a_block_against_which_nothing_speaks_is_good() -> None:
@@ -82,4 +85,4 @@ def test_what_is_wrong_or_weak_is_named_with_what_to_do(changes: dict[str, Any],
 
 
 def test_a_part_of_a_run_has_no_verdict() -> None:
-    assert quality_of({"filter": {"components": [4], "weakly_tied": []}}, NAMES) is None
+    assert quality_of(filled(BlockResults, filter={"components": [4]}), NAMES) is None

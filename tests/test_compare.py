@@ -50,7 +50,7 @@ def test_what_speaks_the_other_way_is_said() -> None:
 
 def side(*names: str, width_px: int = 1000, time: str = "", matches: int = 100) -> compared._Side:
     images = {name: Image(name.replace(".", "_"), name, width_px, 750, "1", time=time) for name in names}
-    return compared._Side({}, images, {(names[0], names[1]): matches}, {}, {}, {}, frozenset(names), "good")
+    return compared._Side({}, images, {(names[0], names[1]): matches}, {}, None, None, frozenset(names), "good")
 
 
 def outcome_of(monkeypatch: pytest.MonkeyPatch, first: compared._Side, second: compared._Side):

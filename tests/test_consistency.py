@@ -186,10 +186,10 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert outcome.code == 0
     stages = outcome.facts["stages"]
     assert {stages[name]["done"] for name in ("extract", "match", "filter", "adjust")} == {0}
-    facts, before = stages["consistency"]["facts"], stages["filter"]["facts"]["verified_matches"]
+    facts, before = stages["consistency"]["result"], stages["filter"]["result"]["verified_matches"]
     assert 0 < facts["dropped_matches"] < before / 2
     assert facts["verified_matches"] == before - facts["dropped_matches"]
-    assert stages["export"]["facts"]["colmap"]["verified_matches"] == facts["verified_matches"]
+    assert stages["export"]["result"]["exporters"]["colmap"]["verified_matches"] == facts["verified_matches"]
     assert f"{facts['dropped_matches']} matches contradict the adjusted block" in outcome.stdout
     model = pycolmap.Reconstruction(done_site.work / "export" / "colmap" / "sparse")
     assert model.num_points3D() == facts["points_left"] <= facts["points"]
@@ -200,8 +200,8 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert all(ninths + empty <= 9 for ninths, empty, _ in spread)
     assert f"{facts['verified_matches']:,}" in (done_site.work / "report" / "index.html").read_text()
     refused = done_site("run", "--set", "consistency.epipolar_px=0.3", "--set", "consistency.min_matches=100000")
-    facts = refused.facts["stages"]["consistency"]["facts"]
-    exported = refused.facts["stages"]["export"]["facts"]["colmap"]
+    facts = refused.facts["stages"]["consistency"]["result"]
+    exported = refused.facts["stages"]["export"]["result"]["exporters"]["colmap"]
     assert facts["rejected_pairs"] > 0
     assert facts["verified_matches"] == exported["verified_matches"]
     with sqlite3.connect(done_site.work / "export" / "colmap" / "database.db") as database:
@@ -213,9 +213,9 @@ def test_export_report_and_evaluation_go_without_what_is_dropped(done_site: Site
     assert final.is_file()
     none = done_site("run", "--set", "consistency=none")
     assert not final.exists()
-    assert none.facts["stages"]["export"]["facts"]["colmap"]["verified_matches"] == before
+    assert none.facts["stages"]["export"]["result"]["exporters"]["colmap"]["verified_matches"] == before
     assert not (done_site.work / "orientation" / "dropped.npz").exists()
-    assert json.loads((done_site.work / "reports" / "consistency.json").read_text())["facts"]["dropped_matches"] == 0
+    assert json.loads((done_site.work / "reports" / "consistency.json").read_text())["result"]["dropped_matches"] == 0
 
 
 def alone(truth: Truth, keypoints: dict[str, FloatArray], indices: IntArray, sign: float = 1.0) -> AdjustedBlock:

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import PAGE, Site
+from make_results import filled
 from test_export_colmap import ORIGIN_M, Truth, make_truth
 
 from aeromatch_cli.blocks.control import far_control, read_control
@@ -20,6 +21,7 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.orientation.control import control_figures
+from aeromatch_cli.results.adjustment import Control, ControlInGroup
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.lines import control_words
 from aeromatch_cli.synthetic import load_truth
@@ -62,13 +64,13 @@ def test_check_points_show_their_own_error(truth: Truth) -> None:
     offsets_m[7:] = [0.03, -0.04, 0.12]  # the check points are surveyed wrong by this
     points = surveyed(truth, rows, offsets_m, set(rows[7:]))
     figures = control_figures(adjusted_truth(truth), cameras(truth), points)
-    assert (figures["control"], figures["check"], figures["check_kind"]) == (7, 3, "check points")
-    np.testing.assert_allclose(figures["offset_m"], 0.0, atol=1e-6)
-    assert figures["check_rmse_m"] == [0.03, 0.04, 0.12]
-    assert max(figures["control_rmse_m"]) < 1e-6
-    assert figures["transformation"]["scale"] == pytest.approx(1.0, abs=1e-9)
-    assert figures["residuals"][f"p{rows[9]}"] == [-0.03, 0.04, -0.12]
-    assert figures["reprojection_error_px"] < 1e-3
+    assert (figures.control, figures.check, figures.check_kind) == (7, 3, "check points")
+    np.testing.assert_allclose(figures.offset_m, 0.0, atol=1e-6)
+    assert figures.check_rmse_m == (0.03, 0.04, 0.12)
+    assert max(figures.control_rmse_m) < 1e-6
+    assert figures.transformation.scale == pytest.approx(1.0, abs=1e-9)
+    assert figures.residuals[f"p{rows[9]}"] == (-0.03, 0.04, -0.12)
+    assert figures.reprojection_error_px < 1e-3
 
 
 def test_residuals_are_as_large_as_survey_and_measurements_let_expect(truth: Truth) -> None:
@@ -81,19 +83,19 @@ def test_residuals_are_as_large_as_survey_and_measurements_let_expect(truth: Tru
     ]
     whole = adjusted_truth(truth)
     figures = control_figures(whole, cameras(truth), points)
-    residuals, stated = (np.array([figures[key][p.name] for p in points]) for key in ("residuals", "point_sigmas_m"))
+    residuals, stated = (np.array([own[p.name] for p in points]) for own in (figures.residuals, figures.point_sigmas_m))
     assert (stated > 1.05 * np.array(sigmas_m)).all()  # the survey alone is less
     np.testing.assert_allclose(np.sqrt(((residuals / stated) ** 2).mean(axis=0)), 1.0, atol=0.1)
     # Of 2 px in each coordinate, of which three unknowns of a point take a part.
-    images = np.mean([len(own) for own in figures["image_residuals_px"].values()])
+    images = np.mean([len(own) for own in figures.image_residuals_px.values()])
     expected_px = sigma_px * np.sqrt(2.0) * np.sqrt(1.0 - 3.0 / (2.0 * images))
-    assert figures["reprojection_error_px"] == pytest.approx(expected_px, rel=0.1)
+    assert figures.reprojection_error_px == pytest.approx(expected_px, rel=0.1)
     halved = {i: replace(pose, center_m=0.5 * pose.center_m) for i, pose in whole.poses.items()}
     small = control_figures(replace(whole, poses=halved), cameras(truth), points, metric=False)
-    np.testing.assert_allclose([small["point_sigmas_m"][p.name] for p in points], stated, rtol=0.02)
-    assert small["ground_pixel_m"] == pytest.approx(figures["ground_pixel_m"], rel=0.01)
-    assert small["offset_m"] is None
-    scale = small["transformation"]["scale"]
+    np.testing.assert_allclose([small.point_sigmas_m[p.name] for p in points], stated, rtol=0.02)
+    assert small.ground_pixel_m == pytest.approx(figures.ground_pixel_m, rel=0.01)
+    assert small.offset_m is None
+    scale = small.transformation.scale
     assert scale == pytest.approx(2.0, rel=1e-3)
     assert f"to fit them the exported block is to be scaled to {scale:.4g} m per unit" in control_words(small)
 
@@ -103,9 +105,9 @@ def test_without_check_points_each_is_left_out_once(truth: Truth) -> None:
     rng = np.random.default_rng(0)
     points = surveyed(truth, rows, rng.normal(0.0, 0.05, (10, 3)), set())
     figures = control_figures(adjusted_truth(truth), cameras(truth), points)
-    assert figures["check_kind"] == "leave one out"
-    assert all(left > fit for left, fit in zip(figures["check_rmse_m"], figures["control_rmse_m"], strict=True))
-    assert 0.03 < np.mean(figures["check_rmse_m"]) < 0.1
+    assert figures.check_kind == "leave one out"
+    assert all(left > fit for left, fit in zip(figures.check_rmse_m, figures.control_rmse_m, strict=True))
+    assert 0.03 < np.mean(figures.check_rmse_m) < 0.1
 
 
 def test_a_block_in_another_frame_is_transformed(truth: Truth) -> None:
@@ -116,8 +118,8 @@ def test_a_block_in_another_frame_is_transformed(truth: Truth) -> None:
         for p in surveyed(truth, rows, np.zeros((8, 3)), set())
     ]
     figures = control_figures(adjusted_truth(truth), cameras(truth), points)
-    assert figures["transformation"]["scale"] == pytest.approx(2.0)
-    assert max(figures["check_rmse_m"]) < 1e-6
+    assert figures.transformation.scale == pytest.approx(2.0)
+    assert max(figures.check_rmse_m) < 1e-6
 
 
 def test_a_point_that_the_others_contradict_is_named(truth: Truth) -> None:
@@ -125,10 +127,10 @@ def test_a_point_that_the_others_contradict_is_named(truth: Truth) -> None:
     offsets_m = np.random.default_rng(0).normal(0.0, 0.01, (8, 3))
     offsets_m[5] += [5.0, 0.0, 0.0]
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, rows, offsets_m, set()))
-    assert figures["doubtful"] == ["p250"]
+    assert figures.doubtful == ["p250"]
     offsets_m[5] = 0.0
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, rows, offsets_m, set()))
-    assert figures["doubtful"] == []
+    assert figures.doubtful == []
 
 
 def test_a_point_whose_rays_meet_behind_the_cameras_is_named_and_left_out(truth: Truth) -> None:
@@ -136,27 +138,27 @@ def test_a_point_whose_rays_meet_behind_the_cameras_is_named_and_left_out(truth:
     (id0, pixel0), (id1, pixel1) = list(points[1].pixels.items())[:2]
     swapped = replace(points[1], pixels={id0: pixel1, id1: pixel0})
     left = control_figures(adjusted_truth(truth), cameras(truth), [points[0], swapped, *points[2:]])
-    assert left["rays_do_not_meet"] == ["p100"]
-    assert left["not_measured_in_two_images"] == []
-    assert max(left["control_rmse_m"]) < 1e-6
-    assert left["reprojection_error_px"] < 1e-3
-    assert json.dumps(left, allow_nan=False)
+    assert left.rays_do_not_meet == ["p100"]
+    assert left.not_measured_in_two_images == []
+    assert max(left.control_rmse_m) < 1e-6
+    assert left.reprojection_error_px < 1e-3
+    assert json.dumps(left.as_json(), allow_nan=False)
     assert control_words(left)[1].startswith("rays do not meet of p100: ")
 
 
 def test_two_points_determine_nothing(truth: Truth) -> None:
     figures = control_figures(adjusted_truth(truth), cameras(truth), surveyed(truth, [0, 40], np.zeros((2, 3)), set()))
-    assert (figures["control"], figures["transformation"], figures["check_rmse_m"]) == (2, None, None)
+    assert (figures.control, figures.transformation, figures.check_rmse_m) == (2, None, None)
 
 
 def test_check_points_alone_have_the_residuals_of_the_block_as_it_is(truth: Truth) -> None:
     rows = [0, 40, 80, 120]
     points = surveyed(truth, rows, np.tile([0.03, -0.04, 0.12], (4, 1)), set(rows))
     figures = control_figures(adjusted_truth(truth), cameras(truth), points)
-    assert figures["residuals"] == {f"p{row}": [-0.03, 0.04, -0.12] for row in rows}
-    assert [*figures["point_sigmas_m"]] == figures["checks"] == [*figures["residuals"]]
+    assert figures.residuals == {f"p{row}": (-0.03, 0.04, -0.12) for row in rows}
+    assert [*figures.point_sigmas_m] == figures.checks == [*figures.residuals]
     own = control_figures(adjusted_truth(truth), cameras(truth), points, metric=False)
-    assert "residuals" not in own  # nothing says what its units are
+    assert not own.residuals  # nothing says what its units are
 
 
 @pytest.mark.parametrize("head", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
@@ -246,7 +248,7 @@ def test_control_above_the_geoid_gives_the_block_its_heights(done_site: Site, re
     path = write_gcp_list(done_site.root / "gcp_list.txt", rendered, lower_m=45.0)
     outcome = done_site("run", "--gcp", path, *PAGE)
     assert outcome.code == 0
-    facts = outcome.facts["stages"]["adjust"]["facts"]
+    facts = outcome.facts["stages"]["adjust"]["result"]
     inside = facts["groups"][0]["control"]
     assert inside["held_out_rms_m"][2] < 1.5 < 40.0 < inside["without_rms_m"][2]
     (remark,) = [line for line in facts["remarks"] if "the block has the heights of the control points" in line]
@@ -261,10 +263,10 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     path = write_gcp_list(done_site.root / "gcp_list.txt", rendered)
     outcome = done_site("run", "--gcp", path, *PAGE)
     assert outcome.code == 0
-    control = outcome.facts["stages"]["adjust"]["facts"]["control"]
+    control = outcome.facts["stages"]["adjust"]["result"]["control"]
     assert control["control"] >= 6
     assert max(control["check_rmse_m"][:2]) < 0.5  # a pixel is 0.4 m on the ground
-    inside = outcome.facts["stages"]["adjust"]["facts"]["groups"][0]["control"]
+    inside = outcome.facts["stages"]["adjust"]["result"]["groups"][0]["control"]
     assert (len(inside["used"]), inside["wrong"], inside["exchanged"]) == (control["control"], [], [])
     assert max(inside["held_out_rms_m"][:2]) < 0.5 < max(inside["without_rms_m"])
     assert "take part in the adjustment: RMSE at each control point, adjusted without it" in outcome.stdout
@@ -300,7 +302,7 @@ def test_what_control_points_did_in_the_adjustment_is_said() -> None:
         "used": ["a", "b", "c", "d"], "wrong": ["e"], "exchanged": [], "held_out": "leave one out", "kept": True,
         "held_out_rms_m": [0.02, 0.03, 0.04], "without_rms_m": [2.0, 3.0, 4.0],
     }  # fmt: skip
-    assert control_words(control, [{}, adjusted]) == [
+    assert control_words(filled(Control, control), [filled(ControlInGroup, adjusted)]) == [
         "control: 5 control points, 0 check points",
         "control points that the others contradict: e; they were left out",
         "4 control points take part in the adjustment: RMSE at each control point, adjusted without it x 0.020, y "

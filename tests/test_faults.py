@@ -31,7 +31,7 @@ def test_a_mapper_that_stops_is_a_failure_and_tried_again(site: Site, monkeypatc
     assert "matches do not agree" not in outcome.stdout
     again = site("orient", "--poses", "none")
     assert (again.code, again.counts("orient")) == (0, (IMAGES, 0, 0))
-    assert len(again.facts["stages"]["orient"]["facts"]["outside"]) < IMAGES
+    assert len(again.facts["stages"]["orient"]["result"]["outside"]) < IMAGES
     assert site("orient", "--poses", "none").counts("orient") == (0, IMAGES, 0)
 
 

@@ -48,7 +48,7 @@ def test_a_smaller_model_in_another_frame_becomes_part_of_the_larger_one() -> No
     pairs, _ = matches(TRUTH)
     (found,) = found_of([model_of(turned(STRIP)), model_of(REST)], pairs)
     assert found.rotations.keys() == TRUTH.keys()
-    assert found.figures["images"] == len(TRUTH)
+    assert found.figures.images == len(TRUTH)
     assert same(found)
 
 

@@ -14,6 +14,7 @@ import pyproj
 import pytest
 import rasterio
 from make_images import write_image
+from make_results import filled
 from read_inputs import read_inputs
 
 from aeromatch_cli.blocks.control import read_control
@@ -26,6 +27,8 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.orientation.dem import Terrain
 from aeromatch_cli.orientation.heights import shift_of_points_m, shift_to_control_m
 from aeromatch_cli.orientation.quality import Evidence, judged
+from aeromatch_cli.results.adjustment import GroupResult
+from aeromatch_cli.results.stages import AdjustResult, OrientResult
 from aeromatch_cli.stages.adjust import height_remarks
 from aeromatch_cli.stages.ground import judged_ground
 
@@ -201,14 +204,14 @@ def dem_context(terrain: Terrain, shape: np.ndarray, sigma_m: float) -> Any:
 
 
 TERRAIN = Terrain(300.0 + np.add.outer(np.zeros(20), np.linspace(0.0, 20.0, 20)), 0.0, 0.0, 10.0)
-FACTS = {"frame": "given", "points": 1000}
+ORIENTED = filled(OrientResult, frame="world", points=1000)
 
 
 @pytest.mark.parametrize("off_m", [-45.0, 30.0, -8.0])
 def test_a_dem_with_another_zero_is_used_shifted_and_the_offset_named(off_m: float) -> None:
     """The smallest is 8 % of the flying height: more than positions of 0.03 m leave open."""
     context = dem_context(TERRAIN, TERRAIN.heights_m + off_m, 0.03)
-    ground, source, (remark,) = judged_ground(context, [TERRAIN], FACTS)
+    ground, source, (remark,) = judged_ground(context, [TERRAIN], ORIENTED)
     places = np.array([[50.0, -50.0], [120.0, -30.0]])
     np.testing.assert_allclose(ground.height_m(places), context.block.ground.height_m(places) - off_m, atol=1e-9)
     assert source == f"DEM dem.tif, {'raised' if off_m < 0 else 'lowered'} by {abs(off_m):.1f} m"
@@ -220,11 +223,11 @@ def test_a_dem_with_another_zero_is_used_shifted_and_the_offset_named(off_m: flo
 
 def test_a_dem_that_agrees_or_has_another_shape_is_not_shifted() -> None:
     agreeing = dem_context(TERRAIN, TERRAIN.heights_m + 3.0, 0.03)
-    assert judged_ground(agreeing, [TERRAIN], FACTS) == (agreeing.block.ground, "DEM dem.tif", [])
+    assert judged_ground(agreeing, [TERRAIN], ORIENTED) == (agreeing.block.ground, "DEM dem.tif", [])
     uncertain = dem_context(TERRAIN, TERRAIN.heights_m + 12.0, 5.0)  # three standard deviations of GPS
-    assert judged_ground(uncertain, [TERRAIN], FACTS)[2] == []
+    assert judged_ground(uncertain, [TERRAIN], ORIENTED)[2] == []
     hill = 60.0 * np.sin(np.arange(20) / 3.0)[:, None] + TERRAIN.heights_m - 80.0
-    ground, source, (remark,) = judged_ground(dem_context(TERRAIN, hill, 0.03), [TERRAIN], FACTS)
+    ground, source, (remark,) = judged_ground(dem_context(TERRAIN, hill, 0.03), [TERRAIN], ORIENTED)
     assert (source, "The terrain of the pictures is used" in remark) == (
         "terrain from 1000 points of the first pass",
         True,
@@ -232,7 +235,7 @@ def test_a_dem_that_agrees_or_has_another_shape_is_not_shifted() -> None:
     assert ground is not None
 
 
-def group(*shifts_m: tuple[float, float, float], used: bool = True) -> dict[str, Any]:
+def group(*shifts_m: tuple[float, float, float], used: bool = True) -> GroupResult:
     flights = [
         {
             "flight": f"{n}",
@@ -242,10 +245,11 @@ def group(*shifts_m: tuple[float, float, float], used: bool = True) -> dict[str,
         }
         for n, one in enumerate(shifts_m)
     ]
-    return {
+    found = {
         "kind": "positions", "images": 24, "flights": flights, "control": {"used": ["p1"] if used else []},
-        "positions": {"stated_m": [0.02, 0.02, 0.03], "images": 24, "wrong": [], "used": 24, "rms_sigmas": None},
+        "positions": {"stated_m": [0.02, 0.02, 0.03], "images": 24, "used": 24},
     }  # fmt: skip
+    return filled(GroupResult, found)
 
 
 def test_the_offset_of_positions_to_control_is_told() -> None:
@@ -265,7 +269,7 @@ def test_the_offset_of_positions_to_control_is_told() -> None:
 
 def test_an_offset_that_control_points_explain_is_no_doubt() -> None:
     def level(one: dict[str, Any]) -> list[str]:
-        found = judged(Evidence(24, {"images": 24, "positions_given": 24, "groups": [one]}))
+        found = judged(Evidence(images=24, adjust=AdjustResult(images=24, positions_given=24, groups=[one])))
         return [finding.level for finding in found.findings if finding.what == "shift of a flight"]
 
     assert level(group((0.01, -0.03, 45.3))) == ["good"]
@@ -287,7 +291,8 @@ def test_the_offset_of_check_points_is_told_and_named() -> None:
         "held_out_rms_m": [0.02, 0.02, 45.03], "without_rms_m": [0.02, 0.02, 45.03],
     }  # fmt: skip
     groups = [{"kind": "positions", "images": 12, "control": inside}]
-    found = judged(Evidence(12, {"images": 12, "positions_given": 12, "groups": groups, "control": control}))
+    adjusted = {"images": 12, "positions_given": 12, "groups": groups}
+    found = judged(filled(Evidence, images=12, adjust=adjusted | {"control": control}))
     (named,) = [finding for finding in found.findings if finding.what == "heights of surveyed points"]
     assert named.level == "doubtful"
     assert (
@@ -297,5 +302,5 @@ def test_the_offset_of_check_points_is_told_and_named() -> None:
     (points,) = [finding for finding in found.findings if finding.what == "check points"]
     assert points.level == "good"  # but for the offset they are met to 0.06 m
     control = {**control, "residuals": {name: [0.0, 0.0, 7.0 * n] for n, name in enumerate(errors_m)}}
-    found = judged(Evidence(12, {"images": 12, "positions_given": 12, "groups": groups, "control": control}))
+    found = judged(filled(Evidence, images=12, adjust=adjusted | {"control": control}))
     assert next(finding for finding in found.findings if finding.what == "check points").level == "bad"

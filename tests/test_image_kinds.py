@@ -30,7 +30,7 @@ def test_equal_names_in_two_folders(site):
     site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
     outcome = site("run")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
     assert sorted(path.stem for path in (site.work / "features").iterdir()) == sorted(
         name.replace("/", "--").replace(".", "_") for name in names
     )
@@ -51,7 +51,7 @@ def test_unicode_and_blanks_in_names(site):
     site.rewrite_poses(lambda rows: [{**row, "image": name} for row, name in zip(rows, names, strict=True)])
     outcome = site("run", "--workspace", site.root / "Arbeit für mich")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
     assert site("run", "--workspace", site.root / "Arbeit für mich").done() == {}
 
 
@@ -61,7 +61,7 @@ def test_the_same_picture_twice(site):
     site.rewrite_poses(lambda rows: [*rows, {**rows[0], "image": "copy.jpg"}])
     outcome = site("run")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["components"] == [IMAGES + 1]
+    assert outcome.facts["stages"]["filter"]["result"]["components"] == [IMAGES + 1]
     first = next(name for name in site.names() if name != "copy.jpg")
     later, earlier = sorted(("copy.jpg", first), reverse=True)
     assert f"1 of {IMAGES + 1} images are there twice ({later} is {earlier})" in outcome.stderr
@@ -84,7 +84,7 @@ def test_sizes_depths_and_formats_mixed(site):
     outcome = site("run", "--cameras", "exif")
     assert outcome.code == 0, outcome.stderr
     assert outcome.facts["stages"]["extract"]["items"] == IMAGES
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"].get("verified", 0) >= PAIRS // 2
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"].get("verified", 0) >= PAIRS // 2
 
 
 def test_tiffs_of_five_bands_of_floats_and_of_signed_numbers(site):
@@ -100,7 +100,7 @@ def test_tiffs_of_five_bands_of_floats_and_of_signed_numbers(site):
     outcome = site("run", "--set", "enhance=clahe", "--set", "extract.colours=true")
     assert outcome.code == 0, outcome.stderr
     assert outcome.facts["stages"]["extract"]["items"] == IMAGES
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
 
 
 def test_images_that_do_not_fit_their_camera(site):
@@ -115,7 +115,7 @@ def test_images_without_any_pose(site):
     site = oriented(site)
     outcome = site("run", "--poses", "none")
     assert outcome.code == 0
-    assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100
+    assert outcome.facts["stages"]["filter"]["result"]["verified_matches"] > 100
     views = read_json(Workspace(site.work).views(site.names()[0].replace(".", "_")))["views"]
-    assert outcome.facts["stages"]["orient"]["facts"]["poses_from"] == "pictures"
+    assert outcome.facts["stages"]["orient"]["result"]["poses_from"] == "pictures"
     assert [view["is_source"] for view in views] == [False]  # a ground view: the pictures gave the attitude

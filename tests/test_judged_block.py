@@ -54,7 +54,7 @@ def test_a_block_that_falls_into_parts_is_searched_with_more_keypoints(
     def oriented() -> tuple[list[int], list[dict[str, object]], str]:
         outcome = site("orient", "--set", "orient.keypoints=120", "--overwrite")
         assert outcome.code == 0
-        facts = read_json(site.work / "reports" / "orient.json")["facts"]
+        facts = read_json(site.work / "reports" / "orient.json")["result"]
         return [model["images"] for model in facts["models"]], facts["further_first_passes"], outcome.stdout
 
     more = {"with": "more keypoints", "images": 3}
@@ -74,7 +74,7 @@ def test_a_block_of_many_pairs_is_not_searched_with_more_keypoints(
     shutil.copy2(rendered / "poses_noisy.csv", site.poses)
     monkeypatch.setattr("aeromatch_cli.stages.first_pass._MOST_DEAR_PAIRS", IMAGES * (IMAGES - 1) // 2 - 1)
     assert site("orient", "--set", "orient.keypoints=120").code == 0
-    facts = read_json(site.work / "reports" / "orient.json")["facts"]
+    facts = read_json(site.work / "reports" / "orient.json")["result"]
     assert ([model["images"] for model in facts["models"]], facts["further_first_passes"]) == ([3], [])
 
 
@@ -154,10 +154,10 @@ def test_a_third_of_the_attitudes_wrong_settles_in_one_run(site: Site, rendered:
     site.rewrite_poses(change)
     outcome = site("run")
     assert outcome.code == 0
-    named = outcome.facts["stages"]["orient"]["facts"]["wrong_attitudes"]
+    named = outcome.facts["stages"]["orient"]["result"]["wrong_attitudes"]
     assert sorted(named) == [site.names()[number] for number in wrong]
     assert max(attitude_errors(site, rendered)) < 1.0
-    verified = outcome.facts["stages"]["filter"]["facts"]["pairs"]["verified"]
+    verified = outcome.facts["stages"]["filter"]["result"]["pairs"]["verified"]
     with sqlite3.connect(site.work / "export" / "colmap" / "database.db") as database:
         exported = database.execute("SELECT COUNT(*) FROM two_view_geometries WHERE rows > 0").fetchone()[0]
     assert exported == verified == IMAGES * (IMAGES - 1) // 2
@@ -214,7 +214,7 @@ def test_equal_positions_are_named_and_not_used(site: Site) -> None:
     outcome = site("orient")
     assert outcome.code == 0
     assert "all 5 positions are identical" in outcome.stderr
-    facts = outcome.facts["stages"]["orient"]["facts"]
+    facts = outcome.facts["stages"]["orient"]["result"]
     assert facts["frame"] == "own"
     assert len(read_poses(site.work / "poses.csv")) == facts["models"][0]["images"] >= 3
 

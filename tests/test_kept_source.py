@@ -95,7 +95,7 @@ def test_skipped_images_have_no_enhanced_picture_and_are_counted(site: Site) -> 
         outcome = site("run", *chained, "--keep-images", *PAGE)
         assert said in outcome.stdout
         assert pictures() == ids[:2]
-    facts = read_json(site.work / "reports" / "extract.json")["facts"]
+    facts = read_json(site.work / "reports" / "extract.json")["result"]
     assert facts["images_skipped_same_illumination"] == 3
     assert "3 images not enhanced (same illumination)" in (site.work / "report" / "index.html").read_text(
         encoding="utf-8"
@@ -112,7 +112,7 @@ def test_preset_fusion_verifies_the_block(site: Site) -> None:
     assert outcome.code == 0
     assert True in enhanced_views(site).values()
     report = read_json(site.work / "reports" / "filter.json")
-    assert report["facts"]["pairs"] == {"verified": 10}
+    assert report["result"]["pairs"] == {"verified": 10}
     assert (site.work / "export" / "colmap" / "database.db").is_file()
     shown = (site.work / "report" / "index.html").read_text(encoding="utf-8")
     assert "Shadow %" in shown

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 import typer
+from make_results import filled
 
 from aeromatch_cli.cli.output import guarded
+from aeromatch_cli.results.stages import BlockResults
 from aeromatch_cli.stages.lost import lost_images, lost_lines, write_lost
 from aeromatch_cli.stages.run import Result
 from aeromatch_cli.workspace import Workspace
@@ -16,8 +18,8 @@ NAMES = {f"a{k}_jpg": f"a{k}.jpg" for k in range(8)}
 
 
 def test_images_are_lost_that_were_not_read_or_not_oriented(tmp_path: Path) -> None:
-    facts = {"adjust": {"images": 6, "outside": {"a7_jpg": "no pair", "a6_jpg": "no texture"}}}
-    lost = lost_images(facts, [("b.jpg", "file is empty")], NAMES)
+    adjusted = {"images": 6, "outside": {"a7_jpg": "no pair", "a6_jpg": "no texture"}}
+    lost = lost_images(filled(BlockResults, adjust=adjusted), [("b.jpg", "file is empty")], NAMES)
     assert lost == [
         ("a6.jpg", "not oriented", "no texture"),
         ("a7.jpg", "not oriented", "no pair"),
@@ -33,10 +35,10 @@ def test_images_are_lost_that_were_not_read_or_not_oriented(tmp_path: Path) -> N
 
 
 def test_without_adjustment_images_are_lost_that_no_pair_holds(tmp_path: Path) -> None:
-    facts = {"adjust": {"images": 0}, "filter": {"unconnected": ["a0_jpg"]}}
-    whole = {**facts, "consistency": {"components": [6, 1, 1], "unconnected": sorted(NAMES)[:7]}}
-    assert [name for name, _, _ in lost_images(facts, (), NAMES)] == ["a0.jpg"]
-    lost = lost_images(whole, (), NAMES)
+    found = {"adjust": {"images": 0}, "filter": {"unconnected": ["a0_jpg"]}}
+    final = {"components": [6, 1, 1], "unconnected": sorted(NAMES)[:7]}
+    assert [name for name, _, _ in lost_images(filled(BlockResults, found), (), NAMES)] == ["a0.jpg"]
+    lost = lost_images(filled(BlockResults, found, consistency=final), (), NAMES)
     assert len(lost) == 7
     [line] = lost_lines(Workspace(tmp_path), lost, 8)
     assert "7 of 8 images are not in the result (7 not connected): a0.jpg, a1.jpg, a2.jpg, a3.jpg, a4.jpg and 2" in line

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from aeromatch_cli.stages.models import Mapped
 class _Model:
     def __init__(self, images: int, contradiction: str) -> None:
         self.rotations = dict.fromkeys(range(images))
-        self.figures = {"contradiction": contradiction}
+        self.figures = SimpleNamespace(contradiction=contradiction)
 
 
 def mapped(sizes: tuple[int, ...], contradiction: str = "") -> Mapped:

@@ -11,7 +11,7 @@ import pytest
 from aeromatch_cli.data import Image
 from aeromatch_cli.files import write_text
 from aeromatch_cli.formats.tables import images_text
-from aeromatch_cli.stages.naming import facts_named, item_named, names_on_file
+from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.workspace import Workspace
 
@@ -25,10 +25,10 @@ def test_items_are_images_pairs_or_something_else() -> None:
     assert item_named("mapping", NAMES) == "mapping"
 
 
-def test_facts_have_names_as_keys_and_values() -> None:
+def test_results_have_names_as_keys_and_values() -> None:
     facts = {"outside": {"b_jpg": "blurred"}, "groups": [{"registered": ["b_jpg", "flight_a_jpg"], "points": 3}],
              "images": 2, "remarks": ["of b_jpg nothing"], "sigma": None}  # fmt: skip
-    assert facts_named(facts, NAMES) == {
+    assert with_names(facts, NAMES) == {
         "outside": {"b b.jpg": "blurred"}, "groups": [{"registered": ["b b.jpg", "flight/a.jpg"], "points": 3}],
         "images": 2, "remarks": ["of b_jpg nothing"], "sigma": None,
     }  # fmt: skip

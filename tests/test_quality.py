@@ -6,21 +6,21 @@ from copy import deepcopy
 from typing import Any
 
 import pytest
+from make_results import filled
 
-from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain, without_units
+from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
 }}  # fmt: skip
 GROUP: dict[str, Any] = {
-    "kind": "positions", "images": 12, "sigma_px": 0.3, "mounts": {}, "flights": [], "control": {},
+    "kind": "positions", "images": 12, "sigma_px": 0.3, "mounts": {}, "flights": [],
     "positions": {
         "images": 12, "used": 12, "wrong": [], "rms_m": [0.02, 0.02, 0.03], "rms_sigmas": [1.0, 1.0, 1.0],
         "stated_m": [0.02, 0.02, 0.03], "factors": [1.0, 1.0],
     },
     "calibration": {"camera_1": CALIBRATED},
-    "heights": {"sigma_m": 0.05, "bowl_m": 0.06, "tilt_m": 0.03, "reach_m": 100.0, "pixel_m": 0.03,
-                "points": []},
+    "heights": {"metric": True, "sigma": 0.05, "bowl": 0.06, "tilt": 0.03, "reach": 100.0, "pixel": 0.03},
 }  # fmt: skip
 ADJUSTED: dict[str, Any] = {
     "images": 12, "points": 3000, "track_length": 3.4, "held_by_pairs": 0, "reprojection_error_px": 0.3,
@@ -30,11 +30,11 @@ ADJUSTED: dict[str, Any] = {
 
 
 def judged_with(group: dict[str, Any] | None = None, **evidence: Any) -> Quality:
-    """The sound block with changed facts. group: of its only group, evidence: `adjust` and fields of `Evidence`."""
+    """The sound block with changes. group: of its only group, evidence: `adjust` and fields of `Evidence`."""
     adjusted = deepcopy(ADJUSTED) | evidence.pop("adjust", {})
     if group is not None:
         adjusted["groups"] = [deepcopy(GROUP) | group]
-    return judged(Evidence(**{"images": 12, "adjust": adjusted, "components": [12], "refined": True, **evidence}))
+    return judged(filled(Evidence, {"images": 12, "adjust": adjusted, "components": [12], "refined": True, **evidence}))
 
 
 def found(quality: Quality, what: str) -> Finding:
@@ -110,10 +110,10 @@ def test_a_sound_block_is_good_and_every_criterion_has_its_number() -> None:
         ({"group": lens(b1=[0.3, 0.1, 0.0, 0.6])}, "affinity", 0.5, "good"),
         ({"group": lens(readout_s=[0.03, 0.001, 0.0, 0.03])}, "rolling shutter", 0.03, "good"),
         ({"group": lens(readout_s=[0.5, 0.001, 0.0, 0.03])}, "rolling shutter", 0.5, "doubtful"),
-        ({"group": heights(bowl_m=0.3)}, "bowl", 10.0, "doubtful"),
-        ({"group": heights(sigma_m=0.3)}, "heights", 10.0, "doubtful"),
-        ({"group": heights(sigma_m=9.0) | positions(stated_m=[5.0] * 3)}, "heights", 300.0, "good"),
-        ({"group": heights(tilt_m=5.0)}, "tilt", 2.862, "doubtful"),
+        ({"group": heights(bowl=0.3)}, "bowl", 10.0, "doubtful"),
+        ({"group": heights(sigma=0.3)}, "heights", 10.0, "doubtful"),
+        ({"group": heights(sigma=9.0) | positions(stated_m=[5.0] * 3)}, "heights", 300.0, "good"),
+        ({"group": heights(tilt=5.0)}, "tilt", 2.862, "doubtful"),
         ({"group": flight(step_m=14.9)}, "step of heights", 14.9 / 0.03, "doubtful"),
         ({"group": flight(shift_x=[1.0, 0.01])}, "shift of a flight", 50.0, "doubtful"),
         ({"adjust": {"control": CONTROL}, "group": {"control": INSIDE}}, "check points", 8.839, "bad"),
@@ -170,7 +170,7 @@ def test_parts_that_share_no_points_are_as_exact_as_their_positions() -> None:
 def test_a_block_of_unknown_tilt_does_not_tell_the_principal_point(name: str, verdict: str) -> None:
     group = lens(**{name: [1100.0, 1.0, 1000.0, 10.0]})
     assert judged_with(group=group).verdict == "bad"
-    quality = judged_with(group=group | heights(tilt_m=5.0))
+    quality = judged_with(group=group | heights(tilt=5.0))
     assert found(quality, "calibration").level == quality.verdict == verdict
 
 
@@ -198,17 +198,17 @@ def test_flights_that_scatter_as_much_as_they_lie_apart_are_not_apart() -> None:
 
 
 def test_a_block_that_nothing_ties_to_the_ground_has_a_shape_only() -> None:
-    quality = judged_with(group={"kind": "level", "positions": None}, adjust={"positions_given": 0, "residuals": {}})
+    quality = judged_with(group={"kind": "level", "positions": None}, adjust={"positions_given": 0, "residuals": None})
     assert quality.verdict == "doubtful"
     assert quality.faults[0].sentence.startswith("shape only")
     assert "angles: none are given" in quality.unchecked
     assert quality.unchecked.count("positions: none are given") == 1
 
 
-@pytest.mark.parametrize(("inside", "verdict"), [({}, "doubtful"), (INSIDE | {"held_out_rms_m": [0.02] * 3}, "good")])
-def test_control_points_hold_a_block_only_where_they_took_part(inside: dict[str, Any], verdict: str) -> None:
+@pytest.mark.parametrize(("inside", "verdict"), [(None, "doubtful"), (INSIDE | {"held_out_rms_m": [0.02] * 3}, "good")])
+def test_control_points_hold_a_block_only_where_they_took_part(inside: dict[str, Any] | None, verdict: str) -> None:
     group = {"kind": "level", "positions": None, "control": inside}
-    quality = judged_with(group=group, adjust={"positions_given": 0, "residuals": {}, "control": CONTROL})
+    quality = judged_with(group=group, adjust={"positions_given": 0, "residuals": None, "control": CONTROL})
     assert quality.verdict == verdict
     assert [one.what for one in quality.faults] == ["ground"] * (verdict == "doubtful")
     assert quality.unchecked.count("positions: none are given") == 1
@@ -228,7 +228,7 @@ def test_control_points_that_were_left_out_are_good_where_they_agree(without_m: 
 def test_flights_are_named_once_and_large_numbers_have_no_powers_of_ten() -> None:
     flights = {"flights": [{"flight": "flight 2", "images": 6, "step_m": 14.93}]}
     assert judged_with(group=flights).faults[0].sentence.startswith("heights of flight 2 (6 images) lie 14.9 m")
-    sentence = found(judged_with(group=heights(bowl_m=112.0)), "bowl").sentence
+    sentence = found(judged_with(group=heights(bowl=112.0)), "bowl").sentence
     assert "(112 m)" in sentence
     assert [plain(value) for value in (112.3, 9.99, 2.86, 0.034)] == ["112", "10", "2.9", "0.034"]
 
@@ -240,16 +240,16 @@ def test_positions_of_which_none_is_used_are_bad() -> None:
 
 
 def test_lengths_of_a_frame_without_metres_are_no_metres() -> None:
-    known = heights(bowl_m=0.3)["heights"]
-    for own, metres in ((known, True), (without_units(known), False)):
-        group = {"kind": "level", "positions": None, "heights": own}
+    known = heights(bowl=0.3)["heights"]
+    for metric in (True, False):
+        group = {"kind": "level", "positions": None, "heights": known | {"metric": metric}}
         bowl = found(judged_with(group=group, adjust={"positions_given": 0, "ground_pixel_m": None}), "bowl")
         assert bowl.value == pytest.approx(10.0)
-        assert ("0.3 m" in bowl.sentence) is metres
+        assert ("0.3 m" in bowl.sentence) is metric
 
 
 def test_what_json_gets_is_plain() -> None:
-    facts = judged_with(group=heights(bowl_m=0.3)).as_facts()
+    facts = judged_with(group=heights(bowl=0.3)).as_facts()
     assert facts["verdict"] == "doubtful"
     assert facts["findings"][0] == {
         "what": "bowl", "value": 10.0, "limit": 5.0, "level": "doubtful",

@@ -167,7 +167,7 @@ def test_tie_points_are_nearer_to_their_exact_places(done_site: Site, rendered: 
                 errors[name].append(truth.errors(*(images[i].name for i in ids), *points)[0])
     medians = {name: float(np.nanmedian(np.concatenate(found))) for name, found in errors.items()}
     assert medians["measured"] < 0.7 * medians["detected"], medians
-    facts = json.loads(work.stage_report("refine").read_text())["facts"]
+    facts = json.loads(work.stage_report("refine").read_text())["result"]
     assert facts["measured"] > 0.8 * facts["keypoints"] > 0
     with sqlite3.connect(work.export("colmap") / "database.db") as database:
         query = "SELECT images.name, rows, cols, data FROM keypoints JOIN images USING (image_id)"
@@ -184,7 +184,7 @@ def test_without_refinement_tie_points_stay_where_the_detector_put_them(done_sit
     assert not list(work.refined_files.parent.glob("*.npy"))
     outcome = done_site("run", "--set", "refine=none")
     assert outcome.code == 0, outcome.stderr
-    assert outcome.facts["stages"]["refine"]["facts"]["measured"] is None
+    assert outcome.facts["stages"]["refine"]["result"]["measured"] is None
     assert not work.refined_files.parent.exists()
     for image in read_images(work.images):
         np.testing.assert_array_equal(final(work)(image.image_id), read_keypoints(work.features(image.image_id))[0])

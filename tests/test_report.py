@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from make_results import filled
 from markupsafe import escape
 from PIL import Image as PilImage
 from read_html import Structure, shapes
@@ -28,6 +29,7 @@ from aeromatch_cli.report.gathering import Gathered, gather
 from aeromatch_cli.report.pair_viewer import pair_table
 from aeromatch_cli.report.previews import chosen_previews
 from aeromatch_cli.report.rows import ImageRow, PairRow, stage_rows
+from aeromatch_cli.results.stages import FilterResult, OrientResult, PairsResult, RefineResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace
@@ -128,14 +130,16 @@ def full(tmp_path: Path) -> Context:
         raw = [MatchEntry(e.image_id1, "print", "nearest", matches(e.matches_in)) for e in entries]
         write_atomically(result.workspace.matches(image_id), lambda s, r=raw: write_match_row(s, r))
     first = StageReport("pairs", items=5, done=5)
-    first.facts = {"summary": ["flying height    100 m"], "warnings": ["altitudes look relative"], "images": 4}
+    first.result = filled(
+        PairsResult, summary=["flying height    100 m"], warnings=["altitudes look relative"], images=4
+    )
     first.write(result.workspace)
     StageReport("extract", items=5, done=4, failures=[("broken.png", "cut <off> & empty")]).write(result.workspace)
     judged = StageReport("filter", items=5, done=4)
-    judged.facts = {"verified_matches": 80}
+    judged.result = filled(FilterResult, verified_matches=80)
     judged.write(result.workspace)
     oriented = StageReport("orient", items=4, done=4)
-    oriented.facts = {"wrong_attitudes": {"c": 178.4}}
+    oriented.result = filled(OrientResult, wrong_attitudes={"c": 178.4})
     oriented.write(result.workspace)
     return result
 
@@ -351,23 +355,23 @@ def test_shards_are_summed_per_stage(tmp_path):
     for index in (1, 2):
         path = one.workspace.stage_report("match", f"{index}-of-2")
         counts = {"seconds": 1.5, "items": 10, "done": 9, "skipped": 0, "failed": 1}
-        write_json(path, {"stage": "match", **counts, "facts": {}, "failures": []})
+        write_json(path, {"stage": "match", **counts, "result": None, "failures": []})
         write_json(
             one.workspace.step("first", "first").stage_report("match", f"{index}-of-2"),
-            {"stage": "match", **counts, "facts": {}, "failures": []},
+            {"stage": "match", **counts, "result": None, "failures": []},
         )
     (row,) = stage_rows(one.workspace)
     # Of the shards' own folders and of the steps of a cascade.
     assert (row.label, row.seconds, row.items, row.done, row.failed) == ("match (2 shards)", 6.0, 40, 36, 4)
 
 
-def test_facts_of_stages_are_told_in_words_and_internals_are_not(tmp_path):
+def test_results_of_stages_are_told_in_words_and_internals_are_not(tmp_path):
     workspace = Workspace(tmp_path)
     counts = {"seconds": 1.0, "items": 8, "done": 8, "skipped": 0, "failed": 0, "failures": []}
-    facts = {"images_matched": 8, "stays": False, "frame": "world", "stopped": "", "points": 5925}
-    write_json(workspace.stage_report("orient"), {"stage": "orient", **counts, "facts": facts})
-    facts = {"keypoints": 25068, "measured": 23385, "shift_px": 0.2436}
-    write_json(workspace.stage_report("refine"), {"stage": "refine", **counts, "facts": facts})
+    oriented = filled(OrientResult, images_matched=8, frame="world", points=5925)
+    write_json(workspace.stage_report("orient"), {"stage": "orient", **counts, "result": oriented.as_json()})
+    refined = RefineResult(keypoints=25068, measured=23385, shift_px=0.2436)
+    write_json(workspace.stage_report("refine"), {"stage": "refine", **counts, "result": refined.as_json()})
     assert [row.facts for row in stage_rows(workspace)] == [
         "8 images matched in the first pass, 5,925 points",
         "23,385 keypoints measured, 25,068 matched, moved by 0.24 px (median)",

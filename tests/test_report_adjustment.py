@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from make_results import filled
 from test_report import full, page_of  # noqa: F401
 
 from aeromatch_cli.data import AdjustedBlock, Camera
 from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.report.adjustment import Adjustment, adjustment_notices, adjustment_rows
+from aeromatch_cli.results.stages import AdjustResult, OrientResult
 from aeromatch_cli.stages.stage_report import StageReport
 
 
 def test_an_adjustment_of_earlier_matches_is_left_out_and_named(full):  # noqa: F811
     told = StageReport("adjust", items=4, done=4)
-    told.facts = {"images": 4, "points": 77, "remarks": ["a remark"], "outside": {}, "control": None}
+    told.result = AdjustResult(images=4, points=77, remarks=["a remark"])
     told.write(full.workspace)
     page = page_of(full)
     assert "Adjustment and points are older than the matches" in page
@@ -25,26 +27,26 @@ def test_an_adjustment_of_earlier_matches_is_left_out_and_named(full):  # noqa: 
 def test_control_points_that_say_nothing_are_named():
     control = {"points": 4, "control": 4, "check": 0, "not_measured_in_two_images": ["p3", "p4"], "doubtful": [],
                "rays_do_not_meet": ["p2"], "control_rmse_m": None, "check_rmse_m": None}  # fmt: skip
-    (notice,) = adjustment_notices([], Adjustment({"control": control}))
+    (notice,) = adjustment_notices([], Adjustment(filled(AdjustResult, control=control)))
     assert "fewer than 3 control points are measured in two oriented images" in notice.text
     assert "rays do not meet of p2" in notice.text
 
 
 def test_a_frame_of_its_own_has_no_metres(full):  # noqa: F811
     oriented = StageReport("orient", items=4, done=4)
-    oriented.facts = {"frame": "own"}
+    oriented.result = filled(OrientResult, frame="own")
     oriented.write(full.workspace)
     page = page_of(full)
     assert "x, arbitrary units" in page
     assert "metres" not in page.split('id="settings"')[0].replace("no metre", "")
 
 
-def test_cameras_count_from_the_corner_of_the_first_pixel_in_facts_and_on_the_page():
+def test_cameras_count_from_the_corner_of_the_first_pixel_in_files_and_on_the_page():
     """A principal point in the middle of 800 x 600 px is 400, 300 there, and 399.5, 299.5 in the workspace."""
     camera = Camera("PINHOLE", 800, 600, (700.0, 700.0, 399.5, 299.5))
-    facts = block_figures(replace(AdjustedBlock.empty(), cameras={"1": camera}), [], [])
-    assert facts["cameras"] == {"1": ["PINHOLE", 800, 600, [700.0, 700.0, 400.0, 300.0]]}
-    told = facts | {"points": 1, "reprojection_error_px": 0.2, "control": None}
+    figures = block_figures(replace(AdjustedBlock.empty(), cameras={"1": camera}), [], [])
+    told = AdjustResult(**figures | {"points": 1, "reprojection_error_px": 0.2})
+    assert told.as_json()["cameras"] == {"1": ["PINHOLE", 800, 600, [700.0, 700.0, 400.0, 300.0]]}
     assert adjustment_rows(Adjustment(told))[-1] == (
         "Cameras after the adjustment (cx, cy from the corner of the first pixel, as in COLMAP)",
         "1: PINHOLE, 800 x 600 px, 700, 700, 400, 300",
@@ -56,10 +58,9 @@ def test_check_points_alone_are_told_of_the_block_as_it_is():
                "control_rmse_m": None, "check_rmse_m": None, "residuals": {"p1": [2.0, 3.0, 4.0]}}  # fmt: skip
     inside = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": True,
               "held_out_rms_m": [2.0, 3.0, 4.0], "without_rms_m": [2.0, 3.0, 4.0]}  # fmt: skip
-    facts = {"images": 9, "points": 1, "track_length": 3.0, "reprojection_error_px": 0.2, "sigma_position_m": None,
-             "sigma_angle_deg": None, "control": control, "groups": [{"control": inside}]}  # fmt: skip
-    assert adjustment_rows(Adjustment(facts))[-1] == (
+    found = filled(AdjustResult, images=9, points=1, control=control, groups=[{"control": inside}])
+    assert adjustment_rows(Adjustment(found))[-1] == (
         "Control: 0 control points, 4 check points",
         "the block as it is: RMSE at check points x 2.000, y 3.000, z 4.000 m",
     )
-    assert adjustment_notices([], Adjustment(facts)) == []
+    assert adjustment_notices([], Adjustment(found)) == []

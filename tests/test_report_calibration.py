@@ -7,22 +7,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from make_results import filled
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import project
-from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.adjustment import surveyed_rows
 from aeromatch_cli.report.calibration import camera_sections, heights_section
+from aeromatch_cli.results.adjustment import Control
+from aeromatch_cli.results.stages import AdjustResult
 
 CAMERA = Camera("PINHOLE", 800, 600, (700.0, 700.0, 399.5, 299.5))
 IMAGES = [Image(i, f"{i}.jpg", 800, 600, "1") for i in "ab"]
 KNOWN = {"f": 690.0, "cx": 399.5, "cy": 299.5}
-FACTS: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
+ADJUSTED: dict[str, Any] = {"ground_pixel_m": 0.1, "groups": [{
     "calibration": {"1": {"images": 2, "correlations": [["f", "k1", -0.95]], "parameters": {
         "f": [700.0, 0.5, 690.0, 20.0], "cx": [400.0, 0.0, 400.0, 16.0], "cy": [300.0, 0.0, 300.0, 16.0],
         "k1": [0.0, 0.001, 0.0, 0.05],
     }}},
-    "heights": {"sigma_m": 0.15, "bowl_m": 0.4, "tilt_m": 0.2, "reach_m": 90.0, "pixel_m": 0.1,
+    "heights": {"metric": True, "sigma": 0.15, "bowl": 0.4, "tilt": 0.2, "reach": 90.0, "pixel": 0.1,
                 "points": [[0.0, 0.0, 0.1], [50.0, 10.0, 0.15], [20.0, 60.0, 0.2]]},
 }]}  # fmt: skip
 
@@ -43,7 +45,7 @@ def block(off_px: FloatArray) -> tuple[AdjustedBlock, dict[str, FloatArray]]:
 
 def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
     adjusted, keypoints = block(np.zeros(2))
-    (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
+    (section,) = camera_sections(filled(AdjustResult, ADJUSTED), adjusted, IMAGES, keypoints.__getitem__)
     assert section.words == "2 images, PINHOLE, 800 x 600 px"
     assert section.rows[0] == ("f, focal length", "px", "700.00", "0.50", "690.00", "20.00", "+0.5", "k1 -0.95")
     assert section.rows[1] == ("cx, principal point", "px", "400.00", "held", "400.00", "16.00", "", "")
@@ -51,13 +53,14 @@ def test_a_camera_has_its_parameters_beside_what_was_known() -> None:
 
 def test_a_setting_that_holds_a_parameter_is_named() -> None:
     adjusted, keypoints = block(np.zeros(2))
-    (section,) = camera_sections(FACTS | {"held_by": {"cx": "adjust.hold"}}, adjusted, IMAGES, keypoints.__getitem__)
+    found = filled(AdjustResult, ADJUSTED, held_by={"cx": "adjust.hold"})
+    (section,) = camera_sections(found, adjusted, IMAGES, keypoints.__getitem__)
     assert [row[3] for row in section.rows] == ["0.50", "held by adjust.hold", "held", "0.001000"]
 
 
 def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
     adjusted, keypoints = block(np.array([0.3, -0.4]))
-    (section,) = camera_sections(FACTS, adjusted, IMAGES, keypoints.__getitem__)
+    (section,) = camera_sections(filled(AdjustResult, ADJUSTED), adjusted, IMAGES, keypoints.__getitem__)
     (moved, moved_words), (remaining, remaining_words) = section.fields
     # 10 px more in a focal length of 700 px move the middle of the outermost cell, 465.0 px away, by 10 / 700 of that.
     assert float(re.findall(r"up to ([\d.]+) px", moved_words)[0]) == pytest.approx(465.0 * 10 / 700, abs=0.06)
@@ -66,8 +69,9 @@ def test_fields_show_what_the_calibration_does_and_what_remains() -> None:
 
 
 def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() -> None:
-    [group] = FACTS["groups"]
-    world, own = heights_section(FACTS), heights_section({"groups": [{"heights": without_units(group["heights"])}]})
+    [group] = ADJUSTED["groups"]
+    in_own = {"heights": group["heights"] | {"metric": False}}
+    world, own = (heights_section(filled(AdjustResult, groups=[one])) for one in (group, in_own))
     assert world is not None
     assert own is not None
     assert "median 0.150 m (1.5 ground pixels)" in world.words
@@ -75,7 +79,7 @@ def test_expected_errors_of_heights_are_in_metres_only_where_there_are_metres() 
     assert "median 1.5 ground pixels" in own.words
     assert "metres" in world.plan
     assert "metres" not in own.plan
-    assert heights_section({"groups": []}) is None
+    assert heights_section(AdjustResult(images=0)) is None
 
 
 def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:
@@ -84,7 +88,7 @@ def test_surveyed_points_have_metres_pixels_and_sigmas() -> None:
         "point_sigmas_m": {"P1": [0.02, 0.02, 0.03], "P2": [0.02, 0.02, 0.03]}, "ground_pixel_m": 0.1,
         "image_residuals_px": {"P1": {"a": [0.3, -0.4], "b": [0.0, 0.0]}, "P2": {}},
     }  # fmt: skip
-    assert surveyed_rows({"control": control}) == [
+    assert surveyed_rows(filled(Control, control)) == [
         ("P1", "control", "+0.020", "-0.010", "+0.060", "0.6", "2.0", "2", "0.35"),  # of 0.5 and 0 px
         ("P2", "check", "+0.000", "+0.000", "+0.300", "3.0", "10.0", "0", ""),
     ]

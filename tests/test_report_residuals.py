@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Site
+from make_results import filled
 from test_export_colmap import Truth
 from test_exporters import contents, truth  # noqa: F401 - fixtures
 
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, FloatArray, PoseResidual
 from aeromatch_cli.report.figures import round_length
 from aeromatch_cli.report.residuals import residual_section
+from aeromatch_cli.results.adjustment import FlightCorrection, GroupResult
 from aeromatch_cli.strategies.exporters import EXPORTERS
 
 STRAIGHT_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -51,18 +53,20 @@ def test_the_table_has_root_mean_squares_in_metres_pixels_and_deviations() -> No
 
 def test_the_weights_of_positions_stand_beside_their_stated_accuracy() -> None:
     found = dict.fromkeys("abc", residual([0.0, 0.0, 0.2]))
-    small = {"positions": {"used": 2, "factors": [5.0, 5.0]}, "flights": [], "mounts": {}}
-    large = {"positions": {"used": 9, "factors": [1.84, 0.62]}, "flights": [], "mounts": {}}
+    small = filled(GroupResult, positions={"used": 2, "factors": [5.0, 5.0]})
+    large = filled(GroupResult, positions={"used": 9, "factors": [1.84, 0.62]})
     section = residual_section(adjusted(), found, NAMES, 0.1, [small, large])
     assert section is not None
     assert section.words.endswith(
         " By what they are off the adjustment weighs them with 1.8 times the stated standard deviations horizontally "
         "and 0.6 times vertically."
     )
-    shifted = residual_section(adjusted(), found, NAMES, 0.1, [large | {"flights": [{"flight": "A"}]}])
+    shifted = residual_section(
+        adjusted(), found, NAMES, 0.1, [large.model_copy(update={"flights": [filled(FlightCorrection, flight="A")]})]
+    )
     assert shifted is not None
     assert shifted.words.endswith(" What was found of flights and antennas is part of the residuals here.")
-    without = residual_section(adjusted(), found, NAMES, 0.1, [large | {"positions": None}])
+    without = residual_section(adjusted(), found, NAMES, 0.1, [large.model_copy(update={"positions": None})])
     assert without is not None
     assert "weighs them" not in without.words
 
@@ -123,7 +127,7 @@ def test_a_run_states_residuals_everywhere(site: Site) -> None:
     site.rewrite_poses(moved)
     outcome = site("run")
     assert outcome.code == 0
-    figures = outcome.facts["stages"]["adjust"]["facts"]["residuals"]
+    figures = outcome.facts["stages"]["adjust"]["result"]["residuals"]
     assert figures["positions"] == figures["images"] == 5
     own, exported = (site.work / folder / "residuals.csv" for folder in ("orientation", "export/colmap"))
     assert own.read_text() == exported.read_text()
@@ -132,7 +136,7 @@ def test_a_run_states_residuals_everywhere(site: Site) -> None:
     assert [row["image"] for row in rows] == site.names()
     rms_m = np.sqrt(np.mean([float(row["dx_m"]) ** 2 for row in rows]))
     assert figures["position_m_rms"][0] == pytest.approx(rms_m, rel=1e-3)
-    stated_px = outcome.facts["stages"]["adjust"]["facts"]["reprojection_error_px"]
+    stated_px = outcome.facts["stages"]["adjust"]["result"]["reprojection_error_px"]
     points = np.array([float(row["points"]) for row in rows])
     errors_px = np.array([float(row["error_px"]) for row in rows])
     assert (points @ errors_px) / points.sum() == pytest.approx(stated_px, rel=0.1)

@@ -100,26 +100,26 @@ def test_an_image_without_points_has_no_error() -> None:
 
 def test_figures_of_all_images() -> None:
     figures = residual_figures(made(), NAMES)
-    assert (figures["images"], figures["positions"], figures["rotations"]) == (3, 3, 2)
+    assert (figures.images, figures.positions, figures.rotations) == (3, 3, 2)
     rms_m = [np.sqrt(0.18 / 3.0), np.sqrt(0.32 / 3.0), np.sqrt(1.44 / 3.0)]
-    assert figures["position_m_rms"] == pytest.approx(rms_m, rel=1e-3)
-    assert figures["position_sigmas_rms"] == pytest.approx([2.0 * one for one in rms_m], rel=1e-3)
-    assert figures["position_m_median"] == pytest.approx([0.3, 0.4, 0.0])
-    assert figures["position_m_worst"] == ["one, a.jpg", pytest.approx(1.3)]
-    assert figures["rotation_deg_rms"] == pytest.approx([0.0, 0.0, np.sqrt(2.5)], rel=1e-3)
-    assert figures["rotation_deg_worst"] == ["one, a.jpg", pytest.approx(2.0)]
-    assert figures["error_px_median"] == pytest.approx(1.0, abs=1e-3)
-    assert figures["error_px_worst"] == ["one, a.jpg", pytest.approx(5.0, abs=1e-3)]
+    assert figures.position_m_rms == pytest.approx(rms_m, rel=1e-3)
+    assert figures.position_sigmas_rms == pytest.approx([2.0 * one for one in rms_m], rel=1e-3)
+    assert figures.position_m_median == pytest.approx([0.3, 0.4, 0.0])
+    assert figures.position_m_worst == ("one, a.jpg", pytest.approx(1.3))
+    assert figures.rotation_deg_rms == pytest.approx([0.0, 0.0, np.sqrt(2.5)], rel=1e-3)
+    assert figures.rotation_deg_worst == ("one, a.jpg", pytest.approx(2.0))
+    assert figures.error_px_median == pytest.approx(1.0, abs=1e-3)
+    assert figures.error_px_worst == ("one, a.jpg", pytest.approx(5.0, abs=1e-3))
 
 
 def test_figures_without_anything_given() -> None:
     adjusted, keypoints = block()
     figures = residual_figures(residuals_of(adjusted, {}, IMAGES, keypoints.__getitem__), NAMES)
-    assert figures["positions"] == 0
-    assert figures["position_m_rms"] is None
-    assert figures["rotation_deg_worst"] is None
-    assert figures["error_px_median"] == pytest.approx(1.0, abs=1e-3)
-    assert residual_figures({}, NAMES)["error_px_median"] is None
+    assert figures.positions == 0
+    assert figures.position_m_rms is None
+    assert figures.rotation_deg_worst is None
+    assert figures.error_px_median == pytest.approx(1.0, abs=1e-3)
+    assert residual_figures({}, NAMES).error_px_median is None
 
 
 def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:

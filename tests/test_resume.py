@@ -33,8 +33,8 @@ def verified(work: Path) -> dict[str, dict[str, bytes]]:
 
 def test_block_is_fully_connected(done_site):
     outcome = done_site("run")
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
-    assert outcome.facts["stages"]["filter"]["facts"]["verified_matches"] > 100 * PAIRS / 2
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
+    assert outcome.facts["stages"]["filter"]["result"]["verified_matches"] > 100 * PAIRS / 2
 
 
 def test_second_run_does_nothing_and_touches_nothing(done_site):
@@ -208,13 +208,13 @@ def test_a_wrong_attitude_is_corrected_once_and_the_second_run_does_nothing(done
     done_site.rewrite_poses(lambda rows: turned(rows, {1}))
     outcome = done_site("run")
     assert outcome.code == 0
-    facts = outcome.facts["stages"]["orient"]["facts"]
+    facts = outcome.facts["stages"]["orient"]["result"]
     assert facts["poses_from"] == "given poses"
     assert facts["corrected"] == [name]
     assert facts["wrong_attitudes"] == {name: pytest.approx(180, abs=2)}
     # The others keep their poses to the last bit: nothing of theirs is made again.
     assert kept_pairs(before, pair_prints(done_site)) == {pair for pair in before if image_id not in pair}
-    assert outcome.facts["stages"]["filter"]["facts"]["pairs"] == {"verified": PAIRS}
+    assert outcome.facts["stages"]["filter"]["result"]["pairs"] == {"verified": PAIRS}
     workspace = contents(done_site.work)
     assert done_site("run").done() == {}
     assert contents(done_site.work) == workspace
@@ -224,8 +224,8 @@ def test_every_verified_pair_is_exported_where_a_third_of_the_attitudes_is_wrong
     done_site.rewrite_poses(lambda rows: turned(rows, {0, 3}))
     outcome = done_site("run")
     assert outcome.code == 0
-    assert len(outcome.facts["stages"]["orient"]["facts"]["wrong_attitudes"]) == 2
-    verified = outcome.facts["stages"]["filter"]["facts"]["pairs"]["verified"]
+    assert len(outcome.facts["stages"]["orient"]["result"]["wrong_attitudes"]) == 2
+    verified = outcome.facts["stages"]["filter"]["result"]["pairs"]["verified"]
     assert verified == PAIRS
     assert len(contents(done_site.work)["export/colmap/database.db"]["two_view_geometries"]) == verified
     assert done_site("run").done() == {}

@@ -6,7 +6,8 @@ import numpy as np
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.images.views import render_view
-from aeromatch_cli.stages.simulate import ViewCost, cost_facts
+from aeromatch_cli.results.stages import ExtractResult
+from aeromatch_cli.stages.simulate import ViewCost, views_result
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.simulators.tilts import Tilts
 
@@ -20,15 +21,11 @@ def test_cost_is_counted_over_views() -> None:
     assert cost == ViewCost(4, 0.48)
 
 
-def test_facts_add_up_over_the_passes_of_a_command() -> None:
-    first = cost_facts([ViewCost(1, 2.0), ViewCost(3, 4.0)], {})
-    assert first == {
-        "images": 2,
-        "views": 4,
-        "view_megapixels": 6.0,
-        "views_per_image": 2.0,
-        "view_megapixels_per_image": 3.0,
-    }
-    both = cost_facts([ViewCost(5, 9.0)], {"keypoints": 77, **first})
-    assert (both["images"], both["views"], both["view_megapixels"]) == (3, 9, 15.0)
-    assert (both["views_per_image"], both["view_megapixels_per_image"]) == (3.0, 5.0)
+def test_views_add_up_over_the_passes_of_a_command() -> None:
+    first = views_result([ViewCost(1, 2.0), ViewCost(3, 4.0)])
+    assert (first.images, first.views, first.view_megapixels) == (2, 4, 6.0)
+    assert (first.views_per_image, first.megapixels_per_image) == (2.0, 3.0)
+    second = views_result([ViewCost(5, 9.0)])
+    both = ExtractResult(keypoints=77, **first.as_json()).plus(ExtractResult(keypoints=3, **second.as_json()))
+    assert (both.images, both.views, both.view_megapixels, both.keypoints) == (3, 9, 15.0, 80)
+    assert (both.views_per_image, both.megapixels_per_image) == (3.0, 5.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from make_results import filled
 from scipy.spatial.transform import Rotation
 from test_orientation import CAMERA, flight, limits, matches
 
@@ -15,6 +16,7 @@ from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.judgement import PairPoints
 from aeromatch_cli.orientation.mapping import Model
 from aeromatch_cli.orientation.soundness import rigid_groups, sound_part
+from aeromatch_cli.results.stages import MappedModel
 
 
 def model_of(poses: dict[str, Pose], kind: str = "level") -> Model:
@@ -23,8 +25,7 @@ def model_of(poses: dict[str, Pose], kind: str = "level") -> Model:
         centers_m={i: pose.center_m for i, pose in poses.items()},
         cameras={"a": CAMERA},
         points_m=np.zeros((1, 3)),
-        kind=kind,
-        figures={"images": len(poses)},
+        figures=filled(MappedModel, kind=kind, images=len(poses)),
     )
 
 
@@ -45,7 +46,7 @@ def test_images_in_wrong_places_leave_the_model() -> None:
     part = sound_part(model_of(moved), pairs, *limits(truth), {})
     assert part is not None
     assert part.rotations.keys() == truth.keys() - {"i00", "i23"}
-    assert part.figures["images"] == len(truth) - 2
+    assert part.figures.images == len(truth) - 2
 
 
 def test_of_two_halves_that_do_not_fit_the_larger_stays() -> None:

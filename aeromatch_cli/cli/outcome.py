@@ -7,97 +7,18 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import reduce
+from operator import or_
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, create_model
 
-
-class Facts(BaseModel):
-    """Figures of a stage; further ones may be there, and docs/workspace.md has them all (`reports/<stage>.json`)."""
-
-    model_config = ConfigDict(extra="allow")
-
-
-class OrientFacts(Facts):
-    """Of `orient`: what the pictures say of the poses."""
-
-    poses_from: str | None = Field(None, description="Where the poses of the block come from, in words.")
-    frame: Literal["world", "own"] | None = Field(None, description="own: no position was given; metres mean nothing.")
-    wrong_attitudes: dict[str, float] = Field({}, description="Image -> degrees off.")
-    wrong_positions: dict[str, float] = Field({}, description="Image -> metres off.")
-    outside: list[str] = Field([], description="Images that the pictures could not orient.")
-
-
-class PairsFacts(Facts):
-    """Of `pairs`: the block as it was read."""
-
-    images: int | None = Field(None, description="Images of the block.")
-    summary: list[str] = Field([], description="What is printed of the block, line by line.")
-    block: dict[str, Any] = Field(
-        {},
-        description="The same in figures: crs, gsd_m, flying_height_m, pairs ... With metric: false the scale is "
-        "arbitrary, and lengths are null.",
-    )
-    warnings: list[str] = Field([], description="What a person should look at.")
-
-
-class MatchFacts(Facts):
-    """Of `match`."""
-
-    matches: int | None = Field(None, description="Before verification, of the pairs of this run.")
-    settled_by: dict[str, int] = Field({}, description="With a cascade: step -> pairs that needed nothing after it.")
-    not_settled: int | None = Field(None, description="With a cascade: pairs left with few matches, or gaps.")
-
-
-class FilterFacts(Facts):
-    """Of `filter`: the two-view verification."""
-
-    pairs: dict[str, int] = Field({}, description="State (verified, rejected, not verifiable) -> pairs.")
-    verified_matches: int | None = Field(None, description="Matches of the verified pairs.")
-    components: list[int] = Field([], description="Sizes of the groups of images that verified pairs connect.")
-    weakly_tied: list[str] = Field([], description="Images with few verified matches.")
-    unconnected: list[str] = Field([], description="Images with no verified match.")
-
-
-class AdjustFacts(Facts):
-    """Of `adjust`: the bundle adjustment."""
-
-    images: int | None = Field(None, description="Oriented images.")
-    points: int | None = Field(None, description="Points in space.")
-    track_length: float | None = Field(None, description="Images per point, mean.")
-    reprojection_error_px: float | None = Field(None, description="Mean, pixels.")
-    sigma_position_m: float | None = Field(None, description="Of the positions, metres, median; null without metres.")
-    sigma_angle_deg: float | None = Field(None, description="Of the attitudes, degrees, median.")
-    groups: list[dict[str, Any]] = Field(
-        [], description="Of each group: positions, flights, mounts, calibration, heights, control; see adjusted.json."
-    )
-    outside: dict[str, str] = Field({}, description="Images without adjusted pose -> reason.")
-    residuals: dict[str, Any] = Field(
-        {}, description="Adjusted less given positions and attitudes: rms, median, worst image; see residuals.csv."
-    )
-
-
-class RefineFacts(Facts):
-    """Of `refine`: tie points measured anew."""
-
-    keypoints: int | None = Field(None, description="Matched keypoints, without those that stand for their points.")
-    measured: int | None = Field(None, description="Those of them that were measured.")
-    shift_px: float | None = Field(None, description="By how much they were moved, median, pixels.")
-
-
-class ConsistencyFacts(Facts):
-    """Of `consistency`: the final matches."""
-
-    verified_matches: int | None = Field(None, description="Matches that are exported.")
-    dropped_matches: int | None = Field(None, description="Matches that contradict the adjusted block or are unlikely.")
-    points: int | None = Field(None, description="Points of the adjusted block.")
-    points_left: int | None = Field(None, description="Those of them that the exported matches hold.")
-    expected_right: float | None = Field(None, description="Share (0-1) of the exported ones that is right to 3 px.")
-    doubtful: list[str] = Field([], description="Images that the block seems to hold in a wrong place.")
+from aeromatch_cli.results.stages import RESULTS
 
 
 class StageOutcome(BaseModel):
-    """One stage. items: images or pairs; done: made now; skipped: up to date before."""
+    """One stage. items: images or pairs; done: made now; skipped: up to date before. result: null where the stage has
+    found nothing, such as where no orientation is asked for."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -106,55 +27,16 @@ class StageOutcome(BaseModel):
     skipped: int
     failed: int
     seconds: float
-    facts: Facts
+    result: Any
 
 
-class Orient(StageOutcome):
-    facts: OrientFacts
-
-
-class Pairs(StageOutcome):
-    facts: PairsFacts
-
-
-class Match(StageOutcome):
-    facts: MatchFacts
-
-
-class Filter(StageOutcome):
-    facts: FilterFacts
-
-
-class Refine(StageOutcome):
-    facts: RefineFacts
-
-
-class Adjust(StageOutcome):
-    facts: AdjustFacts
-
-
-class Consistency(StageOutcome):
-    facts: ConsistencyFacts
-
-
-class Stages(BaseModel):
-    """The stages that the command has run, in order."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    orient: Orient | None = None
-    pairs: Pairs | None = None
-    enhance: StageOutcome | None = None
-    simulate: StageOutcome | None = None
-    extract: StageOutcome | None = None
-    match: Match | None = None
-    filter: Filter | None = None
-    refine: Refine | None = None
-    adjust: Adjust | None = None
-    consistency: Consistency | None = None
-    export: StageOutcome | None = None
-    report: StageOutcome | None = None
-    steps: dict[str, dict[str, StageOutcome]] = Field({}, description="Of a shard: what its cascade's steps did.")
+def _stages() -> type[BaseModel]:
+    """The stages that a command has run, in order; `steps`: what the steps of a shard's cascade did."""
+    fields: dict[str, Any] = {"steps": (dict[str, dict[str, StageOutcome]], {})}
+    for stage, kind in RESULTS.items():
+        result: Any = (kind | None, ...)
+        fields[stage] = (create_model(stage.capitalize(), __base__=StageOutcome, result=result) | None, None)
+    return create_model("Stages", __config__=ConfigDict(extra="forbid"), **fields)
 
 
 class Line(BaseModel):
@@ -209,7 +91,7 @@ class Outcome(Line):
     lost: dict[str, str] | None = Field(
         None, description="After `run` and `adjust`: images that the result does not hold -> reason; as in lost.csv."
     )
-    stages: Stages = Field(description="What each stage did.")
+    stages: Any = Field(description="What each stage did.")
 
 
 class Checked(Line):
@@ -327,12 +209,17 @@ class Begun(Line):
     found: list[str]
 
 
-AnyOutcome = Outcome | Checked | Evaluated | Rendered | Weights | Shown | Compared | Configured | Listed | Begun | Error
+def any_outcome() -> TypeAdapter[Any]:
+    """What the line of any command is checked by."""
+    stages = (_stages(), Field(description="What each stage did."))
+    outcome = create_model("Outcome", __base__=Outcome, stages=stages)
+    kinds = (outcome, Checked, Evaluated, Rendered, Weights, Shown, Compared, Configured, Listed, Begun, Error)
+    return TypeAdapter(reduce(or_, kinds))
 
 
 def schema() -> str:
     """JSON Schema (draft 2020-12) of the line."""
-    found = {"title": "aeromatch --json", **TypeAdapter(AnyOutcome).json_schema()}
+    found = {"title": "aeromatch --json", **any_outcome().json_schema()}
     return json.dumps(found, indent=1) + "\n"
 
 

@@ -34,7 +34,7 @@ The resolved configuration, every default included. `aeromatch run WORK/config.y
 
 Written at the end of a run without a failure: `settings`, `program`, `inputs` and `files` are digests of the settings,
 of the program and its libraries, and of the size and times of every input and every file of the workspace; `stages`:
-items of each stage, and its facts where no report holds them. Where all are as they were, `aeromatch run` says at once
+items of each stage, and its result where no report holds it. Where all are as they were, `aeromatch run` says at once
 that everything is up to date; anything else is looked into. May be deleted.
 
 ### images.csv
@@ -67,19 +67,7 @@ What `orient` found. `cameras.csv` and `poses.csv` of the workspace are what all
 
 - `fingerprint`: of the inputs and settings. `images`: fingerprint of what was given of every image. `settings`: of the
   rest. `files`: SHA-256 of the other files.
-- `facts`: `poses_from` (`given poses`: they explain the matches; `pictures`: a mapper oriented the block),
-  `images_matched`, `positions_given`, `given_poses_explained` (images), `corrected` (images whose given pose was
-  replaced), `points`,
-  `models` (of `pictures`: `images`, `points`, `track_length`, `reprojection_error_px`, `kind`,
-  `turned_back`: images that the mapper had turned over), `calibrated` (cameras whose
-  parameters a mapper found), `stopped` (why mapping failed; it is tried again), `by_one_pair`
-  (images placed by one pair and their position), `further_first_passes` (where the block fell into parts, or positions
-  did not fit: `with` what, images of the largest model before, `images`, and of the new one, `images_then`, and whether
-  that was `used`), `wrong_attitudes`
-  (image_id -> degrees), `wrong_positions` (image_id -> metres), `outside` (images that could not be oriented), `frame`
-  (`world`, or `own`: nothing ties it to the CRS, which is `local` then), `focal_lengths` (camera_id -> the given one
-  and the one found, pixels, where they differ by more than 2 %), `stays` (whether wrong given poses were kept,
-  orient=given), `remarks` (what is wrong with given positions or angles, sentences).
+- `result`: see [Result of orient](#result-of-orient).
 - `failed`: images and rows of pairs that the first pass had to leave out; once they can be read again, `orient` starts
   anew.
 - `tied`: pairs that the first pass verified. `similar`: pairs that look alike, where they were asked for.
@@ -118,55 +106,7 @@ deviations that were stated, each axis in its own. All are empty where nothing w
 ### orientation/adjusted.json
 
 - `fingerprint`; `files`: SHA-256 of `adjusted.npz`, `orientation.csv` and `residuals.csv`.
-- `facts`: `images`, `points`, `track_length` (images per point, mean), `held_by_pairs` (images with fewer than 20
-  points that three images see), `tied_parts` (sizes of the parts within which pairs of images that share 20 points
-  connect them), `reprojection_error_px` (mean), `ground_pixel_m` (what a pixel is on the ground,
-  median, null in a frame without metres), `reduced` (stored pixels in a pixel of the pictures that keypoints were found
-  in), `positions_given` (images), `sigma_position_m` (median over the images whose frame has metres, else null),
-  `sigma_angle_deg` (median), `groups` (see below), `outside` (image_id -> why it is not oriented), `cameras` (camera_id
-  -> model, width, height, parameters as in a camera file: cx and cy from the corner of the first pixel), `remarks`,
-  `held_by` (parameter of cameras -> setting that holds it), `readout_not_tried` (why the read-out time of a rolling
-  shutter was no unknown, null where it was), `control` (errors at ground control points, or null, see below),
-  `residuals`: of `residuals.csv`, for each of `position_m`, `position_sigmas`, `rotation_deg`, `rotation_sigmas` the
-  root mean squares (`_rms`) and medians of absolute values (`_median`) along x, y and z, and the image with the longest
-  one (`_worst`: name, value), null where nothing was given; `positions`, `rotations`: how many were compared;
-  `error_px_median`, `error_px_worst`: of the images' means.
-- Each of `groups`: `kind`, `images`, `points`, `track_length`, `reprojection_error_px`, `registered` (image_ids that
-  were tied to it by its points) and, where it was adjusted:
-  - `sigma_px`: standard deviation of a coordinate of an image point, by residuals and redundancy.
-  - `positions`, null without any: `images` that have one, `used`, `wrong` (image_ids of those that are not used),
-    `rms_m` and `rms_sigmas` (root mean squares of measured less adjusted ones along x, y, z, in metres and in stated
-    standard deviations, after what was found of flights and antennas), `stated_m` (median standard deviations),
-    `factors` (by which they are less exact than stated, horizontally and vertically, as the adjustment weighs them),
-    `flights` (`flight`, `images`, `mean_m` and `scatter_m`: mean and standard deviation of the differences of each).
-  - `flights`: those of which something was found: `flight` (its name, empty of images of none), `images`, `step_m` (of
-    its heights above those of the flight of most images, taken out before), and of `shift_x`, `shift_y`, `shift_z`
-    (metres), `lag_s` (seconds by which positions lag behind exposures), `slope_x` and `slope_y` (by how much heights of
-    positions rise to the east and north, metres per metre) those that were unknowns, slopes where they are clear:
-    value, standard deviation.
-  - `mounts`: camera_id -> `boresight_x` to `boresight_z` (degrees) and `lever_x` to `lever_z` (metres from the
-    projection centre to the antenna, in the camera's frame): value, standard deviation.
-  - `calibration`: camera_id -> `images`; `parameters`: name -> value, standard deviation (0 where it was held), value
-    known before and its standard deviation, cx and cy from the corner of the first pixel; `correlations`: up to five
-    pairs above 0.9: two names, correlation; `flights`: of its flights but the largest that tell of a lens, `flight`,
-    `images`, `change` (name -> by how much a lens of its own differs) and `worth` (by how much that lowers the sum of
-    squares over what is asked for: above 1 the flights do not share a calibration); `if_freed`: the same `change` and
-    `worth` of what settings hold, if it were unknown.
-  - `heights`, missing with few points: expected errors of the heights of points: `sigma_m` (median), `bowl_m` (of the
-    middle of the block above its border), `tilt_m` (of one side above the middle), `reach_m` (half the extent that
-    both are of), `pixel_m` (what a pixel is on the ground), `points`: x, y and standard deviation of points over the
-    block. In a frame of its own, whose units are arbitrary, the names are `sigma`, `bowl`, `tilt`, `reach`, `pixel`.
-  - `control`: of points that took part: `used`, `wrong`, `exchanged` (names), `fault` (what is wrong with the list as a
-    whole, "" for nothing), `held_out` (`check points`, or `leave one out`), `held_out_rms_m` and `without_rms_m` (at
-    these, with control and without), `kept` (whether control makes them better).
-- `control`: the block beside all surveyed points. `points`, `control`, `check` (counts), `not_measured_in_two_images`,
-  `rays_do_not_meet`, `doubtful` (names); `transformation` (the similarity onto the control points: `scale`,
-  `rotation_vector_deg`, `shift_m`; null with fewer than three of them) and after it `residuals` (name -> x, y, z,
-  metres), `control_rmse_m`, `check_rmse_m`, `check_kind`; `checks` (names); `offset_m` (before it, median; null in a
-  frame without metres); `point_sigmas_m` (name -> standard deviations of its residual, as stated of the survey and of
-  the image measurements, both together), `sigmas_m` (median of those of the check points, else of the control points);
-  `image_residuals_px` (name -> image_id -> x, y: measured less seen where the rays of the point meet),
-  `reprojection_error_px` (root mean square of their lengths); `ground_pixel_m` (at the points).
+- `result`: see [Result of adjust](#result-of-adjust).
 
 ### orientation/adjusted.npz
 
@@ -296,27 +236,10 @@ The same row layout with the kept matches: `image_id1`, `fingerprint`, `features
 
 ### reports/<stage>.json, <stage>.i-of-n.json
 
-- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`,
-  `facts_version` (facts of another version are not read).
+- `stage`, `seconds`, `items`, `done`, `skipped` (already up to date), `failed`, `fingerprint`.
 - `failures`: [[item, reason], ...].
-- `facts` of pairs: `summary` (lines), `block` (figures), `warnings`, `images`, `pairs_sha256`.
-- `facts` of enhance and extract: `images_skipped_same_illumination`. Of simulate and extract: `images`, `views`,
-  `view_megapixels`, `views_per_image`, `view_megapixels_per_image`. Of extract: `keypoints`,
-  `images_without_keypoints`.
-- `facts` of refine: `keypoints` (matched ones, without those that stand for their points), `measured`, `shift_px`.
-- `facts` of adjust: those of `orientation/adjusted.json`.
-- `facts` of consistency: `verified_matches` (those that stay), `dropped_matches`, `rejected_pairs`, `components` and
-  `weakly_tied`, `unconnected` (as of filter, of those that stay), `points`, `observations` (of the adjusted block),
-  `points_left`, `observations_left` (that those that stay hold),
-  `expected_right` (the share of those that stay that is right to 3 px, by their probabilities; null without
-  `consistency.min_probability`), `doubtful` (images that the block seems to hold in a wrong place), `spread`
-  (image_id -> ninths of the image that hold a point that is left, ninths that hold none though other images
-  show them, and its points that three or more images see).
-- `facts` of match: `matches`; with a cascade `settled_by` (step -> pairs) and `not_settled` (pairs with fewer
-  matches than their overlap promises, or with empty parts of it). Of extract with a cascade: `images_by_step`.
-  Of filter: `pairs` (state -> count), `verified_matches`, `components` (sizes),
-  `weakly_tied` (images with few verified matches), `unconnected` (those with none).
-- `facts` of export: exporter -> files and counts.
+- `result`: what the stage has found, null for nothing; see [Results of stages](#results-of-stages). Images are named
+  by their ids, in what `--json` prints by their names.
 
 ### failures.csv
 
@@ -365,9 +288,12 @@ plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 
 
 def page() -> str:
-    """docs/workspace.md: this specification as Markdown."""
+    """docs/workspace.md: this specification as Markdown, and the results of stages by their types."""
+    from aeromatch_cli.results.page import text
+
     heading, _, rest = (__doc__ or "").partition("\n\n")
     made = (
         "This page is made from the specification in the code: `python -m aeromatch_cli.formats > docs/workspace.md`."
     )
-    return f"{heading}\n\n{made}\n\n{rest}"
+    words = "This is what stages find: it stands in their reports and in the last line that `--json` prints."
+    return f"{heading}\n\n{made}\n\n{rest}\n## Results of stages\n\n{words}\n\n{text()}"

@@ -1,4 +1,4 @@
-"""Figures of an adjusted block as a whole, JSON-ready: sizes, errors, and how many images hold each other."""
+"""Figures of an adjusted block as a whole: sizes, errors, and how many images hold each other."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
 from aeromatch_cli.geometry.cameras import corner_params, focal_px
+from aeromatch_cli.results.adjustment import GroupResult
+from aeromatch_cli.results.stages import AdjustedCamera
 
 # Images with fewer points of three images and more are held by their neighbours one by one; pairs that share fewer tie
 # no parts.
 _FEW_POINTS = 20
 
 
-def block_figures(
-    adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequence[Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Keys as in adjusted.json. groups: facts of each."""
+def block_figures(adjusted: AdjustedBlock, images: Iterable[Image], groups: Sequence[GroupResult]) -> dict[str, Any]:
+    """Fields of AdjustResult. groups: the results of each."""
     placed = [pose for image_id, pose in adjusted.poses.items() if image_id not in adjusted.frames]
     seen = images_per_point(adjusted)
     held = [int((seen[track[:, 1]] >= 3).sum()) for track in adjusted.tracks.values()]
@@ -33,9 +33,11 @@ def block_figures(
         # No length is a metre in a frame of a group's own.
         "sigma_position_m": _median([float(np.mean(pose.sigmas_m)) for pose in placed]),
         "sigma_angle_deg": _median([float(np.mean(pose.sigmas_deg)) for pose in adjusted.poses.values()]),
-        "groups": [dict(one) for one in groups],
+        "groups": list(groups),
         "cameras": {
-            camera_id: [camera.model, camera.width_px, camera.height_px, list(corner_params(camera))]
+            camera_id: AdjustedCamera(
+                camera.model, camera.width_px, camera.height_px, [*map(float, corner_params(camera))]
+            )
             for camera_id, camera in sorted(adjusted.cameras.items())
         },
     }

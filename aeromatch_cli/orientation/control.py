@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
 from aeromatch_cli.geometry.cameras import project, world_rays
 from aeromatch_cli.orientation.placing import similarity
+from aeromatch_cli.results.adjustment import Control, Similarity, Xyz, xyz
 
 # A similarity has seven unknowns: three points determine it, a fourth tells how well.
 _LEAST_POINTS = 3
+# Coordinates of image points that determine a point: of two images, inside what their lens models hold for.
+_LEAST_RAYS = 4
+# Points lie on one line, or in one place, where their extent across it is a smaller share of that along it.
+_LINE = 1e-3
 # A point is doubtful without which, of so many, the errors of the others are smaller by this factor.
 _TELLING_POINTS, _DOUBTFUL = 5, 5.0
 # Derivatives are those of steps of this share of the distance from the camera.
@@ -21,86 +26,120 @@ _STEP = 1e-5
 
 def control_figures(
     adjusted: AdjustedBlock, cameras: Mapping[str, Camera], points: Sequence[ControlPoint], *, metric: bool = True
-) -> dict[str, Any]:
-    """Transformation from the adjusted block to the points, and root mean square errors; JSON-ready.
+) -> Control:
+    """The similarity from the adjusted block to surveyed points, and errors at them.
 
-    cameras: image_id -> adjusted camera. metric: whether lengths of the block are metres. `check_rmse_m` (x, y, z) is
-    of the check points; without any, of every control point under the transformation of the others (leave-one-out).
-    `offset_m`: from the block as it is to the surveyed positions, median over the control points, None of a block
-    without metres. `doubtful`: control points that the others contradict. `residuals`: name -> x, y, z after the
-    transformation, of a block that none is known of as it is; `checks`: names; `point_sigmas_m`, `sigmas_m`: standard
-    deviations of these residuals by what was stated of survey and image measurements, and the median of those at which
-    errors count. `image_residuals_px`: name -> image_id -> x, y, measured less seen where the rays meet.
-    `ground_pixel_m`: what a pixel is at the points. `rays_do_not_meet`: points whose rays are parallel or meet behind a
-    camera, which are left out. None where too few are left.
+    cameras: image_id -> adjusted camera. metric: whether lengths of the block are metres. Errors are determined at the
+    check points; without any, at every control point under the transformation of the others (leave-one-out). Without
+    three control points residuals are those of the block as it is.
     """
     rays = {point.name: _rays(adjusted, cameras, point) for point in points}
     found = {point.name: intersected(*rays[point.name]) for point in points}
-    seen = [point for point in points if found[point.name] is not None]
-    in_block = {name: place for name, place in found.items() if place is not None}
+    in_block = {
+        point.name: place
+        for point in points
+        if (place := found[point.name]) is not None
+        and len(_pixel_moves(adjusted, cameras, point, place)) >= _LEAST_RAYS
+    }
+    seen = [point for point in points if point.name in in_block]
     control = [point for point in seen if not point.check]
     checks = [point for point in seen if point.check]
-    fit = _fit(control, in_block) if len(control) >= _LEAST_POINTS else None
+    fit = _fit(control, in_block) if _determine_similarity(control, in_block) else None
     image_residuals = {p.name: _image_residuals(adjusted, cameras, p, in_block[p.name]) for p in seen}
-    figures: dict[str, Any] = {
-        "points": len(points),
-        "control": len(control),
-        "check": len(checks),
-        "not_measured_in_two_images": sorted(name for name, (_, directions) in rays.items() if len(directions) < 2),
-        "rays_do_not_meet": sorted(
-            name for name, (_, directions) in rays.items() if len(directions) > 1 and found[name] is None
+    result = Control(
+        points=len(points),
+        control=len(control),
+        check=len(checks),
+        not_measured_in_two_images=sorted(name for name, (_, directions) in rays.items() if len(directions) < 2),
+        rays_do_not_meet=sorted(
+            name for name, (_, directions) in rays.items() if len(directions) > 1 and name not in in_block
         ),
-        "image_residuals_px": image_residuals,
-        "reprojection_error_px": _rms_length([one for own in image_residuals.values() for one in own.values()]),
-    }
+        image_residuals_px=image_residuals,
+        reprojection_error_px=_rms_length([one for own in image_residuals.values() for one in own.values()]),
+    )
     if seen and (metric or fit is not None):
-        placed = fit if fit is not None else (1.0, np.eye(3), np.zeros(3))
-        turned = np.linalg.inv(placed[0] * placed[1])
-        moves = {p.name: _pixel_moves(adjusted, cameras, p, in_block[p.name]) @ turned for p in seen}
-        sigmas_m = {p.name: np.hypot(p.sigmas_m, _measured_sigmas_m(moves[p.name], p.sigma_px)) for p in seen}
-        figures |= {
-            "point_sigmas_m": {name: [float(f"{v:.4g}") for v in own] for name, own in sigmas_m.items()},
-            "sigmas_m": np.median([sigmas_m[p.name] for p in checks or control], axis=0).tolist(),
-            "residuals": {
-                point.name: [round(float(v), 4) for v in error]
-                for point, error in zip(
-                    [*control, *checks], _errors(placed, [*control, *checks], in_block), strict=True
-                )
-            },
-            "checks": [point.name for point in checks],
-            "ground_pixel_m": 1.0 / float(np.median(np.linalg.norm(np.concatenate([*moves.values()]), axis=1))),
-        }
+        result = result.model_copy(update=_residuals(adjusted, cameras, [*control, *checks], in_block, fit))
     if fit is None:
-        unknown = ("offset_m", "transformation", "control_rmse_m", "check_rmse_m", "check_kind")
-        return figures | dict.fromkeys(unknown) | {"doubtful": []}
-    own = _errors(fit, control, in_block)
-    if checks:
-        kind, independent = "check points", _errors(fit, checks, in_block)
-    elif len(control) > _LEAST_POINTS:
-        kind = "leave one out"
-        others = [[one for one in control if one is not point] for point in control]
-        independent = np.concatenate(
-            [_errors(_fit(rest, in_block), [point], in_block) for rest, point in zip(others, control, strict=True)]
-        )
-    else:
-        kind, independent = None, np.zeros((0, 3))
+        return result
+    kind, independent = _independent_errors(fit, control, checks, in_block)
     off_m = np.array([point.position_m - in_block[point.name] for point in control])
-    return figures | {
-        "offset_m": [round(float(v), 3) for v in np.median(off_m, axis=0)] if metric else None,
-        "transformation": _described(fit),
-        "control_rmse_m": _rmse(own),
-        "check_rmse_m": _rmse(independent),
-        "check_kind": kind,
-        "doubtful": _doubtful(control, in_block),
+    return result.model_copy(
+        update={
+            "offset_m": xyz(np.round(np.median(off_m, axis=0), 3)) if metric else None,
+            "transformation": _described(fit),
+            "control_rmse_m": _rmse(_errors(fit, control, in_block)),
+            "check_rmse_m": _rmse(independent),
+            "check_kind": kind,
+            "doubtful": _doubtful(control, in_block),
+        }
+    )
+
+
+_Fit = tuple[float, FloatArray, FloatArray]
+
+
+def _determine_similarity(points: Sequence[ControlPoint], in_block: Mapping[str, FloatArray]) -> bool:
+    """Whether there are three points, neither as surveyed nor in the block on one line."""
+    if len(points) < _LEAST_POINTS:
+        return False
+    for places in ([point.position_m for point in points], [in_block[point.name] for point in points]):
+        centred = np.array(places) - np.mean(places, axis=0)
+        along, across, _ = np.linalg.svd(centred, compute_uv=False)
+        if across <= _LINE * along:
+            return False
+    return True
+
+
+def _residuals(
+    adjusted: AdjustedBlock,
+    cameras: Mapping[str, Camera],
+    points: Sequence[ControlPoint],
+    in_block: Mapping[str, FloatArray],
+    fit: _Fit | None,
+) -> dict[str, Any]:
+    """Fields of Control: residuals after the transformation, and their standard deviations by what was stated of survey
+    and image measurements. points: those that are seen. fit: None for the block as it is."""
+    placed = fit if fit is not None else (1.0, np.eye(3), np.zeros(3))
+    turned = np.linalg.inv(placed[0] * placed[1])
+    moves = {p.name: _pixel_moves(adjusted, cameras, p, in_block[p.name]) @ turned for p in points}
+    sigmas_m = {p.name: np.hypot(p.sigmas_m, _measured_sigmas_m(moves[p.name], p.sigma_px)) for p in points}
+    checks = [point.name for point in points if point.check]
+    counting = checks or [point.name for point in points]
+    errors_m = _errors(placed, points, in_block)
+    return {
+        "point_sigmas_m": {name: xyz(float(f"{v:.4g}") for v in own) for name, own in sigmas_m.items()},
+        "sigmas_m": xyz(np.median([sigmas_m[name] for name in counting], axis=0)),
+        "residuals": {point.name: xyz(np.round(error, 4)) for point, error in zip(points, errors_m, strict=True)},
+        "checks": checks,
+        "ground_pixel_m": 1.0 / float(np.median(np.linalg.norm(np.concatenate([*moves.values()]), axis=1))),
     }
 
 
-def offset_words(figures: Mapping[str, Any]) -> str:
-    """How the block, as it is exported, lies to the control points."""
-    if figures["offset_m"] is None:
-        return f"to fit them the exported block is to be scaled to {figures['transformation']['scale']:.4g} m per unit"
-    offset = ", ".join(f"{axis} {off:+.2f}" for axis, off in zip("xyz", figures["offset_m"], strict=True))
-    share = 100.0 * (figures["transformation"]["scale"] - 1.0)
+def _independent_errors(
+    fit: _Fit, control: Sequence[ControlPoint], checks: Sequence[ControlPoint], in_block: Mapping[str, FloatArray]
+) -> tuple[Literal["check points", "leave one out"] | None, FloatArray]:
+    """At which points errors are independent of the fit, and these errors (N, 3)."""
+    if checks:
+        return "check points", _errors(fit, checks, in_block)
+    if len(control) <= _LEAST_POINTS:
+        return None, np.zeros((0, 3))
+    others = [[one for one in control if one is not point] for point in control]
+    errors = [
+        _errors(_fit(rest, in_block), [point], in_block)
+        for rest, point in zip(others, control, strict=True)
+        if _determine_similarity(rest, in_block)
+    ]
+    return ("leave one out", np.concatenate(errors)) if errors else (None, np.zeros((0, 3)))
+
+
+def offset_words(control: Control) -> str:
+    """How the block, as it is exported, lies to the control points, of which there are three or more."""
+    assert control.transformation is not None
+    scale = control.transformation.scale
+    if control.offset_m is None:
+        return f"to fit them the exported block is to be scaled to {scale:.4g} m per unit"
+    offset = ", ".join(f"{axis} {off:+.2f}" for axis, off in zip("xyz", control.offset_m, strict=True))
+    share = 100.0 * (scale - 1.0)
     size = f"{abs(share):.2f} % {'larger' if share >= 0.0 else 'smaller'}"
     return f"to fit them the exported block is to be moved by {offset} m and made {size}"
 
@@ -128,13 +167,11 @@ def intersected(centers_m: FloatArray, rays: FloatArray) -> FloatArray | None:
     return place if (((place - centers_m) * rays).sum(axis=1) > 0.0).all() else None
 
 
-def _fit(points: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> tuple[float, FloatArray, FloatArray]:
+def _fit(points: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> _Fit:
     return similarity(np.array([found[p.name] for p in points]), np.array([p.position_m for p in points]))
 
 
-def _errors(
-    fit: tuple[float, FloatArray, FloatArray], points: Sequence[ControlPoint], found: Mapping[str, FloatArray]
-) -> FloatArray:
+def _errors(fit: _Fit, points: Sequence[ControlPoint], found: Mapping[str, FloatArray]) -> FloatArray:
     """(N, 3) transformed minus surveyed, metres."""
     scale, rotation, shift_m = fit
     moved = np.array([scale * rotation @ found[p.name] + shift_m for p in points]).reshape(-1, 3)
@@ -148,6 +185,8 @@ def _doubtful(control: Sequence[ControlPoint], found: Mapping[str, FloatArray]) 
     while len(left) >= _TELLING_POINTS:
         whole_m = float(np.linalg.norm(_errors(_fit(left, found), left, found)))
         rests = [[one for one in left if one is not point] for point in left]
+        if not all(_determine_similarity(rest, found) for rest in rests):
+            break
         rest_m = [float(np.linalg.norm(_errors(_fit(rest, found), rest, found))) for rest in rests]
         worst = int(np.argmin(rest_m))
         if _DOUBTFUL * rest_m[worst] >= whole_m:
@@ -157,21 +196,21 @@ def _doubtful(control: Sequence[ControlPoint], found: Mapping[str, FloatArray]) 
     return names
 
 
-def _described(fit: tuple[float, FloatArray, FloatArray]) -> dict[str, Any]:
+def _described(fit: _Fit) -> Similarity:
     from scipy.spatial.transform import Rotation
 
     scale, rotation, shift_m = fit
     turn_deg = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
-    return {"scale": scale, "rotation_vector_deg": turn_deg.tolist(), "shift_m": shift_m.tolist()}
+    return Similarity(scale=float(scale), rotation_vector_deg=xyz(turn_deg), shift_m=xyz(shift_m))
 
 
-def _rmse(errors: FloatArray) -> list[float] | None:
-    return [round(float(v), 4) for v in np.sqrt((errors**2).mean(axis=0))] if len(errors) else None
+def _rmse(errors: FloatArray) -> Xyz | None:
+    return xyz(np.round(np.sqrt((errors**2).mean(axis=0)), 4)) if len(errors) else None
 
 
 def _image_residuals(
     adjusted: AdjustedBlock, cameras: Mapping[str, Camera], point: ControlPoint, place: FloatArray
-) -> dict[str, list[float]]:
+) -> dict[str, tuple[float, float]]:
     """image_id -> x, y of the measured pixel less that of a place in the block. Where a point is far off, it may lie
     outside what the lens model holds for: such images are left out."""
     found = {}
@@ -180,7 +219,7 @@ def _image_residuals(
         if pose is not None:
             off_px = pixel - project(cameras[image_id], pose.rotation, pose.center_m, place[None])[0]
             if np.isfinite(off_px).all():
-                found[image_id] = [round(float(v), 3) for v in off_px]
+                found[image_id] = round(float(off_px[0]), 3), round(float(off_px[1]), 3)
     return found
 
 

@@ -23,6 +23,7 @@ from aeromatch_cli.orientation.bundle.solve import solve
 from aeromatch_cli.orientation.calibration import camera_of
 from aeromatch_cli.orientation.control import intersected
 from aeromatch_cli.orientation.control_faults import fault_of_list
+from aeromatch_cli.results.adjustment import ControlInGroup, Xyz, xyz
 
 # Control points farther from the block than this, metres, are in another coordinate system.
 _FAR_M = 300.0
@@ -67,27 +68,31 @@ class Surveyed:
 
 def with_control(
     work: Work, model: Any, outcome: Outcome, surveyed: Sequence[Surveyed]
-) -> tuple[Outcome, dict[str, Any]]:
-    """The block adjusted once more with control points, where that makes held-out points better; and what was found.
-
-    Facts: "used", "wrong", "exchanged": names; "fault": what is wrong with the list as a whole, "" for nothing;
-    "held_out_rms_m", "without_rms_m": root mean square (x, y, z) of points that took no part, with and without control;
-    "kept".
-    """
+) -> tuple[Outcome, ControlInGroup | None]:
+    """The block adjusted once more with control points, where that makes held-out points better; and what was found,
+    None where no point is measured in two images."""
     images = set(outcome.images)
     base = _Block(outcome.result.network, outcome.result.state, outcome)
     seen = [point for point in surveyed if point.seen_by(images) >= 2 and np.isfinite(base.error_m(point)).all()]
     control, checks = [p for p in seen if not p.check], [p for p in seen if p.check]
     if not seen:
-        return outcome, {}
+        return outcome, None
     without_m = np.array([base.error_m(point) for point in seen])
     offset_m = np.median(without_m, axis=0)
     stated_m = np.array([point.position_m for point in seen])
     fault = fault_of_list(stated_m + without_m, stated_m)
     if not control or fault or float(np.abs(offset_m).max()) > _FAR_M:
         as_it_is = _rms(without_m[[seen.index(point) for point in checks]]) if checks else None
-        found = {"used": [], "wrong": [], "exchanged": [], "held_out": "check points", "kept": not control}
-        return outcome, found | {"fault": fault, "held_out_rms_m": as_it_is, "without_rms_m": as_it_is}
+        return outcome, ControlInGroup(
+            used=[],
+            wrong=[],
+            exchanged=[],
+            fault=fault,
+            held_out="check points",
+            held_out_rms_m=as_it_is,
+            without_rms_m=as_it_is,
+            kept=not control,
+        )
     exchanged = _exchanged(base, control)
     used = [point for point in control if point.name not in exchanged]
     wrong: list[str] = []
@@ -105,21 +110,21 @@ def with_control(
     before_m = without_m[[seen.index(point) for point in held_out]] if held_out else np.zeros((0, 3))
     sound = bool(np.isfinite(solved.state.centers_m).all())
     kept = sound and (not held_out or _size(held_out_m) <= _size(before_m))
-    facts = {
-        "used": [point.name for point in used] if kept else [],
-        "wrong": wrong,
-        "exchanged": exchanged,
-        "fault": "",
-        "held_out": "check points" if checks else "leave one out",
-        "held_out_rms_m": _rms(held_out_m) if held_out else None,
-        "without_rms_m": _rms(before_m) if held_out else None,
-        "kept": kept,
-    }
+    found = ControlInGroup(
+        used=[point.name for point in used] if kept else [],
+        wrong=wrong,
+        exchanged=exchanged,
+        fault="",
+        held_out="check points" if checks else "leave one out",
+        held_out_rms_m=_rms(held_out_m) if held_out else None,
+        without_rms_m=_rms(before_m),
+        kept=kept,
+    )
     if not kept:
-        return outcome, facts
+        return outcome, found
     taken = replace(outcome, result=replace(solved.outcome.result, stated=outcome.result.stated))
     take_outcome(work, model, taken)
-    return taken, facts
+    return taken, found
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,5 +232,8 @@ def _size(errors_m: FloatArray) -> float:
     return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
 
 
-def _rms(errors_m: FloatArray) -> list[float]:
-    return [round(float(value), 4) for value in np.sqrt((errors_m**2).mean(axis=0))]
+def _rms(errors_m: FloatArray) -> Xyz | None:
+    """None where rays of a point do not meet, or there is none."""
+    if not len(errors_m) or not np.isfinite(errors_m).all():
+        return None
+    return xyz(np.round(np.sqrt((errors_m**2).mean(axis=0)), 4))

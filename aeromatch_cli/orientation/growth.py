@@ -74,7 +74,7 @@ def _with(model: Model, found: Mapping[str, Pose], cameras: Mapping[str, Camera]
     for image_id, pose in found.items():
         assert pose.world_rotation is not None
         rotations[image_id], centers_m[image_id] = pose.world_rotation, pose.center_m
-    figures = {**model.figures, "images": len(rotations)}
+    figures = model.figures.model_copy(update={"images": len(rotations)})
     return replace(
         model, rotations=rotations, centers_m=centers_m, cameras={**model.cameras, **cameras}, figures=figures
     )

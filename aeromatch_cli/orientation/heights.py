@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+
+from aeromatch_cli.results.adjustment import GroupResult
 
 # The geoid lies between these heights above the ellipsoid (106 m below it south of India, 85 m above at New Guinea);
 # the difference may have either sign, and what is smaller than the last is as likely another fault.
@@ -37,16 +38,14 @@ def height_remedy(metres: float, other: str) -> str:
     return f"to have the block in the heights of {other}: --set block.height_shift_m={metres:.2f}{exactly}"
 
 
-def shift_to_control_m(group: Mapping[str, Any]) -> float | None:
+def shift_to_control_m(group: GroupResult) -> float | None:
     """How far heights of the positions of a group lie above those of its control points, where control points hold it,
-    all flights are off by nearly the same, and neither sideways; None otherwise. group: of adjusted.json."""
-    flights = group.get("flights") or ()
-    if not (group.get("control") or {}).get("used") or not flights:
+    all flights are off by nearly the same, and neither sideways; None otherwise."""
+    if group.control is None or not group.control.used or not group.flights:
         return None
-    stated_m = np.array((group.get("positions") or {}).get("stated_m") or [0.0] * 3)
-    shifts_m = np.array([[flight.get(f"shift_{axis}", [0.0])[0] for axis in "xyz"] for flight in flights])
-    steps_m = np.array([flight.get("step_m", 0.0) for flight in flights])
-    shifts_m[:, 2] += steps_m
+    stated_m = np.zeros(3) if group.positions is None else np.array(group.positions.stated_m)
+    shifts_m = np.array([[one.value for one in flight.shifts] for flight in group.flights])
+    shifts_m[:, 2] += [flight.step_m for flight in group.flights]
     limits_m = np.maximum(_ALIKE_M, _ALIKE_SIGMAS * stated_m)
     up_m = float(np.median(shifts_m[:, 2]))
     alike = np.abs(shifts_m - [0.0, 0.0, up_m]) <= limits_m

@@ -11,7 +11,7 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,11 +21,13 @@ from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Block, Camera, Contr
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import colmap_params, focal_px
 from aeromatch_cli.geometry.lenses import in_colmap
-from aeromatch_cli.orientation.adjustment_facts import with_names
 from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import Calibration, camera_of, freed, held_by, lens_prior
+from aeromatch_cli.orientation.group_results import Names
 from aeromatch_cli.orientation.grouping import rows_by_number
 from aeromatch_cli.orientation.process import run_process
+from aeromatch_cli.results.adjustment import GroupResult, PlacementKind
+from aeromatch_cli.results.stages import MappedModel
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
@@ -38,15 +40,18 @@ class Model:
     """Images that were oriented together, in the world frame.
 
     rotations: image_id -> (3, 3) cam_from_world; centers_m: image_id -> (3,). cameras: camera_id -> Camera as
-    calibrated. points_m: (P, 3). kind: how it was placed (`placing.Placement`). figures: counts.
+    calibrated. points_m: (P, 3). figures: counts, and how it was placed.
     """
 
     rotations: Mapping[str, FloatArray]
     centers_m: Mapping[str, FloatArray]
     cameras: Mapping[str, Camera]
     points_m: FloatArray
-    kind: str
-    figures: Mapping[str, Any]
+    figures: MappedModel
+
+    @property
+    def kind(self) -> PlacementKind:
+        return self.figures.kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +87,8 @@ def map_block(contents: ExportContents, observed: Observed, mapper: Mapper) -> t
     # Few matches of reduced pictures do not tell an affinity from a rolling shutter.
     observed = replace(observed, switches={**dict.fromkeys(("b1", "b2"), False), **observed.switches})
     with _task(contents, observed) as folder:
-        facts = _solved(folder, "mapper", {"mapper": mapper}, f"pycolmap's {mapper} mapping")
-        return tuple(_read(folder, one, block) for one in facts)
+        found = _solved(folder, "mapper", {"mapper": mapper}, f"pycolmap's {mapper} mapping")
+        return tuple(_read(folder, block, **one) for one in found)
 
 
 @dataclass(frozen=True)
@@ -96,8 +101,8 @@ class Group:
 
 def refine_block(
     contents: ExportContents, observed: Observed, groups: Sequence[Group], *, fixed: bool
-) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
-    """The block adjusted from its poses and verified pairs, and figures of every group.
+) -> tuple[AdjustedBlock, list[GroupResult]]:
+    """The block adjusted from its poses and verified pairs, and the result of every group.
 
     A given rotation is an observation in groups of kind "given", where the block still has it. groups: the largest
     first; those that matches tie become one, and images of none are tied to the first of which they share enough
@@ -123,16 +128,12 @@ def refine_block(
             for point in observed.control
         ],
     }
+    names = Names(_image_ids(block), sorted(block.cameras), sorted(set(observed.flights.values())))
     with _task(contents, observed) as folder:
-        facts = _solved(folder, "refiner", task, "the bundle adjustment")
-        archives = [dict(np.load(folder / one.pop("file"))) for one in facts]
-    image_ids, flights = _image_ids(block), sorted(set(observed.flights.values()))
-    named = [
-        with_names(one, image_ids, sorted(block.cameras), flights)
-        | {"registered": [image_ids[k - 1] for k in one["registered"]]}
-        for one in facts
-    ]
-    return _joined(archives, [one["kind"] for one in facts], block), named
+        found = _solved(folder, "refiner", task | {"names": asdict(names)}, "the bundle adjustment")
+        archives = [dict(np.load(folder / one["file"])) for one in found]
+    results = [GroupResult(**one["result"]) for one in found]
+    return _joined(archives, [one.kind for one in results], block), results
 
 
 def _joined(archives: Sequence[Mapping[str, Any]], kinds: Sequence[str], block: Block) -> AdjustedBlock:
@@ -219,18 +220,18 @@ def _camera_task(block: Block, camera_id: str, observed: Observed) -> dict[str, 
 
 
 def _solved(folder: Path, process: str, task: Mapping[str, Any], what: str) -> list[dict[str, Any]]:
-    """Facts of the models that a process of its own makes in `folder`. InputError where it stops."""
+    """What a process of its own says of the models that it makes in `folder`. InputError where it stops."""
     path = folder / "task.json"
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | task), encoding="utf-8")
     result = run_process(process, folder, "result.json", what)
     return list(json.loads(result.read_text(encoding="utf-8"))["models"])
 
 
-def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
-    arrays = np.load(folder / facts.pop("file"))
+def _read(folder: Path, block: Block, *, file: str, turned_back: Sequence[int], **counts: Any) -> Model:
+    """A model that the mapper's process has written. turned_back: numbers of images."""
+    arrays = np.load(folder / file)
     image_ids, camera_ids = _image_ids(block), sorted(block.cameras)
     names = [image_ids[number - 1] for number in arrays["images"]]
-    facts["turned_back"] = [image_ids[number - 1] for number in facts["turned_back"]]
     given = block.cameras
     cameras = {camera_ids[n - 1]: camera_of(arrays[f"lens{n}"], given[camera_ids[n - 1]]) for n in arrays["cameras"]}
     return Model(
@@ -238,6 +239,5 @@ def _read(folder: Path, facts: dict[str, Any], block: Block) -> Model:
         centers_m=dict(zip(names, arrays["centers_m"], strict=True)),
         cameras=cameras,
         points_m=arrays["points_m"],
-        kind=str(facts.pop("kind")),
-        figures=facts,
+        figures=MappedModel(turned_back=[image_ids[number - 1] for number in turned_back], **counts),
     )

@@ -1,21 +1,34 @@
 """Whether an adjusted block can be trusted: good, doubtful or bad, with the number that says so and the remedy.
 
-Every criterion looks at one figure of the adjustment (keys of adjusted.json) and at what it ought to be. The worst
+Every criterion looks at one figure of the adjustment and at what it ought to be. The worst
 finding is the verdict. What nothing was given for cannot be checked; it is named, and counts neither way, but for a
 block that nothing ties to the ground.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import BROWN, MODELS
 from aeromatch_cli.orientation.heights import height_remedy, shift_of_points_m, shift_to_control_m, zeros_words
+from aeromatch_cli.results.adjustment import (
+    Calibration,
+    Control,
+    ControlInGroup,
+    FlightOffset,
+    GroupResult,
+    HeightErrors,
+    Parameter,
+    xyz,
+)
+from aeromatch_cli.results.record import Record
+from aeromatch_cli.results.stages import AdjustResult, OrientResult
 
 Level = Literal["good", "doubtful", "bad"]
 LEVELS: tuple[Level, ...] = ("good", "doubtful", "bad")
@@ -110,30 +123,34 @@ class Quality:
         return {"verdict": self.verdict, "findings": findings, "unchecked": list(self.unchecked)}
 
 
-@dataclass(frozen=True)
-class Evidence:
+class Evidence(Record):
     """What a block is judged by.
 
-    images: of the block. adjust, orient: facts of these stages. components: sizes of the groups of images that verified
-    pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted: share of
-    the verified matches that the adjusted block contradicts, None where it is not known; contradicting: ids of images
-    of which it contradicts most. reduced: stored pixels in a pixel of the pictures that keypoints were found in. names:
-    of the files, by image_id.
+    images: of the block. adjust, orient: results of these stages. components: sizes of the groups of images that
+    verified pairs connect, the largest first. refined: whether tie points were measured by least squares. contradicted:
+    share of the verified matches that the adjusted block contradicts, None where it is not known; contradicting: ids of
+    images of which it contradicts most. reduced: stored pixels in a pixel of the pictures that keypoints were found in.
+    names: of the files, by image_id.
     """
 
     images: int
-    adjust: Mapping[str, Any]
-    orient: Mapping[str, Any] = field(default_factory=dict)
-    components: Sequence[int] = ()
+    adjust: AdjustResult
+    orient: OrientResult | None = None
+    components: tuple[int, ...] = ()
     refined: bool = False
     contradicted: float | None = None
-    contradicting: Sequence[str] = ()
+    contradicting: tuple[str, ...] = ()
     reduced: float = 1.0
-    names: Mapping[str, str] = field(default_factory=dict)
+    names: dict[str, str] = Field({})
 
     @property
-    def groups(self) -> Sequence[Mapping[str, Any]]:
-        return list(self.adjust.get("groups", ()))
+    def groups(self) -> Sequence[GroupResult]:
+        return self.adjust.groups
+
+    @property
+    def held(self) -> Mapping[str, str]:
+        """Parameter of cameras -> setting that holds it."""
+        return self.adjust.held_by
 
     def named(self, image_ids: Sequence[str], most: int = 5) -> str:
         shown = ", ".join(self.names.get(i, i) for i in image_ids[:most])
@@ -143,7 +160,7 @@ class Evidence:
 def judged(evidence: Evidence) -> Quality:
     """The verdict on a block, and what it rests on."""
     findings, unchecked = [*_connection(evidence)], list[str]()
-    if evidence.adjust.get("images"):
+    if evidence.adjust.images:
         for criterion in (
             _left_out, _frames, _weak_ties, _contradicted, _positions, _flights, _mounts, _angles, _control, _errors,
             _multiplicity, _calibration, _deformation, _kept_poses,
@@ -154,7 +171,7 @@ def judged(evidence: Evidence) -> Quality:
                 else:
                     unchecked.append(found)
     elif evidence.images > 2:
-        if evidence.adjust.get("remarks"):
+        if evidence.adjust.remarks:
             words = (
                 "no image is oriented: more overlap, or known positions and attitudes (--poses) and cameras "
                 "(--cameras) help; matches are exported all the same"
@@ -199,8 +216,8 @@ def _connection(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _left_out(evidence: Evidence) -> _Found:
-    outside = list(evidence.adjust.get("outside", ()))
-    missing = max(len(outside), evidence.images - evidence.adjust["images"])
+    outside = list(evidence.adjust.outside)
+    missing = max(len(outside), evidence.images - evidence.adjust.images)
     words = f"{evidence.images - missing} of {evidence.images} images are oriented"
     if outside:
         one = evidence.names.get(outside[0], outside[0])
@@ -215,7 +232,7 @@ def _left_out(evidence: Evidence) -> _Found:
 
 def _frames(evidence: Evidence) -> _Found:
     """Parts of frames of their own, and whether anything ties the block to the ground."""
-    kinds = [group["kind"] for group in evidence.groups]
+    kinds = [group.kind for group in evidence.groups]
     parts = kinds.count("level") + any(kind != "level" for kind in kinds)  # those that positions place lie in one frame
     if parts > 1 and len(evidence.components) <= 1:
         words = (
@@ -224,10 +241,10 @@ def _frames(evidence: Evidence) -> _Found:
         yield Finding("parts", float(parts), 1.0, "bad", words)
     yield from _placed_parts(evidence)
     given = _positions_given(evidence)
-    used = sum((group.get("positions") or {}).get("used", 0) for group in evidence.groups)
+    used = sum(group.positions.used for group in evidence.groups if group.positions)
     kept = any(kind == "given" for kind in kinds)
     # Control points that took no part show how the block is to be moved; they do not hold it.
-    surveyed = sum(len((group.get("control") or {}).get("used", ())) for group in evidence.groups)
+    surveyed = sum(len(group.control.used) for group in evidence.groups if group.control)
     if used >= _HOLDING or surveyed >= _HOLDING or kept:
         return
     if given >= _HOLDING:
@@ -246,12 +263,12 @@ def _frames(evidence: Evidence) -> _Found:
 
 def _positions_given(evidence: Evidence) -> int:
     """Of how many images; the adjustment knows of none that the orientation has left out."""
-    return int(max(one.get("positions_given", 0) for one in (evidence.adjust, evidence.orient)))
+    return max(evidence.adjust.positions_given, evidence.orient.positions_given if evidence.orient else 0)
 
 
 def _weak_ties(evidence: Evidence) -> _Found:
     """Parts of a block that is one by single points; several parts are judged by `_placed_parts`."""
-    parts = [size for size in evidence.adjust.get("tied_parts", ()) if size >= _PART_IMAGES]
+    parts = [size for size in evidence.adjust.tied_parts if size >= _PART_IMAGES]
     if len(parts) > 1 and len(evidence.groups) == 1:
         words = (
             f"{_sizes(parts)} share fewer than 20 points: single points, or their positions, put them to each other; "
@@ -278,13 +295,13 @@ def _contradicted(evidence: Evidence) -> _Found:
 
 
 def _placed_parts(evidence: Evidence) -> Iterator[Finding]:
-    placed = [group for group in evidence.groups if group["kind"] == "positions" and group.get("positions")]
-    pixel_m = evidence.adjust.get("ground_pixel_m")
+    placed = [(group, group.positions) for group in evidence.groups if group.kind == "positions" and group.positions]
+    pixel_m = evidence.adjust.ground_pixel_m
     if len(placed) < 2 or not pixel_m:
         return
     # Of a part of N images by the square root of N better; that of the smallest counts.
-    exact_m = max(_rms(one["positions"]["stated_m"]) / np.sqrt(max(one["positions"]["used"], 1)) for one in placed)
-    sizes = _sizes([group["images"] for group in placed])
+    exact_m = max(_rms(positions.stated_m) / np.sqrt(max(positions.used, 1)) for _, positions in placed)
+    sizes = _sizes([group.images for group, _ in placed])
     words = (
         f"{sizes} share too few points and lie to each other as their positions put them, to {plain(exact_m)} m "
         f"({exact_m / pixel_m:.1f} ground pixels): more overlap between them, better positions, or control points in "
@@ -299,28 +316,29 @@ def _sizes(parts: Sequence[int]) -> str:
 
 
 def _positions(evidence: Evidence) -> _Found:
-    found = [group["positions"] for group in evidence.groups if group.get("positions")]
+    found = [group.positions for group in evidence.groups if group.positions]
     if not found:
         if not _positions_given(evidence):
             yield "positions: none are given"
         return
-    images = sum(one["images"] for one in found)
-    wrong = [i for one in found for i in one["wrong"]]
+    images = sum(one.images for one in found)
+    wrong = [i for one in found for i in one.wrong]
     remedy = f"{evidence.named(wrong)}; check which position belongs to which image"
     words = f"{len(wrong)} of {images} given positions contradict the pictures and are not used"
     yield _finding("wrong positions", len(wrong) / images, _WRONG_POSITIONS, words, remedy)
-    found = [one for one in found if one["rms_sigmas"]]
-    if not found:
+    met = [(one.rms_sigmas, one.rms_m, one.stated_m) for one in found if one.rms_sigmas and one.rms_m]
+    if not met:
         return
-    shares = np.array([one["used"] for one in found]) / sum(one["used"] for one in found)
+    used = np.array([one.used for one in found if one.rms_sigmas and one.rms_m])
+    shares = used / used.sum()
     remedy = (
         "they are less exact than stated, or another focal length, time or antenna offset stands behind it; state "
         "their real accuracy, or correct their cause"
     )
     for name, axes in (("horizontally", [0, 1]), ("vertically", [2])):
         sigmas, off_m, stated_m = (
-            float(np.sqrt(shares @ [_rms(np.array(one[key])[axes]) ** 2 for one in found]))
-            for key in ("rms_sigmas", "rms_m", "stated_m")
+            float(np.sqrt(shares @ [_rms(np.array(one)[axes]) ** 2 for one in values]))
+            for values in zip(*met, strict=True)
         )
         words = f"positions are met {name} to {plain(off_m, 3)} m, {sigmas:.1f} times the {plain(stated_m, 3)} m stated"
         yield _finding(f"positions {name}", sigmas, _POSITION_SIGMAS, words, _with_held(evidence, remedy))
@@ -329,11 +347,10 @@ def _positions(evidence: Evidence) -> _Found:
 def _flights(evidence: Evidence) -> _Found:
     """Steps, shifts and delays of whole flights, each with its size."""
     for group in evidence.groups:
-        positions, found = group.get("positions") or {}, set[str]()
-        stated_m = positions.get("stated_m") or [np.inf] * 3
-        for flight in group.get("flights", ()):
-            name, images = _flight(flight["flight"]), flight["images"]
-            step_m = flight.get("step_m", 0.0)
+        found = set[str]()
+        stated_m = (np.inf, np.inf, np.inf) if group.positions is None else group.positions.stated_m
+        for flight in group.flights:
+            name, images, step_m = _flight(flight.flight), flight.images, flight.step_m
             if step_m:
                 words = (
                     f"heights of {name} ({images} images) lie {abs(step_m):.1f} m "
@@ -341,7 +358,7 @@ def _flights(evidence: Evidence) -> _Found:
                 )
                 remedy = "check the zero of its heights; control points tell which flight is right"
                 yield _finding("step of heights", abs(step_m) / stated_m[2], _FLIGHT_SIGMAS, words, remedy)
-            shift_m, sigma_m = np.array([flight.get(f"shift_{axis}", [0.0, 0.0]) for axis in "xyz"]).T
+            shift_m, sigma_m = np.array(flight.shifts).T
             if (np.abs(shift_m) > _SIGNIFICANT * sigma_m).any():
                 shown = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", shift_m, strict=True))
                 words = f"positions of {name} ({images} images) are off by {shown} m, which was taken out"
@@ -352,14 +369,15 @@ def _flights(evidence: Evidence) -> _Found:
                     known = np.abs(shift_m) > _SIGNIFICANT * sigma_m
                     sigmas = float((np.abs(shift_m) / np.array(stated_m))[known].max())
                     yield _finding("shift of a flight", sigmas, _FLIGHT_SIGMAS, words, remedy)
-            found.add(flight["flight"])
-            if "lag_s" in flight:
-                lag_s = flight["lag_s"][0]
+            found.add(flight.flight)
+            if flight.lag_s is not None:
+                lag_s = flight.lag_s.value
                 words = f"positions of {name} lag {lag_s:+.2f} s behind the exposures, which was taken out"
                 remedy = "check the times by which positions were given to images"
                 yield _finding("delay of positions", abs(lag_s), _LAG_S, words, remedy)
 
-        left = [one for one in positions.get("flights", ()) if one["flight"] not in found]
+        offsets = group.positions.flights if group.positions else []
+        left = [one for one in offsets if one.flight not in found]
         yield from _apart(left, np.array(stated_m))
 
 
@@ -370,21 +388,21 @@ def _flight(name: str) -> str:
     return name if name.lower().startswith("flight") else f"flight {name}"
 
 
-def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterator[Finding]:
+def _apart(flights: Sequence[FlightOffset], stated_m: FloatArray) -> Iterator[Finding]:
     """Flights whose positions lie off together, against that of most images, and nothing was taken out."""
-    flights = [flight for flight in flights if flight["images"] >= _FLIGHT_IMAGES]
-    most = max(flights, key=lambda one: one["images"], default=None)
+    flights = [flight for flight in flights if flight.images >= _FLIGHT_IMAGES]
+    most = max(flights, key=lambda one: one.images, default=None)
     for flight in flights:
         if most is None or flight is most:
             continue
-        off_m = np.array(flight["mean_m"]) - np.array(most["mean_m"])
+        off_m = np.array(flight.mean_m) - np.array(most.mean_m)
         axis = int(np.argmax(np.abs(off_m) / stated_m))
-        if max(flight["scatter_m"][axis], most["scatter_m"][axis]) > _FLIGHT_SCATTER * abs(off_m[axis]):
+        if max(flight.scatter_m[axis], most.scatter_m[axis]) > _FLIGHT_SCATTER * abs(off_m[axis]):
             continue
         what = ("x", "y", "heights")[axis]
         off = f"{'-' if off_m[axis] < 0.0 else '+'}{plain(abs(off_m[axis]), 3)} m"
         words = (
-            f"{what} of {_flight(flight['flight'])} ({flight['images']} images) lie {off} from those of the largest "
+            f"{what} of {_flight(flight.flight)} ({flight.images} images) lie {off} from those of the largest "
             "flight, which is in the result"
         )
         remedy = "check their datum and base stations, or state the accuracy of both as they are"
@@ -393,23 +411,21 @@ def _apart(flights: Sequence[Mapping[str, Any]], stated_m: FloatArray) -> Iterat
 
 def _mounts(evidence: Evidence) -> _Found:
     for group in evidence.groups:
-        for camera_id, mount in (group.get("mounts") or {}).items():
-            lever_m = np.array([mount.get(f"lever_{axis}", [0.0])[0] for axis in "xyz"])
-            if lever_m.any():
-                length_m = float(np.linalg.norm(lever_m))
+        for camera_id, mount in group.mounts.items():
+            length_m = float(np.linalg.norm(mount.lever_m))
+            if length_m > 0.0:
                 words = f"the antenna lies {length_m:.2f} m from camera {camera_id}, as its positions show"
                 remedy = "no drone is as large: check which point the positions are of, and their heights"
                 yield _finding("antenna", length_m, _LEVER_M, words, remedy)
 
 
 def _angles(evidence: Evidence) -> _Found:
-    residuals = evidence.adjust.get("residuals") or {}
-    medians = residuals.get("rotation_sigmas_median")
-    if not medians:
+    residuals = evidence.adjust.residuals
+    if residuals is None or residuals.rotation_sigmas_median is None or residuals.rotation_deg_median is None:
         yield "angles: none are given"
         return
-    sigmas = _rms(np.array(medians[:2])) / 0.6745  # of a normal distribution's absolute values
-    degrees = _rms(np.array(residuals["rotation_deg_median"][:2])) / 0.6745
+    sigmas = _rms(residuals.rotation_sigmas_median[:2]) / 0.6745  # of a normal distribution's absolute values
+    degrees = _rms(residuals.rotation_deg_median[:2]) / 0.6745
     words = f"measured tilts differ by {degrees:.2f} degrees, {sigmas:.1f} times what was stated"
     remedy = "check the convention of the angles (--set block.angles), and the heights of the positions"
     yield _finding("angles", sigmas, _TILT_SIGMAS, words, remedy)
@@ -417,34 +433,34 @@ def _angles(evidence: Evidence) -> _Found:
 
 def _control(evidence: Evidence) -> _Found:
     """Control points that contradict the others, and errors at points that took no part."""
-    control = evidence.adjust.get("control")
-    if not control or not control.get("points"):
+    control = evidence.adjust.control
+    if control is None or not control.points:
         yield "control points: none are given"
         return
-    inside = [group["control"] for group in evidence.groups if group.get("control")]
-    unlike = sorted({*(n for one in inside for n in (*one["wrong"], *one["exchanged"])), *control.get("doubtful", ())})
-    left_out = {n for one in inside if one["kept"] for n in (*one["wrong"], *one["exchanged"])}
-    count = max(control["control"] + control["check"] + len(left_out), 1)
+    inside = [group.control for group in evidence.groups if group.control]
+    unlike = sorted({*(n for one in inside for n in (*one.wrong, *one.exchanged)), *control.doubtful})
+    left_out = {n for one in inside if one.kept for n in (*one.wrong, *one.exchanged)}
+    count = max(control.control + control.check + len(left_out), 1)
     words = f"{len(unlike)} of {count} surveyed points contradict the others"
     remedy = f"{', '.join(unlike[:5])}; check their names, coordinates and where they were measured"
     yield _finding("wrong control points", len(unlike) / count, _WRONG_CONTROL, words, remedy)
-    if not control.get("sigmas_m"):
+    if control.sigmas_m is None:
         yield "control points: too few to check the block by them"
         return
     # A point is known as its survey says, and found as it is measured in its images, in a block that lies as exactly as
     # its positions or the other points put it.
-    stated_m = np.hypot(control["sigmas_m"], evidence.adjust.get("sigma_position_m") or 0.0)
+    stated_m = np.hypot(control.sigmas_m, evidence.adjust.sigma_position_m or 0.0)
     for one in inside:
-        if not one.get("kept", True):
+        if not one.kept:
             yield _refused(one, stated_m)
     # Points left out of few leave a block that is not the one that all of them hold.
-    held_out = [one for one in inside if one["kept"] and (one["held_out"] == "check points" or len(one["used"]) > 3)]
-    errors = [one["held_out_rms_m"] for one in held_out] + [control.get("check_rmse_m")]
-    errors = [error_m for error_m in errors if error_m]
-    as_it_is = list(control.get("residuals", {}).values()) if _is_as_it_is(control, inside) else []
-    up_m = shift_of_points_m(as_it_is, control["sigmas_m"])
+    held_out = [one for one in inside if one.kept and (one.held_out == "check points" or len(one.used) > 3)]
+    found = [one.held_out_rms_m for one in held_out] + [control.check_rmse_m]
+    errors = [error_m for error_m in found if error_m]
+    as_it_is = list(control.residuals.values()) if _is_as_it_is(control, inside) else []
+    up_m = shift_of_points_m(as_it_is, control.sigmas_m)
     if up_m is not None:
-        errors = [np.sqrt(np.mean((np.array(as_it_is) - [0.0, 0.0, up_m]) ** 2, axis=0)).tolist()]
+        errors = [xyz(np.sqrt(np.mean((np.array(as_it_is) - [0.0, 0.0, up_m]) ** 2, axis=0)))]
         words = (
             f"the block lies {abs(up_m):.2f} m {'above' if up_m > 0.0 else 'below'} all surveyed points: "
             f"{zeros_words(up_m)}; {height_remedy(-up_m, 'the points')}, or let some of them take part"
@@ -463,34 +479,34 @@ def _control(evidence: Evidence) -> _Found:
     yield _finding("check points", sigmas, _CONTROL_SIGMAS, words, remedy)
 
 
-def _is_as_it_is(control: Mapping[str, Any], adjusted: Sequence[Mapping[str, Any]]) -> bool:
+def _is_as_it_is(control: Control, adjusted: Sequence[ControlInGroup]) -> bool:
     """Whether residuals are of the block as it is, which no surveyed point holds."""
-    return control.get("transformation") is None and not any(one["used"] for one in adjusted)
+    return control.transformation is None and not any(one.used for one in adjusted)
 
 
-def _refused(control: Mapping[str, Any], stated_m: FloatArray) -> Finding:
+def _refused(control: ControlInGroup, stated_m: FloatArray) -> Finding:
     """Control points that the adjustment left out: because it was as good without them, or because they do not fit."""
-    errors_m = [control.get(key) for key in ("held_out_rms_m", "without_rms_m")]
+    errors_m = [control.held_out_rms_m, control.without_rms_m]
     sigmas = max(float((np.array(one) / stated_m).max()) if one else np.inf for one in errors_m)
     limit, without_m = _CONTROL_SIGMAS[0], errors_m[1]
     if without_m and sigmas <= limit:
         words = f"control points agree with the block to {_axes(without_m)} m and were not needed"
         return Finding("control points", sigmas, limit, "good", words)
     words = (
-        f"the control points fit the block if {control['fault']}; they were left out: correct the list"
-        if control.get("fault")
+        f"the control points fit the block if {control.fault}; they were left out: correct the list"
+        if control.fault
         else "the control points do not make points better that took no part, and were left out: check their "
         "coordinate system, their heights and where they were measured"
     )
     return Finding("control points", sigmas if np.isfinite(sigmas) else None, limit, "doubtful", words)
 
 
-def _axes(errors_m: Sequence[float]) -> str:
+def _axes(errors_m: Iterable[float]) -> str:
     return ", ".join(f"{axis} {error_m:.3f}" for axis, error_m in zip("xyz", errors_m, strict=True))
 
 
 def _errors(evidence: Evidence) -> _Found:
-    error_px = evidence.adjust.get("reprojection_error_px")
+    error_px = evidence.adjust.reprojection_error_px
     if error_px is None:
         return
     limits = _MEASURED_PX if evidence.refined else _DETECTED_PX
@@ -504,83 +520,102 @@ def _errors(evidence: Evidence) -> _Found:
 
 
 def _multiplicity(evidence: Evidence) -> _Found:
-    if evidence.adjust["images"] < 3:
+    if evidence.adjust.images < 3:
         return
-    length = float(evidence.adjust.get("track_length") or 0.0)
+    length = evidence.adjust.track_length
     level: Level = "good" if length >= _FEWEST_IMAGES_PER_POINT else "doubtful"
     words = f"a point is seen by {length:.1f} images"
     remedy = "" if level == "good" else ": where two see it nothing checks them; more overlap, or more keypoints, helps"
     yield Finding("images per point", length, _FEWEST_IMAGES_PER_POINT, level, words + remedy)
-    held = evidence.adjust.get("held_by_pairs")
-    if held is not None:
-        share = held / evidence.adjust["images"]
-        words = f"{held} of {evidence.adjust['images']} images have hardly a point that three images see"
-        yield _finding("held by pairs", share, _HELD_BY_PAIRS, words, "more overlap, or more keypoints, helps")
+    held = evidence.adjust.held_by_pairs
+    words = f"{held} of {evidence.adjust.images} images have hardly a point that three images see"
+    share = held / evidence.adjust.images
+    yield _finding("held by pairs", share, _HELD_BY_PAIRS, words, "more overlap, or more keypoints, helps")
 
 
 def _calibration(evidence: Evidence) -> _Found:
     """The parameter of every camera that differs most from what is known of it."""
-    told, held = set[str](), evidence.adjust.get("held_by", {})
+    told = set[str]()
     for group in evidence.groups:
-        for camera_id, camera in (group.get("calibration") or {}).items():
+        for camera_id, camera in group.calibration.items():
             if camera_id in told:  # a camera is one and the same for all groups
                 continue
-            parameters = camera["parameters"]
-            changes = {
-                name: abs(value - prior) / prior_sigma
-                for name, (value, _, prior, prior_sigma) in parameters.items()
-                if prior_sigma > 0.0 and np.isfinite(prior_sigma) and name in _stated(parameters) | {"b1", "b2"}
-            }
-            read_out = parameters.get("readout_s")
-            if read_out and read_out[1] > 0.0:
-                words = f"camera {camera_id} reads a picture in {read_out[0]:+.3f} s (rolling shutter)"
-                remedy = "no shutter needs as long, or backwards: check the times of the images"
-                readout_s = abs(read_out[0]) if read_out[0] > 0.0 else np.inf
-                yield _finding("rolling shutter", readout_s, _READOUT_S, words, remedy)
-            changes = {name: change for name, change in changes.items() if name not in held}
-            if "f" in changes and parameters["f"][1] == 0.0:
+            parameters = camera.parameters
+            yield from _read_out(camera_id, parameters)
+            changes = {name: change for name, change in _changes(parameters).items() if name not in evidence.held}
+            if "f" in changes and parameters["f"].sigma == 0.0:
                 words = (
-                    f"camera {camera_id} keeps its focal length of {_number(parameters['f'][0])} px: matches put it "
+                    f"camera {camera_id} keeps its focal length of {_number(parameters['f'].value)} px: matches put it "
                     "where no lens is, though their residuals hardly tell. Moving trees, a rolling shutter or wrong "
                     "distortion do that: a calibration of the camera, or another flying height, helps"
                 )
                 yield Finding("focal length", None, None, "doubtful", words)
             affinity = {name: changes.pop(name) for name in ({"b1", "b2"} - _stated(parameters)) & changes.keys()}
-            if affinity:
-                name = max(affinity, key=lambda key: affinity[key])
-                words = _change(camera_id, name, parameters[name], affinity[name])
-                remedy = "pixels of sensors are square: " + (
-                    "a part of the rolling shutter may be in it, which looks the same"
-                    if read_out and read_out[1] > 0.0
-                    else "a rolling shutter looks like that where images have no velocities; give capture times or a "
-                    "shorter exposure"
-                )
-                yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
+            yield from _affinity(camera_id, parameters, affinity)
             yield from _wrongly_held(evidence, camera_id, camera)
-            if not changes:
-                continue
-            told.add(camera_id)
-            yield from _flight_lenses(camera_id, camera)
-            limits = dict.fromkeys(changes, _LENS_SIGMAS)
-            if _tilt_deg(group) > _TILT_DEG[0]:  # what does not tell its tilt does not tell the principal point either
-                limits |= dict.fromkeys({"cx", "cy"} & changes.keys(), (_LENS_SIGMAS[0], None))
-            levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
-            name = max(changes, key=lambda key: (levels[key], changes[key]))
-            words = _change(camera_id, name, parameters[name], changes[name])
-            words += f" ({_held_words(evidence)})" if held else ""
-            remedy = (
-                "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
-                "as well, and heights with it"
-            )
-            yield _finding("calibration", changes[name], limits[name], words, remedy)
+            if changes:
+                told.add(camera_id)
+                yield from _flight_lenses(camera_id, camera)
+                yield _largest_change(evidence, group, camera_id, changes)
     if not told:
         yield f"calibration: {_held_words(evidence) or 'it was not adjusted'}"
+
+
+def _changes(parameters: Mapping[str, Parameter]) -> dict[str, float]:
+    """Parameters that are judged -> by how many standard deviations they differ from what was known."""
+    judged = _stated(parameters) | {"b1", "b2"}
+    return {
+        name: abs(one.value - one.prior) / one.prior_sigma
+        for name, one in parameters.items()
+        if one.prior_sigma > 0.0 and np.isfinite(one.prior_sigma) and name in judged
+    }
+
+
+def _largest_change(evidence: Evidence, group: GroupResult, camera_id: str, changes: Mapping[str, float]) -> Finding:
+    limits = dict.fromkeys(changes, _LENS_SIGMAS)
+    if _tilt_deg(group) > _TILT_DEG[0]:  # what does not tell its tilt does not tell the principal point either
+        limits |= dict.fromkeys({"cx", "cy"} & changes.keys(), (_LENS_SIGMAS[0], None))
+    levels = {key: LEVELS.index(_level(changes[key], limits[key])) for key in changes}
+    name = max(changes, key=lambda key: (levels[key], changes[key]))
+    words = _change(camera_id, name, group.calibration[camera_id].parameters[name], changes[name])
+    words += f" ({_held_words(evidence)})" if evidence.held else ""
+    remedy = (
+        "is it the calibration of this camera, at this size of the pictures? positions that are off change it "
+        "as well, and heights with it"
+    )
+    return _finding("calibration", changes[name], limits[name], words, remedy)
+
+
+def _has_read_out(parameters: Mapping[str, Parameter]) -> bool:
+    return "readout_s" in parameters and parameters["readout_s"].sigma > 0.0
+
+
+def _read_out(camera_id: str, parameters: Mapping[str, Parameter]) -> Iterator[Finding]:
+    if _has_read_out(parameters):
+        seconds = parameters["readout_s"].value
+        words = f"camera {camera_id} reads a picture in {seconds:+.3f} s (rolling shutter)"
+        remedy = "no shutter needs as long, or backwards: check the times of the images"
+        yield _finding("rolling shutter", seconds if seconds > 0.0 else np.inf, _READOUT_S, words, remedy)
+
+
+def _affinity(camera_id: str, parameters: Mapping[str, Parameter], affinity: Mapping[str, float]) -> Iterator[Finding]:
+    """affinity: by how much its parameters differ from those of square pixels, in standard deviations."""
+    if affinity:
+        name = max(affinity, key=lambda key: affinity[key])
+        words = _change(camera_id, name, parameters[name], affinity[name])
+        remedy = "pixels of sensors are square: " + (
+            "a part of the rolling shutter may be in it, which looks the same"
+            if _has_read_out(parameters)
+            else "a rolling shutter looks like that where images have no velocities; give capture times or a "
+            "shorter exposure"
+        )
+        yield _finding("affinity", affinity[name], (_LENS_SIGMAS[0], None), words, remedy)
 
 
 def _held_words(evidence: Evidence) -> str:
     """Which settings hold which parameters of the cameras, "" where none does."""
     by_setting: dict[str, list[str]] = {}
-    for name, setting in evidence.adjust.get("held_by", {}).items():
+    for name, setting in evidence.held.items():
         by_setting.setdefault(setting, []).append(name)
     whole = len(MODELS[BROWN])
     return ", ".join(
@@ -595,38 +630,39 @@ def _with_held(evidence: Evidence, remedy: str) -> str:
     return f"{remedy}; {held} of cameras as stated, which may be wrong" if held else remedy
 
 
-def _wrongly_held(evidence: Evidence, camera_id: str, camera: Mapping[str, Any]) -> Iterator[Finding]:
-    freed = camera.get("if_freed") or {"change": {}, "worth": 0.0}
-    if not freed["change"]:
+def _wrongly_held(evidence: Evidence, camera_id: str, camera: Calibration) -> Iterator[Finding]:
+    freed, known = camera.if_freed, camera.parameters
+    if not freed.change:
         return
-    known = camera["parameters"]
-    in_sigmas = {n: abs(c) / known[n][3] for n, c in freed["change"].items() if n in known and known[n][3] > 0.0}
-    name = max(in_sigmas, key=lambda key: in_sigmas[key], default=next(iter(freed["change"])))
+    in_sigmas = {
+        n: abs(c) / known[n].prior_sigma for n, c in freed.change.items() if n in known and known[n].prior_sigma > 0.0
+    }
+    name = max(in_sigmas, key=lambda key: in_sigmas[key], default=next(iter(freed.change)))
     words = (
         f"{_held_words(evidence)} of camera {camera_id}: the pictures put {name} at "
-        f"{_number(known[name][0] + freed['change'][name])}, not at {_number(known[name][0])}"
+        f"{_number(known[name].value + freed.change[name])}, not at {_number(known[name].value)}"
     )
     remedy = "free it, or give the calibration of this camera at this size of the pictures"
-    yield _finding("held calibration", freed["worth"], _FLIGHT_LENS, words, remedy)
+    yield _finding("held calibration", freed.worth, _FLIGHT_LENS, words, remedy)
 
 
-def _flight_lenses(camera_id: str, camera: Mapping[str, Any]) -> Iterator[Finding]:
-    for one in camera.get("flights", ()):
-        shown = ", ".join(f"{name} by {one['change'].get(name, 0.0):+.1f} px" for name in ("f", "cx", "cy"))
+def _flight_lenses(camera_id: str, camera: Calibration) -> Iterator[Finding]:
+    for one in camera.flights:
+        shown = ", ".join(f"{name} by {one.change.get(name, 0.0):+.1f} px" for name in ("f", "cx", "cy"))
         words = (
-            f"camera {camera_id} has another calibration in {_flight(one['flight'])} ({one['images']} images) than in "
+            f"camera {camera_id} has another calibration in {_flight(one.flight)} ({one.images} images) than in "
             f"the largest of its flights: {shown}"
         )
-        if _level(one["worth"], _FLIGHT_LENS) == "good":
-            words = f"camera {camera_id} has the same calibration in {_flight(one['flight'])} as in the largest"
+        if _level(one.worth, _FLIGHT_LENS) == "good":
+            words = f"camera {camera_id} has the same calibration in {_flight(one.flight)} as in the largest"
         remedy = (
             "was it focused or zoomed in between? with the images of each flight in a folder of their own and "
             "`--cameras folder` each flight has a camera of its own"
         )
-        yield _finding("flights of a camera", one["worth"], _FLIGHT_LENS, words, remedy)
+        yield _finding("flights of a camera", one.worth, _FLIGHT_LENS, words, remedy)
 
 
-def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float) -> str:
+def _change(camera_id: str, name: str, parameter: Parameter, sigmas: float) -> str:
     value, _, prior, prior_sigma = parameter
     return (
         f"calibration of camera {camera_id}: {name} {_number(value)} where {_number(prior)} +- {_number(prior_sigma)} "
@@ -634,36 +670,32 @@ def _change(camera_id: str, name: str, parameter: Sequence[float], sigmas: float
     )
 
 
-def _stated(parameters: Mapping[str, Sequence[float]]) -> set[str]:
+def _stated(parameters: Mapping[str, Parameter]) -> set[str]:
     """Parameters that are judged by what is known of them: of a lens that nobody has calibrated, terms of distortion
     are what they are, and those of affinity are judged by themselves."""
     terms = {"k1", "k2", "k3", "p1", "p2", "b1", "b2"}
-    calibrated = any(parameters[name][2] != 0.0 for name in terms & parameters.keys())
+    calibrated = any(parameters[name].prior != 0.0 for name in terms & parameters.keys())
     return {"f", "cx", "cy"} | (terms if calibrated else set())
 
 
 def _deformation(evidence: Evidence) -> _Found:
     """Of the group that is worst in each respect."""
-    known = [group for group in evidence.groups if group.get("heights")]
+    known = [(group, group.heights) for group in evidence.groups if group.heights]
     if not known:
         yield "expected deformation: the block was not adjusted, or has too few points"
         return
 
-    def length(group: Mapping[str, Any], what: str) -> str:
-        value_m = group["heights"].get(f"{what}_m")  # None in a frame without metres
-        return f"{_pixels(group, what):.1f} ground pixels" + ("" if value_m is None else f" ({plain(value_m)} m)")
+    def part(group: GroupResult) -> str:
+        return "the block" if len(evidence.groups) == 1 else f"the part of {group.images} images"
 
-    def part(group: Mapping[str, Any]) -> str:
-        return "the block" if len(evidence.groups) == 1 else f"the part of {group['images']} images"
-
-    worst = max(known, key=lambda group: _pixels(group, "bowl"))
-    words = f"the middle of {part(worst)} may lie {length(worst, 'bowl')} above or below its border"
+    worst, heights = max(known, key=lambda one: one[1].in_pixels(one[1].bowl))
+    words = f"the middle of {part(worst)} may lie {_length(heights, heights.bowl)} above or below its border"
     remedy = f"straight views from one height do not determine it; {_STRIPS}"
-    yield _finding("bowl", _pixels(worst, "bowl"), _BOWL_PIXELS, words, remedy)
-    placed = [group for group in known if group["kind"] != "level"]
+    yield _finding("bowl", heights.in_pixels(heights.bowl), _BOWL_PIXELS, words, remedy)
+    placed = [one for one in known if one[0].kind != "level"]
     if not placed:
         return
-    worst = max(placed, key=_tilt_deg)
+    worst = max((group for group, _ in placed), key=_tilt_deg)
     angle = _tilt_deg(worst)
     words = f"{part(worst)} may be tilted by {angle:.2f} degrees"
     remedy = (
@@ -671,35 +703,34 @@ def _deformation(evidence: Evidence) -> _Found:
         "measured angles, or three control points tell"
     )
     yield _finding("tilt", angle, _TILT_DEG, words, remedy)
-    placed = [group for group in placed if group.get("positions")]
-    if placed:
-        worst = max(placed, key=lambda group: _pixels(group, "sigma"))
-        stated_m = worst["positions"]["stated_m"][2]
+    stated = [(group, heights, group.positions.stated_m[2]) for group, heights in placed if group.positions]
+    if stated:
+        worst, heights, stated_m = max(stated, key=lambda one: one[1].in_pixels(one[1].sigma))
         # As exact as positions are is as exact as can be asked for.
-        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * stated_m / worst["heights"]["pixel_m"])
-        words = f"heights of {part(worst)} are exact to {length(worst, 'sigma')}, its positions to {plain(stated_m)} m"
+        limit = max(_HEIGHT_PIXELS, _HEIGHT_SIGMAS * heights.in_pixels(stated_m))
+        exact = _length(heights, heights.sigma)
+        words = f"heights of {part(worst)} are exact to {exact}, its positions to {plain(stated_m)} m"
         remedy = f"its images do not tell heights from focal length and tilt; {_STRIPS}"
-        yield _finding("heights", _pixels(worst, "sigma"), (limit, None), words, remedy)
+        yield _finding("heights", heights.in_pixels(heights.sigma), (limit, None), words, remedy)
 
 
-def _pixels(group: Mapping[str, Any], what: str) -> float:
-    """A length of the heights of a part whose heights are known, in ground pixels."""
-    heights = without_units(group["heights"])
-    return float(heights[what] / heights["pixel"])
+def _length(heights: HeightErrors, value: float) -> str:
+    """A length in ground pixels and, where it has them, in metres."""
+    return f"{heights.in_pixels(value):.1f} ground pixels" + (f" ({plain(value)} m)" if heights.metric else "")
 
 
-def _tilt_deg(group: Mapping[str, Any]) -> float:
+def _tilt_deg(group: GroupResult) -> float:
     """Expected error of a part's tilt; 0 where it is not known."""
-    heights = without_units(group.get("heights") or {})
-    return float(np.rad2deg(np.arctan2(heights["tilt"], heights["reach"]))) if heights else 0.0
+    heights = group.heights
+    return 0.0 if heights is None else float(np.rad2deg(np.arctan2(heights.tilt, heights.reach)))
 
 
 def _kept_poses(evidence: Evidence) -> _Found:
     """Of poses that were kept as they were given, whether they explain the matches."""
     orient = evidence.orient
-    if not orient.get("stays") or not orient.get("images_matched"):
+    if orient is None or not orient.stays or not orient.images_matched:
         return
-    matched, explained = orient["images_matched"], orient["given_poses_explained"]
+    matched, explained = orient.images_matched, orient.given_poses_explained
     words = f"given poses explain the matches of {explained} of {matched} images"
     remedy = "they are kept because of orient=given; orient=global finds better ones"
     yield _finding("kept poses", 1.0 - explained / matched, _UNEXPLAINED, words, remedy)
@@ -711,11 +742,6 @@ def _rms(values: Any) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
-
-
-def without_units(lengths: Mapping[str, Any]) -> dict[str, Any]:
-    """The same by names without "_m", which those of a frame of arbitrary scale do not have."""
-    return {name.removesuffix("_m"): value for name, value in lengths.items()}
 
 
 def plain(value: float, digits: int = 2) -> str:

@@ -33,16 +33,17 @@ from aeromatch_cli.orientation.adjusting import (
     keep_images,
     state_errors,
 )
-from aeromatch_cli.orientation.adjustment_facts import adjustment_facts
 from aeromatch_cli.orientation.bundle.adjust import Options
 from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
 from aeromatch_cli.orientation.bundle.network import READOUT
 from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of, set_lens
 from aeromatch_cli.orientation.control_adjustment import Surveyed, with_control
+from aeromatch_cli.orientation.group_results import Names, adjusted_group
 from aeromatch_cli.orientation.joining import Part, joined
 from aeromatch_cli.orientation.process import ANY_DISTORTION, quiet_pycolmap
 from aeromatch_cli.orientation.results import BEHIND_PX, arrays, figures, tracks_of
 from aeromatch_cli.orientation.spread import take_poses, thinned
+from aeromatch_cli.results.adjustment import ControlInGroup, GroupResult
 
 # Points are made and poses adjusted again while that takes away this share of the reprojection error.
 _WORTH_AGAIN = 0.1
@@ -77,7 +78,8 @@ def refine(folder: Path) -> None:
         pycolmap, task["cameras"], Options(_COST_TOLERANCE, final=True, choose=task["chosen"], readout=task["readout"])
     )
     _hold_all_that_adjusts(work, folder)
-    facts: list[dict[str, Any]] = []
+    models: list[dict[str, Any]] = []
+    names = Names(**task["names"])
     surveyed = [Surveyed.of_task(entry) for entry in task["control"]]
     waiting = deque(task["groups"])
     if len(waiting) > 1 and not task["fixed"]:
@@ -101,7 +103,7 @@ def refine(folder: Path) -> None:
         attitudes = _attitudes(model, given) if group["kind"] == "given" else ()
         registered: list[int] = []
         outcome: Outcome | None = None
-        control: dict[str, Any] = {}
+        control: ControlInGroup | None = None
         if free:
             if task["more"]:
                 model, registered = _grown(pycolmap, model, folder, grouped - set(group["images"]))
@@ -117,15 +119,17 @@ def refine(folder: Path) -> None:
             continue
         lenses = {n: work.lens(model, n) for n in images_by_camera(model)}
         held |= lenses.keys()
-        name = f"model{len(facts)}.npz"
+        name = f"model{len(models)}.npz"
         deviations: dict[str, Any] = dict(_deviations(model, given, outcome))
         sweeps_m = _sweeps_m(model, given, lenses)
         np.savez(folder / name, **arrays(model, lenses), **tracks_of(model), **deviations, sweeps_m=sweeps_m)
-        metric, known = group["kind"] != "level", dict[str, Any]()
+        result = GroupResult(
+            kind=group["kind"], registered=[*map(names.image, registered)], control=control, **figures(model)
+        )
         if outcome is not None:
-            known = adjustment_facts(outcome, observed, metric=metric) | {"control": control}
-        facts.append({"file": name, "kind": group["kind"], "registered": registered, **figures(model), **known})
-    (folder / "result.json").write_text(json.dumps({"models": facts}), encoding="utf-8")
+            result = adjusted_group(result, outcome, observed, names)
+        models.append({"file": name, "result": result.as_json()})
+    (folder / "result.json").write_text(json.dumps({"models": models}), encoding="utf-8")
 
 
 def _hold_all_that_adjusts(work: Work, folder: Path) -> None:
@@ -204,7 +208,7 @@ def _refined(
     attitudes: Collection[int],
     held: Collection[int],
     surveyed: Sequence[Surveyed],
-) -> tuple[Any, Outcome | None, dict[str, Any]]:
+) -> tuple[Any, Outcome | None, ControlInGroup | None]:
     """The model adjusted and triangulated in turn, while that makes it better; the last adjustment, and what control
     points say.
 
@@ -213,7 +217,7 @@ def _refined(
     if kind == "positions":
         given = replace(given, ups=believed_tilts(work.pycolmap, model, given))
     outcome: Outcome | None = None
-    control: dict[str, Any] = {}
+    control: ControlInGroup | None = None
     for number in range(_MAX_ROUNDS):
         if model.num_points3D() < MIN_OBSERVATIONS:
             break

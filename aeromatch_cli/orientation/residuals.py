@@ -10,6 +10,7 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, IntArray, Pose, PoseResidual
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.orientation.block_figures import images_per_point
+from aeromatch_cli.results.adjustment import PoseResiduals, Worst
 
 _UNKNOWN = np.full(3, np.nan)
 
@@ -66,12 +67,9 @@ def _residual(
     )
 
 
-def residual_figures(residuals: Mapping[str, PoseResidual], names: Mapping[str, str]) -> dict[str, Any]:
-    """What all images together show, JSON-ready; None where nothing was given to compare with.
-
-    names: of the files, by image_id. Lists hold x, y and z: root mean squares, and medians of the absolute values. The
-    worst image is that with the longest residual, its name and figure.
-    """
+def residual_figures(residuals: Mapping[str, PoseResidual], names: Mapping[str, str]) -> PoseResiduals:
+    """What all images together show. names: of the files, by image_id. The worst image is that with the longest
+    residual."""
     figures: dict[str, Any] = {"images": len(residuals)}
     for key in ("position_m", "position_sigmas", "rotation_deg", "rotation_sigmas"):
         values = {i: getattr(one, key) for i, one in residuals.items() if np.isfinite(getattr(one, key)).all()}
@@ -83,16 +81,16 @@ def residual_figures(residuals: Mapping[str, PoseResidual], names: Mapping[str, 
     errors = {i: one.error_px for i, one in residuals.items() if np.isfinite(one.error_px)}
     figures["error_px_median"] = float(_rounded([np.median(list(errors.values()))])[0]) if errors else None
     figures["error_px_worst"] = _worst(errors, names)
-    return figures
+    return PoseResiduals(**figures)
 
 
 def _rounded(values: Iterable[float]) -> list[float]:
     return [float(f"{value:.4g}") for value in values]
 
 
-def _worst(values: Mapping[str, float], names: Mapping[str, str]) -> list[Any] | None:
-    """Name and value of the image with the largest; None of none."""
+def _worst(values: Mapping[str, float], names: Mapping[str, str]) -> Worst | None:
+    """The image with the largest value; None of none."""
     if not values:
         return None
     worst = max(values, key=lambda image_id: values[image_id])
-    return [names.get(worst, worst), *_rounded([values[worst]])]
+    return Worst(names.get(worst, worst), _rounded([values[worst]])[0])

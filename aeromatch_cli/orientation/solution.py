@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -24,11 +23,12 @@ from aeromatch_cli.orientation.judgement import (
     position_errors_m,
     triangulated,
 )
-from aeromatch_cli.orientation.mapping import Model
+from aeromatch_cli.orientation.mapping import Group, Model
 from aeromatch_cli.orientation.resection import resected
 from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, SLACK
 from aeromatch_cli.orientation.strips import predicted
 from aeromatch_cli.orientation.tying import tied_by_pairs
+from aeromatch_cli.results.stages import FocalChange, OrientResult
 
 # Given poses stay where they explain the matches of this share of the images: single others are corrected.
 _MOST = 0.6
@@ -54,12 +54,13 @@ _STANDING_PX = 2.0
 @dataclass(frozen=True, eq=False)
 class Solution:
     """cameras: camera_id -> Camera. poses: image_id -> Pose. terrains: of flights that lie apart, the largest first.
-    facts: JSON-ready, see orientation.json in `formats`."""
+    groups: images that were oriented together, the largest group first. result: what the stage reports."""
 
     cameras: Mapping[str, Camera]
     poses: Mapping[str, Pose]
     terrains: tuple[Terrain, ...]
-    facts: Mapping[str, Any]
+    groups: tuple[Group, ...]
+    result: OrientResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,19 +120,19 @@ def from_given(evidence: Evidence, good: set[str], *, correct: bool) -> Solution
     seen = known | found or {i: pose for i, pose in poses.items() if pose.world_rotation is not None}
     groups = connected_groups([(p.image_id0, p.image_id1) for p in pairs if {p.image_id0, p.image_id1} <= seen.keys()])
     terrains, points = _terrains(evidence, seen, groups, cameras)
-    facts = {
-        "poses_from": "given poses",
-        "frame": "world",
-        "corrected": sorted(found) if correct else [],
-        "stays": not correct,
-        "remarks": [],
-        "focal_lengths": _focal_lengths(evidence.stated_cameras, block.cameras),
-        "groups": [{"kind": "given", "images": sorted(i for i in poses if poses[i].world_rotation is not None)}],
-        "points": points,
+    result = OrientResult(
+        poses_from="given poses",
+        frame="world",
+        corrected=sorted(found) if correct else [],
+        stays=not correct,
+        remarks=[],
+        focal_lengths=_focal_lengths(evidence.stated_cameras, block.cameras),
+        points=points,
+        outside=_outside(block, poses),
         **_judged(block.poses, found),
-        "outside": _outside(block, poses),
-    }
-    return Solution(block.cameras, poses, terrains, facts)
+    )
+    held = Group("given", tuple(sorted(i for i in poses if poses[i].world_rotation is not None)))
+    return Solution(block.cameras, poses, terrains, (held,), result)
 
 
 def unoriented_remark(evidence: Evidence) -> str:
@@ -151,18 +152,24 @@ def unoriented_remark(evidence: Evidence) -> str:
 
 def judged(given: Solution, pictures: Solution) -> Solution:
     """Given poses as they are, with what the pictures say against them."""
-    against = {key: pictures.facts[key] for key in ("wrong_attitudes", "wrong_positions", "focal_lengths", "remarks")}
-    against["remarks"] = [*against["remarks"], *_kept_remarks(given, pictures)]
-    better = pictures if pictures.facts["frame"] == "world" and pictures.terrains else given
-    return replace(given, terrains=better.terrains, facts={**given.facts, **against, "points": better.facts["points"]})
+    found = pictures.result
+    better = pictures if found.frame == "world" and pictures.terrains else given
+    against = {
+        "wrong_attitudes": found.wrong_attitudes,
+        "wrong_positions": found.wrong_positions,
+        "focal_lengths": found.focal_lengths,
+        "remarks": [*found.remarks, *_kept_remarks(given, pictures)],
+        "points": better.result.points,
+    }
+    return replace(given, terrains=better.terrains, result=given.result.model_copy(update=against))
 
 
 def _kept_remarks(given: Solution, pictures: Solution) -> list[str]:
     """How far given poses, which stay, are from those of the pictures."""
-    oriented = {i for group in pictures.facts["groups"] for i in group["images"]}
+    oriented = {i for group in pictures.groups for i in group.images}
     found = {i: pictures.poses[i] for i in sorted(oriented & pictures.poses.keys())}
     off_deg = list(attitude_errors_deg(given.poses, found).values())
-    if not off_deg or pictures.facts["frame"] != "world":
+    if not off_deg or pictures.result.frame != "world":
         return []
     off_m = list(position_errors_m(given.poses, found).values())
     return [
@@ -212,21 +219,20 @@ def from_models(
     }
     judged_poses = {i: pose for i, pose in found.items() if i not in beside}
     wrong = _judged(block.poses, judged_poses, convention, angles, north_deg)
-    facts = {
-        "poses_from": "pictures",
-        "stays": False,
-        "frame": "own" if own else "world",
-        "models": [dict(model.figures) | {"kind": model.kind} for model in models],
-        "groups": groups,
-        "by_one_pair": sorted(tied),
-        "calibrated": sorted({k for model in models for k in model.cameras}),
-        "points": points,
+    result = OrientResult(
+        poses_from="pictures",
+        stays=False,
+        frame="own" if own else "world",
+        models=[model.figures for model in models],
+        by_one_pair=sorted(tied),
+        calibrated=sorted({k for model in models for k in model.cameras}),
+        points=points,
+        focal_lengths=_focal_lengths(evidence.stated_cameras, cameras),
+        outside=_outside(block, found),
+        remarks=[*_position_remarks(models, exchanged), *_convention_remarks(convention)],
         **wrong,
-        "focal_lengths": _focal_lengths(evidence.stated_cameras, cameras),
-        "outside": _outside(block, found),
-        "remarks": [*_position_remarks(models, exchanged), *_convention_remarks(convention)],
-    }
-    return Solution(cameras, poses, terrains, facts)
+    )
+    return Solution(cameras, poses, terrains, groups, result)
 
 
 def _loose_poses(
@@ -245,13 +251,13 @@ def _loose_poses(
     return {i: by_strip.get(i, replace(given[i], world_rotation=None)) for i in sorted(outside - evidence.consistent())}
 
 
-def _groups_with(models: Sequence[Model], anchors: Mapping[str, str]) -> list[dict[str, Any]]:
+def _groups_with(models: Sequence[Model], anchors: Mapping[str, str]) -> tuple[Group, ...]:
     """Images of every model, and those tied to them. anchors: tied image -> the image that it was tied to, which may
     be a tied one itself, earlier in order."""
     groups = [(model.kind, set(model.rotations)) for model in models]
     for image_id, anchor in anchors.items():
         next(images for _, images in groups if anchor in images).add(image_id)
-    return [{"kind": kind, "images": sorted(images)} for kind, images in groups]
+    return tuple(Group(kind, tuple(sorted(images))) for kind, images in groups)
 
 
 def _same_lens(found: Camera | None, old: Camera) -> bool:
@@ -288,7 +294,7 @@ def _convention_remarks(convention: Recognised | None) -> list[str]:
 
 
 def _position_remarks(models: Sequence[Model], exchanged: str) -> list[str]:
-    contradiction = models[0].figures.get("contradiction") if models else ""
+    contradiction = models[0].figures.contradiction if models else ""
     said = "the given positions do not fit the pictures"
     if not contradiction:
         return []
@@ -305,7 +311,7 @@ def _judged(
     convention: Recognised | None = None,
     as_given: Mapping[str, Angles] | None = None,
     north_deg: Mapping[str, float] | None = None,
-) -> dict[str, Any]:
+) -> dict[str, dict[str, float]]:
     """Given attitudes and positions that those found contradict: image_id -> degrees, image_id -> metres.
 
     north_deg: image_id -> standard deviation of north in the frame of what was found, where it is not exact.
@@ -328,10 +334,11 @@ def _judged(
     }
 
 
-def _focal_lengths(given: Mapping[str, Camera], found: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
+def _focal_lengths(given: Mapping[str, Camera], found: Mapping[str, Camera]) -> dict[str, FocalChange]:
     """camera_id -> focal lengths given and found, pixels, where they differ."""
     both = {k: (focal_px(camera), focal_px(found[k])) for k, camera in sorted(given.items())}
-    return {k: (round(old, 1), round(new, 1)) for k, (old, new) in both.items() if abs(new / old - 1.0) > _FOCAL_SHARE}
+    changed = {k: sizes for k, sizes in both.items() if abs(sizes[1] / sizes[0] - 1.0) > _FOCAL_SHARE}
+    return {k: FocalChange(round(old, 1), round(new, 1)) for k, (old, new) in changed.items()}
 
 
 def _flying_height_m(evidence: Evidence, poses: Mapping[str, Pose]) -> float:

@@ -78,7 +78,7 @@ def only(model: Model, image_ids: Collection[str]) -> Model:
         model,
         rotations={i: model.rotations[i] for i in left},
         centers_m={i: model.centers_m[i] for i in left},
-        figures=dict(model.figures) | {"images": len(left)},
+        figures=model.figures.model_copy(update={"images": len(left)}),
     )
 
 

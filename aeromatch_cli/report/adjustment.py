@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
@@ -13,12 +12,14 @@ from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
+from aeromatch_cli.results.adjustment import Control
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, OrientResult
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.lines import control_words
-from aeromatch_cli.stages.stage_report import facts_on_file
+from aeromatch_cli.stages.lines import control_of, control_words
+from aeromatch_cli.stages.stage_report import result_on_file
 
-# Where cx and cy of cameras count from, on the page and in facts.
+# Where cx and cy of cameras count from, on the page and in files.
 PRINCIPAL_POINT = "cx, cy from the corner of the first pixel, as in COLMAP"
 
 
@@ -37,35 +38,32 @@ class Adjustment:
     """What the stages adjust and consistency state of the present matches; nothing where they state it of earlier ones.
     in_world: else the frame is the pictures' own, and no length in it is a metre."""
 
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    judged: Mapping[str, Any] = field(default_factory=dict)
+    found: AdjustResult = field(default_factory=lambda: AdjustResult(images=0))
+    judged: ConsistencyResult = field(default_factory=ConsistencyResult)
     outdated: bool = False
     in_world: bool = True
 
-    @property
-    def spread(self) -> Mapping[str, Sequence[int]]:
-        """image_id -> ninths with a point, empty ones, points of three images and more."""
-        return dict(self.judged.get("spread", {}))
-
 
 def read_adjustment(context: Context) -> Adjustment:
-    facts = facts_on_file(context.workspace, "adjust")
-    in_world = facts_on_file(context.workspace, "orient").get("frame") != "own"
-    if facts.get("points") and not adjust.is_current(context):
+    found = result_on_file(context.workspace, AdjustResult) or AdjustResult(images=0)
+    oriented = result_on_file(context.workspace, OrientResult)
+    in_world = oriented is None or oriented.frame != "own"
+    if found.points and not adjust.is_current(context):
         return Adjustment(outdated=True, in_world=in_world)
-    return Adjustment(facts, facts_on_file(context.workspace, "consistency"), in_world=in_world)
+    judged = result_on_file(context.workspace, ConsistencyResult) or ConsistencyResult()
+    return Adjustment(found, judged, in_world=in_world)
 
 
 def final_points(context: Context, adjustment: Adjustment) -> AdjustedBlock | None:
     """The adjusted block with the points that final matches hold; None where the last adjustment found none."""
     path = context.workspace.final_or_adjusted
-    return read_adjusted(path) if adjustment.facts.get("points") and path.is_file() else None
+    return read_adjusted(path) if adjustment.found.points and path.is_file() else None
 
 
 def read_position_residuals(context: Context, adjustment: Adjustment) -> dict[str, PoseResidual]:
     """By image_id; none of earlier matches, and of an adjustment by an earlier version."""
     path = context.workspace.residuals
-    return read_residuals(path, context.block.images) if adjustment.facts.get("points") and path.is_file() else {}
+    return read_residuals(path, context.block.images) if adjustment.found.points and path.is_file() else {}
 
 
 def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> list[Notice]:
@@ -74,14 +72,14 @@ def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> li
     if adjustment.outdated:
         text = "Run aeromatch adjust, or aeromatch run: what they tell is of earlier matches, and is left out here."
         return [Notice("warn", "Adjustment and points are older than the matches", text)]
-    names, adjusted = {row.image_id: row.name for row in images}, adjustment.facts
-    found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.get("remarks", ())]
-    control = adjusted.get("control")
-    if control and (not control.get("residuals") or control.get("rays_do_not_meet")):
+    names, adjusted = {row.image_id: row.name for row in images}, adjustment.found
+    found = [Notice("warn", "Note on the adjustment", remark) for remark in adjusted.remarks]
+    control = adjusted.control
+    if control and (not control.residuals or control.rays_do_not_meet):
         # What the section below cannot show.
         found.append(Notice("warn", "Note on the control points", ". ".join(control_words(control))))
-    outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.get("outside", {}).items())
-    doubtful = adjustment.judged.get("doubtful", ())
+    outside = tuple(f"{names.get(i, i)}: {reason}" for i, reason in adjusted.outside.items())
+    doubtful = adjustment.judged.doubtful
     if outside:
         text = "Their matches are exported, but they have no adjusted pose and see no point."
         found.insert(0, Notice("bad", counted(len(outside), "image", "images") + " not oriented", text, outside))
@@ -94,48 +92,53 @@ def adjustment_notices(images: Sequence[ImageRow], adjustment: Adjustment) -> li
 
 def adjustment_rows(adjustment: Adjustment) -> list[tuple[str, str]]:
     """Figures of the bundle adjustment, and of the control points."""
-    facts = adjustment.facts
-    if not facts.get("points"):
+    adjusted = adjustment.found
+    if not adjusted.points:
         return []
     found = [
-        ("Oriented images", f"{facts['images']:,}"),
-        ("Points", f"{facts['points']:,} in {facts['track_length']:.1f} images each"),
-        ("Reprojection error", f"{facts['reprojection_error_px']:.2f} px, mean"),
+        ("Oriented images", f"{adjusted.images:,}"),
+        ("Points", f"{adjusted.points:,} in {adjusted.track_length:.1f} images each"),
     ]
-    units = ("sigma_position_m", "m"), ("sigma_angle_deg", "degrees")
-    sigmas = [f"{facts[key]:.3g} {unit}" for key, unit in units if facts[key] is not None]
+    if adjusted.reprojection_error_px is not None:
+        found.append(("Reprojection error", f"{adjusted.reprojection_error_px:.2f} px, mean"))
+    stated = (adjusted.sigma_position_m, "m"), (adjusted.sigma_angle_deg, "degrees")
+    sigmas = [f"{value:.3g} {unit}" for value, unit in stated if value is not None]
     if sigmas:
         found.append(("Standard deviations of the poses", f"{', '.join(sigmas)}, median"))
-    stated = facts.get("cameras", {}).items()
-    cameras = {i: from_colmap(model, width, height, tuple(params)) for i, (model, width, height, params) in stated}
+    cameras = {
+        camera_id: from_colmap(one.model, one.width_px, one.height_px, tuple(one.parameters))
+        for camera_id, one in adjusted.cameras.items()
+    }
     if cameras:
         found.append((f"Cameras after the adjustment ({PRINCIPAL_POINT})", camera_words(cameras)))
-    control = facts["control"]
-    if control and control["control_rmse_m"]:
-        found.append(("Control points", f"{control['control']}; {offset_words(control)}"))
-        found.append(("Control points after a similarity", f"RMSE {_metres(control['control_rmse_m'])}"))
-        if control["check_rmse_m"]:
-            kind = f"{control['check']} check points" if control["check"] else "Control points, each left out once"
-            found.append((f"{kind}, after it", f"RMSE {_metres(control['check_rmse_m'])}"))
-        if control["doubtful"]:
-            found.append(("Control points that the others contradict", ", ".join(control["doubtful"])))
-    elif control and control.get("residuals"):
-        counts, *words = control_words(control, [group.get("control") or {} for group in facts["groups"]])
+    control = adjusted.control
+    if control and control.control_rmse_m:
+        found.append(("Control points", f"{control.control}; {offset_words(control)}"))
+        found.append(("Control points after a similarity", f"RMSE {_metres(control.control_rmse_m)}"))
+        if control.check_rmse_m:
+            kind = f"{control.check} check points" if control.check else "Control points, each left out once"
+            found.append((f"{kind}, after it", f"RMSE {_metres(control.check_rmse_m)}"))
+        if control.doubtful:
+            found.append(("Control points that the others contradict", ", ".join(control.doubtful)))
+    elif control and control.residuals:
+        counts, *words = control_words(control, control_of(adjusted.groups))
         found.append((counts.capitalize(), "; ".join(words)))
     return found
 
 
-def surveyed_rows(facts: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def surveyed_rows(control: Control | None) -> list[tuple[str, ...]]:
     """Of every surveyed point (name, part, x, y, z in metres, its length in ground pixels, the largest of the three in
     standard deviations, images, root mean square of its residuals there in pixels)."""
-    control, rows = facts.get("control") or {}, []
-    for name, error_m in control.get("residuals", {}).items():
+    rows: list[tuple[str, ...]] = []
+    if control is None or control.ground_pixel_m is None:
+        return rows
+    for name, error_m in control.residuals.items():
         metres = [f"{value:+.3f}" for value in error_m]
-        pixels = f"{math.hypot(*error_m) / control['ground_pixel_m']:.1f}"
-        sigmas = f"{max(abs(e) / s for e, s in zip(error_m, control['point_sigmas_m'][name], strict=True)):.1f}"
-        lengths_px = [math.hypot(*off_px) for off_px in control["image_residuals_px"][name].values()]
+        pixels = f"{math.hypot(*error_m) / control.ground_pixel_m:.1f}"
+        sigmas = f"{max(abs(e) / s for e, s in zip(error_m, control.point_sigmas_m[name], strict=True)):.1f}"
+        lengths_px = [math.hypot(*off_px) for off_px in control.image_residuals_px[name].values()]
         in_images = f"{math.hypot(*lengths_px) / math.sqrt(len(lengths_px)):.2f}" if lengths_px else ""
-        part = "check" if name in control["checks"] else "control"
+        part = "check" if name in control.checks else "control"
         rows.append((name, part, *metres, pixels, sigmas, f"{len(lengths_px)}", in_images))
     return rows
 

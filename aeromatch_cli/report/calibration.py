@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
 from aeromatch_cli.orientation.bundle.network import LENS
 from aeromatch_cli.orientation.calibration import camera_of
-from aeromatch_cli.orientation.quality import without_units
 from aeromatch_cli.report.figures import (
     COLOURS,
     PlanSize,
@@ -24,6 +22,8 @@ from aeromatch_cli.report.figures import (
     round_length,
     svg,
 )
+from aeromatch_cli.results.adjustment import Calibration, Parameter
+from aeromatch_cli.results.stages import AdjustResult
 
 # Cells along the longer side of a picture; a mean of fewer residuals shows their noise.
 _CELLS, _FEWEST = 16, 5
@@ -63,36 +63,36 @@ class HeightsSection:
 
 
 def camera_sections(
-    facts: Mapping[str, Any],
+    found: AdjustResult,
     adjusted: AdjustedBlock,
     images: Sequence[Image],
     keypoints_px: Callable[[str], FloatArray],
 ) -> list[CameraSection]:
-    """One of every camera that was adjusted. facts: of the stage adjust. keypoints_px: image_id -> (K, 2)."""
+    """One of every camera that was adjusted. keypoints_px: image_id -> (K, 2)."""
     sections: dict[str, CameraSection] = {}
-    for group in facts.get("groups", ()):
-        for camera_id, calibration in (group.get("calibration") or {}).items():
+    for group in found.groups:
+        for camera_id, calibration in group.calibration.items():
             camera = adjusted.cameras.get(camera_id)
             if camera is None or camera_id in sections:
                 continue
             own = [image.image_id for image in images if image.camera_id == camera_id]
             fields = (
-                _moved(calibration["parameters"], camera, camera_id),
+                _moved(calibration.parameters, camera, camera_id),
                 _remaining(adjusted, camera, camera_id, own, keypoints_px),
             )
-            words = f"{calibration['images']} images, {camera.model}, {camera.width_px} x {camera.height_px} px"
+            words = f"{calibration.images} images, {camera.model}, {camera.width_px} x {camera.height_px} px"
             shown = tuple(field for field in fields if field is not None)
-            rows = tuple(_rows(calibration, facts.get("held_by", {})))
+            rows = tuple(_rows(calibration, found.held_by))
             sections[camera_id] = CameraSection(camera_id, words, rows, shown)
     return [sections[camera_id] for camera_id in sorted(sections)]
 
 
-def _rows(calibration: Mapping[str, Any], held_by: Mapping[str, str]) -> Iterator[tuple[str, ...]]:
+def _rows(calibration: Calibration, held_by: Mapping[str, str]) -> Iterator[tuple[str, ...]]:
     related: dict[str, list[str]] = {}
-    for first, second, value in calibration["correlations"]:
+    for first, second, value in calibration.correlations:
         related.setdefault(first, []).append(f"{second} {value:+.2f}")
         related.setdefault(second, []).append(f"{first} {value:+.2f}")
-    for name, (value, sigma, prior, prior_sigma) in calibration["parameters"].items():
+    for name, (value, sigma, prior, prior_sigma) in calibration.parameters.items():
         held = sigma == 0.0
         change = f"{round((value - prior) / prior_sigma, 1) + 0.0:+.1f}" if prior_sigma > 0.0 and not held else ""
         digits = 2 if _UNITS.get(name) == "px" else 6
@@ -114,9 +114,9 @@ def _grid(camera: Camera) -> tuple[int, int, float]:
     return max(1, round(camera.width_px / cell_px)), max(1, round(camera.height_px / cell_px)), cell_px
 
 
-def _moved(parameters: Mapping[str, Sequence[float]], camera: Camera, camera_id: str) -> tuple[str, str] | None:
+def _moved(parameters: Mapping[str, Parameter], camera: Camera, camera_id: str) -> tuple[str, str] | None:
     """By how much the adjusted camera moves image points against the one known before."""
-    lens = np.array([parameters[name][2] if name in parameters else 0.0 for name in LENS])
+    lens = np.array([parameters[name].prior if name in parameters else 0.0 for name in LENS])
     lens[[LENS.index("cx"), LENS.index("cy")]] -= COLMAP_OFFSET_PX
     before = camera_of(lens, camera)
     columns, rows, cell_px = _grid(camera)
@@ -192,24 +192,23 @@ def _arrows(camera: Camera, places: FloatArray, vectors_px: FloatArray, title: s
     return svg(axes.figure, title, "lens", {})
 
 
-def heights_section(facts: Mapping[str, Any]) -> HeightsSection | None:
-    """Of the largest group whose errors are known. facts: of the stage adjust."""
-    stated = next((group["heights"] for group in facts.get("groups", ()) if group.get("heights")), None)
-    if not stated:
+def heights_section(found: AdjustResult) -> HeightsSection | None:
+    """Of the largest group whose errors are known."""
+    heights = next((group.heights for group in found.groups if group.heights is not None), None)
+    if heights is None:
         return None
-    heights, in_world = without_units(stated), "pixel_m" in stated
-    points = np.array(heights["points"], dtype=np.float64).reshape(-1, 3)
+    points = np.array(heights.points, dtype=np.float64).reshape(-1, 3)
 
-    def length(what: str) -> str:
-        pixels = f"{heights[what] / heights['pixel']:.1f} ground pixels"
-        return f"{heights[what]:.3f} m ({pixels})" if in_world else pixels
+    def length(value: float) -> str:
+        pixels = f"{heights.in_pixels(value):.1f} ground pixels"
+        return f"{value:.3f} m ({pixels})" if heights.metric else pixels
 
     words = (
         f"Standard deviations of the heights of {len(points)} points, as measurements and geometry let expect them; "
-        f"median {length('sigma')}. The middle of the block may lie {length('bowl')} above or "
-        f"below its border, one side {length('tilt')} above or below the middle."
+        f"median {length(heights.sigma)}. The middle of the block may lie {length(heights.bowl)} above or "
+        f"below its border, one side {length(heights.tilt)} above or below the middle."
     )
-    return HeightsSection(_height_map(points, heights["pixel"], in_world=in_world), words)
+    return HeightsSection(_height_map(points, heights.pixel, in_world=heights.metric), words)
 
 
 def _height_map(points: FloatArray, pixel: float, *, in_world: bool) -> str:

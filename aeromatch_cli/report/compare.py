@@ -16,10 +16,11 @@ from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_csv, read_images, read_pairs
 from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
 from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.quality import quality_on_file
-from aeromatch_cli.stages.stage_report import facts_on_file
+from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 _LISTED = 10
@@ -32,16 +33,16 @@ _UNORIENTED = "predicted"
 
 @dataclass(frozen=True)
 class _Side:
-    """images: by name. matches: verified ones by pair of image names. seconds: by stage. adjusted, consistent: facts of
-    these stages. oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its
+    """images: by name. matches: verified ones by pair of image names. seconds: by stage. adjusted, consistent: results
+    of these stages. oriented: names of images, None where nothing was adjusted. verdict: on the block, None where its
     stages have not run."""
 
     settings: Mapping[str, Any]
     images: Mapping[str, Image]
     matches: Mapping[tuple[str, str], int]
     seconds: Mapping[str, float]
-    adjusted: Mapping[str, Any]
-    consistent: Mapping[str, Any]
+    adjusted: AdjustResult | None
+    consistent: ConsistencyResult | None
     oriented: frozenset[str] | None
     verdict: str | None
 
@@ -60,10 +61,8 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
     ]
     lines += [f"setting     {words}" for words in changed] or ["settings    the same"]
     lines += [*_image_lines(one, two), *_match_lines(one, two)]
-    for key, words in (("images", "oriented"), ("points", "points"), ("reprojection_error_px", "error px")):
-        first_value, second_value = one.adjusted.get(key), two.adjusted.get(key)
-        if first_value is not None and second_value is not None:
-            lines.append(_counts(words, first_value, second_value))
+    if one.adjusted is not None and two.adjusted is not None:
+        lines += _adjusted_lines(one.adjusted, two.adjusted)
     for stage in (stage for stage in STAGE_ORDER if stage in one.seconds and stage in two.seconds):
         lines.append(f"seconds     {stage}: {one.seconds[stage]:.1f} and {two.seconds[stage]:.1f}")
     common = one.images.keys() & two.images.keys()
@@ -136,17 +135,25 @@ def _verified(side: _Side) -> set[tuple[str, str]]:
 
 def _standing(side: _Side, common: Any) -> Standing:
     """common: names of the images in both."""
-    control = side.adjusted.get("control") or {}
-    rmse_m, spread = control.get("check_rmse_m"), side.consistent.get("spread", {})
+    control = None if side.adjusted is None else side.adjusted.control
+    rmse_m = None if control is None else control.check_rmse_m
+    spread = {} if side.consistent is None else side.consistent.spread
     names = {image.image_id: name for name, image in side.images.items()}
     return Standing(
         verdict=side.verdict,
         oriented=None if side.oriented is None else len(side.oriented & common),
         check_m=None if rmse_m is None else float(np.linalg.norm(rmse_m)),
-        checks=frozenset(control.get("checks") or ()),
-        empty=sum(row[1] for i, row in spread.items() if names.get(i) in common) if spread else None,
+        checks=frozenset() if control is None else frozenset(control.checks),
+        empty=sum(ninths.empty for i, ninths in spread.items() if names.get(i) in common) if spread else None,
         matches=sum(count for pair, count in side.matches.items() if common.issuperset(pair)),
     )
+
+
+def _adjusted_lines(one: AdjustResult, two: AdjustResult) -> Iterator[str]:
+    yield _counts("oriented", one.images, two.images)
+    yield _counts("points", one.points, two.points)
+    if one.reprojection_error_px is not None and two.reprojection_error_px is not None:
+        yield _counts("error px", one.reprojection_error_px, two.reprojection_error_px)
 
 
 def _counts(words: str, first: float, second: float) -> str:
@@ -165,8 +172,8 @@ def _side(root: Path) -> _Side:
         images={image.name: image for image in images},
         matches=_matches(workspace, names),
         seconds=seconds_by_stage(workspace),
-        adjusted=facts_on_file(workspace, "adjust"),
-        consistent=facts_on_file(workspace, "consistency"),
+        adjusted=result_on_file(workspace, AdjustResult),
+        consistent=result_on_file(workspace, ConsistencyResult),
         oriented=_oriented(workspace),
         verdict=None if quality is None else quality.verdict,
     )

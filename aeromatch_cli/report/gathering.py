@@ -32,6 +32,7 @@ from aeromatch_cli.images.remote import RemoteFile
 from aeromatch_cli.report.previews import DrawnMatches
 from aeromatch_cli.report.rows import NOT_JUDGED, ImageRow, PairRow
 from aeromatch_cli.report.stretches import made_of, stretches
+from aeromatch_cli.results.stages import Ninths
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import final_pairs
 from aeromatch_cli.stages.context import Context
@@ -97,7 +98,7 @@ class _Found:
         seen[cells[:, 0], cells[:, 1]] = True
 
 
-def gather(context: Context, draw: Draw | None = None, spread: Mapping[str, Sequence[int]] | None = None) -> Gathered:
+def gather(context: Context, draw: Draw | None = None, spread: Mapping[str, Ninths] | None = None) -> Gathered:
     """Everything about pairs and images. spread: image_id -> its ninths with a point, empty ones, points of three
     images. Raises WorkspaceError where a file is broken."""
     found = _Found()
@@ -175,7 +176,7 @@ def _keypoints(context: Context, image_id: str) -> FloatArray | None:
 
 
 def _image_rows(
-    context: Context, pairs: Sequence[PairRow], found: _Found, spread: Mapping[str, Sequence[int]]
+    context: Context, pairs: Sequence[PairRow], found: _Found, spread: Mapping[str, Ninths]
 ) -> list[ImageRow]:
     proposed = Counter(i for pair in context.pairs for i in (pair.image_id0, pair.image_id1))
     tied: Counter[str] = Counter()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -53,11 +53,12 @@ from aeromatch_cli.report.rows import (
 )
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
+from aeromatch_cli.results.stages import FilterResult, MatchResult, OrientResult, PairsResult, ReportResult
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import WEAK_MATCHES, summarise
+from aeromatch_cli.stages.filter import WEAK_MATCHES, connection
 from aeromatch_cli.stages.lines import settled_words
 from aeromatch_cli.stages.quality import quality_on_file
-from aeromatch_cli.stages.stage_report import StageReport, facts_on_file
+from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace
 
 # Longer tables would make a page that no browser sorts: what is left out is the best, and it is in the files.
@@ -71,7 +72,7 @@ def run(context: Context) -> StageReport:
     """Write report/index.html. Raises WorkspaceError when a file of the workspace is broken."""
     report, told = StageReport("report", items=1), told_digests(context.workspace)
     adjustment = read_adjustment(context)
-    found = gather(context, pair_table, spread=adjustment.spread)
+    found = gather(context, pair_table, spread=adjustment.judged.spread)
     pairs, images = found.pairs, found.images
     with settled():
         page = render(context, found, adjustment)
@@ -82,7 +83,7 @@ def run(context: Context) -> StageReport:
     write_record(record, {"told": told}, names)
     report.done = 1
     report.fingerprint = fingerprint([vars(row) for row in pairs], [vars(row) for row in images])
-    report.facts = {"page": "report/index.html", "bytes": len(page.encode("utf-8"))}
+    report.result = ReportResult(page="report/index.html", bytes=len(page.encode("utf-8")))
     return report.write(context.workspace)
 
 
@@ -98,11 +99,12 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
     """The page as text."""
     pairs, images = found.pairs, found.images
     judged = (row for row in pairs if row.state != NOT_JUDGED)
-    facts = summarise(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
-    wrong = {
-        i: float(angle) for i, angle in facts_on_file(context.workspace, "orient").get("wrong_attitudes", {}).items()
-    }
-    input_facts = facts_on_file(context.workspace, "pairs")
+    links = connection(context, ((row.image_id0, row.image_id1, row.state, row.verified) for row in judged))
+    oriented = result_on_file(context.workspace, OrientResult)
+    wrong = {} if oriented is None else oriented.wrong_attitudes
+    block = result_on_file(context.workspace, PairsResult)
+    matched = result_on_file(context.workspace, MatchResult)
+    control = adjustment.found.control
     failures = failure_rows(context)
     stages = stage_rows(context.workspace)
     # Without a verified pair what is on file is of other keypoints.
@@ -119,12 +121,14 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         title=PurePosixPath(context.workspace.root.as_posix()).name,
         quality=quality,
-        headline=[*_verdict(quality), *_headline(images, pairs, facts, failures)],
-        notices=_all_notices(context, images, pairs, facts, adjustment, input_facts.get("warnings", [])),
+        headline=[*_verdict(quality), *_headline(images, pairs, links, failures)],
+        notices=_gravest_first(
+            notices(images, pairs, links, oriented), adjustment_notices(images, adjustment), _input_notices(block)
+        ),
         max_listed=MAX_LISTED,
         failures=failures[:MAX_FAILURE_ROWS],
         failure_count=len(failures),
-        summary=input_facts.get("summary", []),
+        summary=[] if block is None else block.summary,
         adjusted=adjustment_rows(adjustment),
         positions=None
         if adjusted is None
@@ -133,13 +137,13 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
             read_position_residuals(context, adjustment),
             {row.image_id: row.name for row in images},
             context.block.gsd_m,
-            adjustment.facts.get("groups", ()),
+            adjustment.found.groups,
         ),
         cameras=_cameras(context, adjustment, adjusted),
-        readout_not_tried=adjustment.facts.get("readout_not_tried"),
-        heights=heights_section(adjustment.facts),
-        residuals=surveyed_rows(adjustment.facts),
-        residuals_after_fit=bool((adjustment.facts.get("control") or {}).get("transformation")),
+        readout_not_tried=adjustment.found.readout_not_tried,
+        heights=heights_section(adjustment.found),
+        residuals=surveyed_rows(control),
+        residuals_after_fit=control is not None and control.transformation is not None,
         block=_block_facts(context, in_world=adjustment.in_world),
         map=_map(context, images, pairs, wrong, pictures, in_world=adjustment.in_world),
         fields=_ground_figures(context, adjusted, in_world=adjustment.in_world),
@@ -160,9 +164,7 @@ def render(context: Context, found: Gathered, adjustment: Adjustment) -> str:
         pair_keys=keys,
         pairs_beside=bool(drawn.beside),
         has_steps=any(row.steps for row in pairs),
-        settled=settled_words(matched)
-        if "settled_by" in (matched := facts_on_file(context.workspace, "match"))
-        else "",
+        settled="" if matched is None else settled_words(matched),
         pair_count=len(pairs),
         images=sorted(images, key=lambda row: (row.verified_matches, row.image_id))[:MAX_TABLE_ROWS],
         image_count=len(images),
@@ -207,7 +209,7 @@ def _cameras(context: Context, adjustment: Adjustment, adjusted: AdjustedBlock |
         return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
     seen_px = at_once(adjusted, adjusted.cameras_of(context.block), keypoints_px)
-    return camera_sections(adjustment.facts, adjusted, context.block.images, seen_px)
+    return camera_sections(adjustment.found, adjusted, context.block.images, seen_px)
 
 
 def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:
@@ -216,13 +218,13 @@ def number(value: float | None, digits: int = 0, factor: float = 1.0) -> str:
 
 
 def _headline(
-    images: Sequence[ImageRow], pairs: Sequence[PairRow], facts: Mapping[str, Any], failures: Sequence[Any]
+    images: Sequence[ImageRow], pairs: Sequence[PairRow], links: FilterResult, failures: Sequence[Any]
 ) -> list[tuple[str, str, str]]:
     """(number, words, level) of each tile; level "", "warn" or "bad"."""
     posed = sum(row.pose != "none" for row in images)
     full = sum(row.pose == "full" for row in images)
     verified = sum(row.state == "verified" for row in pairs)
-    matches, parts, weak = facts["verified_matches"], len(facts["components"]), len(facts["weakly_tied"])
+    matches, parts, weak = links.verified_matches, len(links.components), len(links.weakly_tied)
     tiles = [
         (counted(len(images), "image", "images"), False),
         (f"{posed:,} with position, {full:,} with attitude, given or found", False),
@@ -237,49 +239,48 @@ def _headline(
     return [(count, words, "bad" if bad else "") for (count, _, words), bad in parted]
 
 
-def _all_notices(
-    context: Context,
-    images: Sequence[ImageRow],
-    pairs: Sequence[PairRow],
-    facts: Mapping[str, Any],
-    adjustment: Adjustment,
-    warnings: Sequence[str],
-) -> list[Notice]:
-    """The gravest first."""
-    found = notices(images, pairs, facts, facts_on_file(context.workspace, "orient"))
-    found += adjustment_notices(images, adjustment)
-    found += [Notice("warn", "Note on the input", warning) for warning in warnings]
-    return sorted(found, key=lambda notice: notice.level != "bad")
+def _gravest_first(*found: Iterable[Notice]) -> list[Notice]:
+    return sorted((notice for one in found for notice in one), key=lambda notice: notice.level != "bad")
+
+
+def _input_notices(block: PairsResult | None) -> list[Notice]:
+    return [] if block is None else [Notice("warn", "Note on the input", warning) for warning in block.warnings]
+
+
+def _orientation_notices(oriented: OrientResult, names: Mapping[str, str]) -> Iterator[Notice]:
+    """What of that which was given is wrong."""
+    used = "the given one is kept" if oriented.stays else "the one from the pictures is used"
+    wrong = (oriented.wrong_attitudes, "attitude", "°"), (oriented.wrong_positions, "position", " m")
+    for off_by_image, what, unit in wrong:
+        items = tuple(f"{names.get(i, i)}: {off:.1f}{unit}" for i, off in off_by_image.items())
+        if items:
+            text = f"The pictures contradict the given {what} by what is shown; {used}."
+            yield Notice("bad", counted(len(items), f"wrong {what}", f"wrong {what}s"), text, items)
+    for camera_id, focal in oriented.focal_lengths.items():
+        text = f"Camera {camera_id}: {focal.found_px:.0f} px in the pictures, {focal.given_px:.0f} px before; {used}."
+        yield Notice("warn", "Another focal length", text)
 
 
 def notices(
     images: Sequence[ImageRow],
     pairs: Sequence[PairRow],
-    facts: Mapping[str, Any],
-    judged: Mapping[str, Any],
+    links: FilterResult,
+    oriented: OrientResult | None,
 ) -> list[Notice]:
-    """What needs a person's eye, the gravest first. facts: of the filter; judged: of the orientation."""
+    """What needs a person's eye of pairs, images and the orientation. links: how verified matches connect images."""
     found = []
     names = {row.image_id: row.name for row in images}
-    if not facts["verified_matches"]:
+    if not links.verified_matches:
         found.append(Notice("bad", "No pair is verified", "The block has no tie points; the pair table says why."))
-    elif len(facts["components"]) > 1:
-        sizes, alone = facts["components"], sum(size == 1 for size in facts["components"])
+    elif len(links.components) > 1:
+        sizes, alone = links.components, sum(size == 1 for size in links.components)
         shown = ", ".join(f"{size:,}" for size in sizes[:12] if size > 1)
         text = f"Sizes of the groups with more than one image: {shown}. Images tied to no other: {alone:,}."
         found.append(Notice("bad", f"The block falls into {len(sizes):,} unconnected groups of images", text))
-    used = "the given one is kept" if judged.get("stays") else "the one from the pictures is used"
-    for key, what, unit in (("wrong_attitudes", "attitude", "°"), ("wrong_positions", "position", " m")):
-        items = tuple(f"{names.get(i, i)}: {off:.1f}{unit}" for i, off in judged.get(key, {}).items())
-        if items:
-            text = f"The pictures contradict the given {what} by what is shown; {used}."
-            found.append(Notice("bad", counted(len(items), f"wrong {what}", f"wrong {what}s"), text, items))
-    for camera_id, (before, now) in judged.get("focal_lengths", {}).items():
-        text = f"Camera {camera_id}: {now:.0f} px in the pictures, {before:.0f} px before; {used}."
-        found.append(Notice("warn", "Another focal length", text))
-    if facts["weakly_tied"] and facts["verified_matches"]:
+    found += [] if oriented is None else _orientation_notices(oriented, names)
+    if links.weakly_tied and links.verified_matches:
         ties = {row.image_id: row for row in images}
-        items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in facts["weakly_tied"])
+        items = tuple(f"{names[i]} ({ties[i].verified_matches})" for i in links.weakly_tied)
         text = f"Fewer than {WEAK_MATCHES} verified matches in all pairs together (number in brackets)."
         title = counted(len(items), "image is weakly tied", "images are weakly tied")
         found.append(Notice("bad", title, text, items))

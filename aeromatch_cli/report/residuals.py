@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, PoseResidual
 from aeromatch_cli.geometry.frames import length_words
 from aeromatch_cli.report.figures import COLOURS, PlanSize, plan_axes, round_length, svg
+from aeromatch_cli.results.adjustment import GroupResult
 
 _PLAN = PlanSize(9.0, (3.4, 6.0), bar=1.5)
 # The arrow of this quantile is as long as this share of the usual distance between neighbouring cameras.
@@ -35,11 +35,11 @@ def residual_section(
     residuals: Mapping[str, PoseResidual],
     names: Mapping[str, str],
     gsd_m: float | None,
-    groups: Sequence[Mapping[str, Any]] = (),
+    groups: Sequence[GroupResult] = (),
 ) -> ResidualSection | None:
     """Root mean squares of the position residuals and where they are, None where no position was given.
 
-    names: of the files, by image_id. gsd_m: metres per pixel on the ground. groups: facts of the adjustment of each.
+    names: of the files, by image_id. gsd_m: metres per pixel on the ground. groups: results of the adjustment.
     """
     ids = [i for i, one in residuals.items() if np.isfinite(one.position_m).all() and i in adjusted.poses]
     if not ids:
@@ -65,17 +65,17 @@ def residual_section(
     return ResidualSection(tuple(rows), _plan(centers_m, offsets_m, titles), words)
 
 
-def _weights(groups: Sequence[Mapping[str, Any]]) -> str:
+def _weights(groups: Sequence[GroupResult]) -> str:
     """How the adjustment weighs positions, and whether it explains some of their residuals; of the group with most."""
-    most = max(groups, key=lambda one: (one.get("positions") or {}).get("used", 0), default={})
-    if not most.get("positions"):
+    most = max(groups, key=lambda one: one.positions.used if one.positions else 0, default=None)
+    if most is None or most.positions is None:
         return ""
-    across, up = most["positions"]["factors"]
+    across, up = most.positions.factors
     words = (
         f" By what they are off the adjustment weighs them with {across:.1f} times the stated standard deviations "
         f"horizontally and {up:.1f} times vertically."
     )
-    explained = most["flights"] or any("lever_x" in mount for mount in most["mounts"].values())
+    explained = most.flights or any(mount.lever_x is not None for mount in most.mounts.values())
     return words + (" What was found of flights and antennas is part of the residuals here." if explained else "")
 
 

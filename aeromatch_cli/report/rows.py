@@ -1,7 +1,6 @@
 """What the report shows, read from the workspace: rows per pair, image, stage and failure, and the evaluation.
 
-Of reports/*.json every stage's counts are shown, and of its facts those that `_DETAILS` has words for; the page also
-reads `summary` and `warnings` of pairs, those of orient and adjust (page.py), `spread` and `doubtful` of consistency.
+Of reports/*.json every stage's counts are shown, and of its result what `_details` has words for.
 """
 
 from __future__ import annotations
@@ -15,38 +14,26 @@ from typing import Any
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_csv
+from aeromatch_cli.results.stages import (
+    RESULTS,
+    AdjustResult,
+    ConsistencyResult,
+    EnhanceResult,
+    ExtractResult,
+    FilterResult,
+    MatchResult,
+    OrientResult,
+    PairsResult,
+    RefineResult,
+    StageResult,
+    ViewsResult,
+)
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.naming import item_named
 from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
-_VIEWS = (("views_per_image", "{:.3g} views per image"), ("view_megapixels_per_image", "{:.3g} megapixels together"))
-_UNENHANCED = (("images_skipped_same_illumination", "{:,} images not enhanced (same illumination)"),)
-# What is told of a stage's facts, and how.
-_DETAILS: Mapping[str, Sequence[tuple[str, str]]] = {
-    "orient": (("images_matched", "{:,} images matched in the first pass"), ("points", "{:,} points")),
-    "pairs": (("images", "of {:,} images"),),
-    "enhance": _UNENHANCED,
-    "simulate": _VIEWS,
-    "extract": (
-        ("keypoints", "{:,} keypoints"), ("images_without_keypoints", "{:,} images without keypoints"), *_VIEWS,
-        *_UNENHANCED,
-    ),
-    "match": (("matches", "{:,} matches before verification"), ("not_settled", "{:,} pairs left with few matches")),
-    "filter": (("verified_matches", "{:,} verified matches"),),
-    "refine": (
-        ("measured", "{:,} keypoints measured"), ("keypoints", "{:,} matched"),
-        ("shift_px", "moved by {:.2f} px (median)"),
-    ),
-    "adjust": (
-        ("images", "{:,} images oriented"), ("points", "{:,} points"), ("track_length", "{:.1f} images per point"),
-        ("reprojection_error_px", "mean reprojection error {:.2f} px"),
-    ),
-    "consistency": (
-        ("verified_matches", "{:,} verified matches left"), ("dropped_matches", "{:,} dropped"),
-        ("rejected_pairs", "{:,} pairs dropped as a whole"), ("points_left", "{:,} points left"),
-    ),
-}  # fmt: skip
+_UNENHANCED = "images not enhanced (same illumination)"
 STAGE_ORDER = (
     "orient",
     "pairs",
@@ -167,8 +154,8 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
             sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
         )
         label = f"{name} ({len(shards[name])} shards)" if sharded else name
-        facts = "" if sharded else _details(name, reports[0]["facts"])
-        rows.append(StageRow(label, seconds, items, done, skipped, failed, facts))
+        found = "" if sharded else ", ".join(_details(RESULTS[name].of_json(reports[0].get("result"))))
+        rows.append(StageRow(label, seconds, items, done, skipped, failed, found))
     return rows
 
 
@@ -187,9 +174,54 @@ def seconds_by_stage(workspace: Workspace) -> dict[str, float]:
     return found
 
 
-def _details(stage: str, facts: Mapping[str, Any]) -> str:
+def _details(result: StageResult | None) -> Iterator[str]:
     """What a stage has found, in words; nothing is said of what is zero or unknown."""
-    return ", ".join(words.format(facts[key]) for key, words in _DETAILS.get(stage, ()) if facts.get(key))
+    match result:
+        case OrientResult():
+            yield from _counts((result.images_matched, "images matched in the first pass"), (result.points, "points"))
+        case PairsResult():
+            yield f"of {result.images:,} images"
+        case ViewsResult():
+            yield from _view_words(result)
+        case EnhanceResult():
+            yield from _counts((result.images_skipped_same_illumination, _UNENHANCED))
+        case MatchResult():
+            few = result.not_settled, "pairs left with few matches"
+            yield from _counts((result.matches, "matches before verification"), few)
+        case FilterResult():
+            yield from _counts((result.verified_matches, "verified matches"))
+        case RefineResult():
+            yield from _counts((result.measured, "keypoints measured"), (result.keypoints, "matched"))
+            if result.shift_px:
+                yield f"moved by {result.shift_px:.2f} px (median)"
+        case AdjustResult():
+            yield from _counts((result.images, "images oriented"), (result.points, "points"))
+            if result.track_length:
+                yield f"{result.track_length:.1f} images per point"
+            if result.reprojection_error_px:
+                yield f"mean reprojection error {result.reprojection_error_px:.2f} px"
+        case ConsistencyResult():
+            yield from _counts(
+                (result.verified_matches, "verified matches left"),
+                (result.dropped_matches, "dropped"),
+                (result.rejected_pairs, "pairs dropped as a whole"),
+                (result.points_left, "points left"),
+            )
+
+
+def _view_words(result: ViewsResult) -> Iterator[str]:
+    if isinstance(result, ExtractResult):
+        empty = result.images_without_keypoints, "images without keypoints"
+        yield from _counts((result.keypoints, "keypoints"), empty)
+    if result.images:
+        yield f"{result.views_per_image:.3g} views per image"
+        yield f"{result.megapixels_per_image:.3g} megapixels together"
+    if isinstance(result, ExtractResult):
+        yield from _counts((result.images_skipped_same_illumination, _UNENHANCED))
+
+
+def _counts(*counts: tuple[int | None, str]) -> Iterator[str]:
+    return (f"{count:,} {words}" for count, words in counts if count)
 
 
 def failure_rows(context: Context) -> list[dict[str, str]]:

@@ -30,13 +30,14 @@ from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
 from aeromatch_cli.report.pictures import image_picture, pair_picture
 from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
+from aeromatch_cli.results.stages import RESULTS, AdjustResult, ConsistencyResult, ExportResult, FilterResult
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.look import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
-from aeromatch_cli.stages.stage_report import facts_on_file
+from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.workspace import Workspace, opened_workspace
 
 # Partners that are listed one by one.
@@ -164,15 +165,16 @@ def _workspace(work: _Work) -> Shown:
         if path.is_file():
             found = stages[stage] = read_json(path)
             lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s")
-            if stage == "filter":
-                states = ", ".join(f"{count} {state}" for state, count in found["facts"].get("pairs", {}).items())
-                lines.append(f"            {states}; {found['facts'].get('verified_matches', 0)} verified matches")
-            if stage == "consistency" and found["facts"].get("verified_matches") is not None:
-                keys = "dropped_matches", "rejected_pairs", "verified_matches"
-                gone, pairs, left = (found["facts"][key] for key in keys)
-                when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
-                lines.append(f"            {gone} of them dropped, {pairs} pairs rejected; {left} are left{when}")
-    written = set(stages.get("export", {}).get("facts", {}))
+            match RESULTS[stage].of_json(found.get("result")):
+                case FilterResult() as judged:
+                    states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
+                    lines.append(f"            {states}; {judged.verified_matches} verified matches")
+                case ConsistencyResult(verified_matches=int(left)) as final:
+                    when = ", of earlier matches: run aeromatch adjust" if workspace.ran_since(path, "filter") else ""
+                    dropped = f"{final.dropped_matches} of them dropped, {final.rejected_pairs} pairs rejected"
+                    lines.append(f"            {dropped}; {left} are left{when}")
+    exported = result_on_file(workspace, ExportResult)
+    written = set() if exported is None else set(exported.exporters)
     older = ", of an earlier adjustment: run aeromatch export" if workspace.export_is_older else ""
     lines += [
         f"export      {one}{older if one.name in written else ' (of an earlier run)'}" for one in workspace.exported()
@@ -187,7 +189,7 @@ def _workspace(work: _Work) -> Shown:
         lines += [f"result      {quality.verdict}: {first}", *(f"            {words}" for words in others)]
         lines += [f"            not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
         facts["quality"] = quality.as_facts()
-    elif "adjust" in stages and not facts_on_file(workspace, "adjust"):
+    elif "adjust" in stages and result_on_file(workspace, AdjustResult) is None:
         lines.append("result      of an earlier version of aeromatch: run `aeromatch run` again for the verdict")
     if workspace.report.is_file():
         lines.append(f"report      {workspace.report}")

@@ -28,6 +28,8 @@ from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.orientation.heights import shift_to_control_m, zeros_words
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.results.adjustment import Control, GroupResult
+from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
@@ -37,7 +39,7 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
-VERSION = 25
+VERSION = 26
 # A focal length that the adjustment changed by more than this share is said.
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
@@ -52,28 +54,30 @@ def run(context: Context) -> StageReport:
     report = StageReport("adjust", items=len(context.block.images))
     recipe, groups = context.settings.orient, _groups(context)
     if not groups:
-        report.items, report.facts = 0, {"images": 0, "remarks": [_NOTHING] if isinstance(recipe, FirstPass) else []}
+        report.items = 0
+        report.result = AdjustResult(images=0, remarks=[_NOTHING] if isinstance(recipe, FirstPass) else [])
         _remove(context)
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
     report.fingerprint = _fingerprint(context, groups)
     record = _on_file(context)
     if record.get("fingerprint") == report.fingerprint:
-        report.skipped, report.facts = report.items, record["facts"]
+        report.skipped, report.result = report.items, AdjustResult(**record["result"])
         return report.write(context.workspace)
     _remove(context)
     try:
         with context.executor.step("adjust"):
             fixed = isinstance(recipe, FirstPass) and not recipe.replaces
-            adjusted, figures = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
+            adjusted, found = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
-        report.facts = {"images": 0, "remarks": [f"not done: {error}"]}  # not those of an earlier adjustment
+        report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment
         return report.write(context.workspace)
     residuals = _residuals(context, adjusted)
-    report.facts = _facts(context, adjusted, figures) | {"residuals": _residual_figures(context, residuals)}
+    report.result = _result(context, adjusted, found, residuals)
     report.done = report.items
-    _write(context, adjusted, residuals, report)
+    head = {"fingerprint": report.fingerprint, "result": report.result.as_json()}
+    _write(context, adjusted, residuals, head)
     return report.write(context.workspace)
 
 
@@ -145,35 +149,36 @@ def _residuals(context: Context, adjusted: AdjustedBlock) -> dict[str, PoseResid
     return residuals_of(adjusted, context.observed.poses, context.block.images, keypoints_px)
 
 
-def _residual_figures(context: Context, residuals: Mapping[str, PoseResidual]) -> dict[str, Any]:
-    return residual_figures(residuals, {image.image_id: image.name for image in context.block.images})
-
-
 def _write(
-    context: Context, adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual], report: StageReport
+    context: Context, adjusted: AdjustedBlock, residuals: Mapping[str, PoseResidual], head: Mapping[str, Any]
 ) -> None:
-    """The record comes last: it vouches for the others."""
+    """The record, which begins with `head`, comes last: it vouches for the others."""
     folder = context.workspace.orientation
     write_atomically(context.workspace.adjusted, lambda stream: write_adjusted(stream, adjusted))
     write_text(folder / "orientation.csv", orientation_text(adjusted, context.block))
     write_text(context.workspace.residuals, residuals_text(residuals, context.block.images))
-    head = {"fingerprint": report.fingerprint, "facts": report.facts}
     write_record(folder / "adjusted.json", head, ("adjusted.npz", "orientation.csv", "residuals.csv"))
 
 
-def _facts(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _result(
+    context: Context,
+    adjusted: AdjustedBlock,
+    groups: Sequence[GroupResult],
+    residuals: Mapping[str, PoseResidual],
+) -> AdjustResult:
     """Figures of the whole and of every group, and why images are not oriented."""
-    control = _control(context, adjusted, figures)
-    return {
-        **block_figures(adjusted, context.block.images, figures),
-        "positions_given": len(context.given.poses),
-        "reduced": _reduced(context),
-        "outside": _reasons(context, adjusted),
-        "held_by": _held_by(context),
-        "readout_not_tried": readout_not_tried(context, adjusted.poses),
-        "control": control,
-        "remarks": _remarks(context, adjusted, figures, control),
-    }
+    control = _control(context, adjusted, groups)
+    return AdjustResult(
+        **block_figures(adjusted, context.block.images, groups),
+        positions_given=len(context.given.poses),
+        reduced=_reduced(context),
+        outside=_reasons(context, adjusted),
+        held_by=_held_by(context),
+        readout_not_tried=readout_not_tried(context, adjusted.poses),
+        control=control,
+        remarks=_remarks(context, adjusted, groups, control),
+        residuals=residual_figures(residuals, {image.image_id: image.name for image in context.block.images}),
+    )
 
 
 def _held_by(context: Context) -> dict[str, str]:
@@ -204,8 +209,8 @@ def _reduced(context: Context) -> float:
 def _remarks(
     context: Context,
     adjusted: AdjustedBlock,
-    figures: Sequence[Mapping[str, Any]],
-    control: Mapping[str, Any] | None,
+    groups: Sequence[GroupResult],
+    control: Control | None,
 ) -> list[str]:
     """What a person should know of the adjusted block, one sentence each."""
     if not adjusted.poses:
@@ -220,13 +225,13 @@ def _remarks(
             remarks.append(
                 f"focal length of camera {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before"
             )
-    remarks += height_remarks(figures)
-    return remarks + control_remarks(context, None if control is None else control["offset_m"])
+    remarks += height_remarks(groups)
+    return remarks + control_remarks(context, None if control is None else control.offset_m)
 
 
-def height_remarks(figures: Sequence[Mapping[str, Any]]) -> list[str]:
+def height_remarks(groups: Sequence[GroupResult]) -> list[str]:
     """What is said of heights of positions that lie above or below those of the control points, all by as much."""
-    shifts_m = [up_m for group in figures if (up_m := shift_to_control_m(group)) is not None]
+    shifts_m = [up_m for group in groups if (up_m := shift_to_control_m(group)) is not None]
     return [
         f"heights of the given positions lie {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} those of the control "
         f"points, everywhere by about as much: {zeros_words(up_m)}; the block has the heights of the control points"
@@ -256,12 +261,12 @@ def control_remarks(context: Context, offset_m: Sequence[float] | None) -> list[
     return []
 
 
-def _control(context: Context, adjusted: AdjustedBlock, figures: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _control(context: Context, adjusted: AdjustedBlock, groups: Sequence[GroupResult]) -> Control | None:
     """The block beside surveyed points, without those that the adjustment has found wrong or exchanged."""
     if not context.control:
         return None
-    found = [one.get("control") or {} for one in figures]
-    left_out = {name for one in found for key in ("wrong", "exchanged") for name in one.get(key, ())}
+    found = [group.control for group in groups if group.control is not None]
+    left_out = {name for one in found for name in (*one.wrong, *one.exchanged)}
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
     # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
     beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from aeromatch_cli.orientation.quality import Quality
+from aeromatch_cli.results.stages import BlockResults
 from aeromatch_cli.stages.filter import WEAK_MATCHES
-from aeromatch_cli.stages.quality import final_links
 
 _NAMED = 5
 # Images with fewer points that three images see hold a block adjustment loosely.
 _FEW_POINTS = 20
 
 
-def closing_lines(quality: Quality, facts: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
-    """The verdict with what speaks against the block, and where it is weak. facts: by stage. names: of the files, by
-    image_id."""
+def closing_lines(quality: Quality, results: BlockResults, names: Mapping[str, str]) -> list[str]:
+    """The verdict with what speaks against the block, and where it is weak. names: of the files, by image_id."""
     count = len(names)
     whole = f"all {count} images are connected" if count > 2 else "both images are connected"
-    if facts["adjust"].get("images"):
+    if results.adjust is not None and results.adjust.images:
         whole += " and oriented"
     lines = verdict_lines(quality, whole)
     others = [f"not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
-    return [*lines, *(f"{'':<9} {line}" for line in (*others, *_weak(facts, names)))]
+    return [*lines, *(f"{'':<9} {line}" for line in (*others, *_weak(results, names)))]
 
 
 def verdict_lines(quality: Quality, whole: str = "") -> list[str]:
@@ -32,17 +30,17 @@ def verdict_lines(quality: Quality, whole: str = "") -> list[str]:
     return [f"{'result':<9} {quality.verdict}: {first}", *(f"{'':<9} {line}" for line in others)]
 
 
-def _weak(facts: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
+def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
     """Images that hang loosely on a block."""
     lines = []
-    tied = final_links(facts).get("weakly_tied", [])
+    tied = [] if results.connection is None else results.connection.weakly_tied
     if tied:
         lines.append(f"weak: {_listed(tied, names)}, with fewer than {WEAK_MATCHES} verified matches")
-    spread = facts.get("consistency", {}).get("spread", {})
-    loose = [i for i, (_, _, points) in spread.items() if points < _FEW_POINTS and i not in tied]
+    spread = {} if results.consistency is None else results.consistency.spread
+    loose = [i for i, ninths in spread.items() if ninths.points < _FEW_POINTS and i not in tied]
     if loose and len(spread) > 2:
         lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
-    empty = [i for i, (_, ninths, _) in spread.items() if ninths]
+    empty = [i for i, ninths in spread.items() if ninths.empty]
     if empty:
         lines.append(f"parts without a point though other images show them: {_listed(empty, names)}")
     return lines

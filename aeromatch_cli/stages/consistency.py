@@ -6,9 +6,8 @@ for all who read final results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -23,10 +22,11 @@ from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown
 from aeromatch_cli.orientation.alone import placed_alone
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.remaining import without_dropped
+from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.filter import Judged, select, summarise, verified_pairs
+from aeromatch_cli.stages.filter import Judged, connection, select, verified_pairs
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies.consistencies import BlockConsistency
@@ -48,9 +48,9 @@ def run(context: Context) -> StageReport:
         context, _ = with_current_pairs(context)
         adjusted = AdjustedBlock.empty()
     if adjusted is None or not isinstance(recipe, BlockConsistency):
-        report.facts = {"dropped_matches": 0, "rejected_pairs": 0, "expected_right": None, "doubtful": [], "spread": {}}
-        if isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels:
-            report.facts["remark"] = f"not done: match {context.settings.match.name} measures points without keypoints"
+        without = isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels
+        words = f"not done: match {context.settings.match.name} measures points without keypoints"
+        report.result = ConsistencyResult(remark=words if without else "")
         for stale in (path, context.workspace.final):
             with translated_os_errors(stale):
                 stale.unlink(missing_ok=True)
@@ -61,8 +61,9 @@ def run(context: Context) -> StageReport:
     last = context.workspace.stage_report("consistency")
     if not context.overwrite and path.is_file() and last.is_file():
         before = read_json(last)
-        if before.get("fingerprint") == report.fingerprint and _whole(context.workspace, before["facts"]):
-            report.skipped, report.facts = report.items, before["facts"]
+        result = ConsistencyResult.of_json(before.get("result"))
+        if result and before.get("fingerprint") == report.fingerprint and _whole(context.workspace, result):
+            report.skipped, report.result = report.items, result
             return report.write(context.workspace)
     # A killed run must not leave what the report of an earlier one vouches for.
     for stale in (last, context.workspace.final):
@@ -86,11 +87,23 @@ def run(context: Context) -> StageReport:
     block = _left_of(context, adjusted, entries)
     if block is not adjusted:
         write_atomically(context.workspace.final, lambda stream: write_adjusted(stream, block))
-    spread = _spread(context, block)
-    counts = {"points": len(adjusted.points_m), "points_left": len(block.points_m)}
-    counts |= {"observations": adjusted.observations, "observations_left": block.observations}
-    known = {"expected_right": found.expected_right, "doubtful": found.doubtful, **counts, "spread": spread}
-    report.facts = {**_facts(context, entries), **known}
+    left = _connection_left(context, entries)
+    matches = sum(len(before.matches.indices) for _, before in entries)
+    report.result = ConsistencyResult(
+        verified_matches=left.verified_matches,
+        dropped_matches=matches - left.verified_matches,
+        rejected_pairs=left.pairs.get("rejected", 0),
+        components=left.components,
+        weakly_tied=left.weakly_tied,
+        unconnected=left.unconnected,
+        expected_right=found.expected_right,
+        doubtful=found.doubtful,
+        points=len(adjusted.points_m),
+        points_left=len(block.points_m),
+        observations=adjusted.observations,
+        observations_left=block.observations,
+        spread=_spread(context, block),
+    )
     report.done = report.items
     return report.write(context.workspace)
 
@@ -117,20 +130,12 @@ def _matched(
     return MatchedKeypoints(image_id0, entry.image_id1, entry.matches.indices, entry.matches.scores, alone)
 
 
-def _facts(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> dict[str, Any]:
+def _connection_left(context: Context, entries: Sequence[tuple[Pair, VerifiedEntry]]) -> FilterResult:
     """What is left of the verified entries, and how it connects the images."""
     final = FinalEntries(context.workspace)
     left = [(pair, final.left(pair.image_id0, entry)) for pair, entry in entries]
     judged = ((p.image_id0, p.image_id1, after.verdict.state, len(after.matches.indices)) for p, after in left)
-    facts = summarise(context, judged)
-    return {
-        "verified_matches": facts["verified_matches"],
-        "dropped_matches": sum(len(before.matches.indices) for _, before in entries) - facts["verified_matches"],
-        "rejected_pairs": facts["pairs"].get("rejected", 0),
-        "components": facts["components"],
-        "weakly_tied": facts["weakly_tied"],
-        "unconnected": facts["unconnected"],
-    }
+    return connection(context, judged)
 
 
 def final_block(context: Context) -> AdjustedBlock | None:
@@ -141,14 +146,12 @@ def final_block(context: Context) -> AdjustedBlock | None:
     return adjusted if adjusted is None or path == context.workspace.adjusted else read_adjusted(path)
 
 
-def _whole(workspace: Workspace, facts: Mapping[str, Any]) -> bool:
+def _whole(workspace: Workspace, result: ConsistencyResult) -> bool:
     """Whether the files that a report vouches for are there. Raises BrokenFileError where one is damaged."""
     load_checked(workspace.dropped, ())
     if workspace.final.is_file():
         load_checked(workspace.final, ())
-    if "observations_left" not in facts:
-        return False  # of an earlier version
-    return workspace.final.is_file() == (facts["observations_left"] < facts["observations"])
+    return workspace.final.is_file() == (result.observations_left < result.observations)
 
 
 def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[Pair, VerifiedEntry]]) -> AdjustedBlock:
@@ -161,7 +164,7 @@ def _left_of(context: Context, adjusted: AdjustedBlock, entries: Iterable[tuple[
     return without_dropped(adjusted, pairs)
 
 
-def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
+def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, Ninths]:
     """image_id -> ninths of the image (of 3 x 3) that hold a point of the adjusted block, ninths without any though
     another image of its pairs shows them, and its points that three or more images see: a block adjustment wants points
     everywhere, and in many images."""
@@ -177,7 +180,7 @@ def _spread(context: Context, adjusted: AdjustedBlock) -> dict[str, list[int]]:
         held = np.zeros((3, 3), dtype=bool)
         held[cells[:, 0], cells[:, 1]] = True
         empty = shown[image_id] & ~held
-        found[image_id] = [int(held.sum()), int(empty.sum()), int((seen[track[:, 1]] > 2).sum())]
+        found[image_id] = Ninths(int(held.sum()), int(empty.sum()), int((seen[track[:, 1]] > 2).sum()))
     return found
 
 

@@ -16,6 +16,7 @@ from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.masks import mask_path, sees_sky
 from aeromatch_cli.images.scaling import scale_within
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.results.stages import EnhanceResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import PIPELINE_VERSION, library_version
@@ -171,19 +172,22 @@ def run(context: Context) -> StageReport:
         if task.as_taken:
             _remove(task, (".png", ".mask.png", ".json"))
     run_stage(context, report, _run_task, todo, [task.image_id for task in todo])
-    report.facts = illumination_facts(tasks)
-    if not context.settings.enhance.changes:
-        report.facts["remark"] = f"enhance={context.settings.enhance.name} changes nothing: no pictures"
+    nothing = f"enhance={context.settings.enhance.name} changes nothing: no pictures"
+    report.result = EnhanceResult(
+        images_skipped_same_illumination=skipped_images(tasks),
+        remark="" if context.settings.enhance.changes else nothing,
+    )
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 
 
-def illumination_facts(tasks: Iterable[EnhanceTask]) -> dict[str, Any]:
-    """How many of the images are skipped; {} where the settings skip none."""
+def skipped_images(tasks: Iterable[EnhanceTask]) -> int | None:
+    """How many of the images are left as taken, since they and those they are paired with were taken in the same light;
+    None where the settings skip none."""
     asked = [
         task.skipped for task in tasks if task.enhancer.keep_source and task.enhancer.same_illumination_minutes > 0.0
     ]
-    return {SKIPPED: sum(asked)} if asked else {}
+    return sum(asked) if asked else None
 
 
 def is_done(task: EnhanceTask) -> bool:

@@ -11,6 +11,7 @@ from aeromatch_cli.data import AdjustedBlock
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import changed_files, read_json, translated_os_errors, write_record
 from aeromatch_cli.fingerprints import file_digest, fingerprint
+from aeromatch_cli.results.stages import Exported, ExportResult
 from aeromatch_cli.stages import refine
 from aeromatch_cli.stages.consistency import final_block, final_pairs
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
@@ -60,13 +61,14 @@ def run(context: Context) -> StageReport:
         not context.overwrite
         and last.is_file()
         and (found := read_json(last)).get("fingerprint") == wanted
-        and set(found["facts"]) == {exporter.name for exporter in context.settings.export}  # none failed
+        and (result := ExportResult.of_json(found.get("result")))
+        and result.exporters.keys() == {exporter.name for exporter in context.settings.export}  # none failed
         and _complete(context.workspace)
     ):
         if context.workspace.export_is_older:  # by its time alone: what was made since is the same
             last.touch()
         report.skipped = report.items
-        report.facts = found["facts"]
+        report.result = result
         report.failures = unexplained(context, outdated, "filter")
         return report.write(context.workspace)
     # A killed export must not be vouched for by the report of an earlier one.
@@ -77,8 +79,8 @@ def run(context: Context) -> StageReport:
     # In this process, one after the other: a task holds the whole context.
     alone = replace(context, executor=Executor("serial", 1, context.executor.progress))
     done = run_stage(alone, report, _run_task, tasks, names)
-    report.facts = {str(facts["name"]): facts for facts in done}
-    written = [f"{facts['name']}/{name}" for facts in done for name in facts["files"]]
+    report.result = ExportResult(exporters={one.name: one for one in done})
+    written = [f"{one.name}/{name}" for one in done for name in one.files]
     write_record(context.workspace.exports, {}, written)
     report.failures += unexplained(context, outdated, "filter")
     return report.write(context.workspace)
@@ -100,10 +102,10 @@ def _complete(workspace: Workspace) -> bool:
     return not changed
 
 
-def _run_task(task: ExportTask) -> dict[str, Any]:
+def _run_task(task: ExportTask) -> Exported:
     contents = contents_of(task.context, task.adjusted, final_pairs)
     summary = task.exporter(contents, task.folder)  # type: ignore[operator]
     for remark in summary.remarks:
         log.warning("warning: export %s: %s", task.folder.name, remark)
     files = [path.relative_to(task.folder).as_posix() for path in summary.files]
-    return {"name": task.folder.name, **asdict(summary), "files": files}
+    return Exported(name=task.folder.name, **{**asdict(summary), "files": files})

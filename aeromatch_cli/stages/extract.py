@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, write_features
 from aeromatch_cli.geometry.frames import apply_homography, resize_matrix
 from aeromatch_cli.images.depth import sample_colours
+from aeromatch_cli.results.stages import ExtractResult, StageResult
 from aeromatch_cli.stages import enhance, simulate
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
@@ -107,13 +108,21 @@ def run(context: Context, image_ids: Iterable[str] | None = None, before: StageR
     network = any(task.extractor.network for task in todo)
     made = run_stage(context, report, run_task, todo, [task.image_id for task in todo], network=network)
     if made:
-        counts = [item.keypoints for item in made]
-        facts = {"keypoints": sum(counts), "images_without_keypoints": sum(count == 0 for count in counts)}
-        facts |= enhance.illumination_facts(task.views.enhance for task in tasks)
-        summed = {key: value + report.facts.get(key, 0) for key, value in facts.items()}
-        report.facts = summed | simulate.cost_facts([item.cost for item in made], report.facts)
+        report.result = _result(made, tasks, report.result)
     report.fingerprint = fingerprint(report.fingerprint, [task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
+
+
+def _result(made: Sequence[Extracted], tasks: Sequence[ExtractTask], before: StageResult | None) -> ExtractResult:
+    """Of the images made now, and of those that the same command has made before."""
+    counts = [item.keypoints for item in made]
+    found = ExtractResult(
+        keypoints=sum(counts),
+        images_without_keypoints=sum(count == 0 for count in counts),
+        images_skipped_same_illumination=enhance.skipped_images(task.views.enhance for task in tasks),
+        **simulate.views_result([item.cost for item in made]).as_json(),
+    )
+    return found if not isinstance(before, ExtractResult) else before.plus(found)
 
 
 def run_own_first(context: Context, image_ids: Iterable[str]) -> StageReport:

@@ -24,6 +24,7 @@ from aeromatch_cli.formats.rows import (
     row_fingerprints,
     write_verified_row,
 )
+from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import extract, match, rows
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.rows import PairTask
@@ -185,17 +186,18 @@ def run(context: Context) -> StageReport:
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
     ids = sorted(image.image_id for image in context.block.images)
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs), ids)
-    report.facts = _facts_on_file(context, report) or summarise(context)
+    report.result = _result_on_file(context, report) or connection(context)
     return report.write(context.workspace, context.shard)
 
 
-def _facts_on_file(context: Context, report: StageReport) -> dict[str, Any]:
-    """Those of the last run, where nothing was made now and the verdicts are the same ones; else nothing."""
+def _result_on_file(context: Context, report: StageReport) -> FilterResult | None:
+    """That of the last run, where nothing was made now and the verdicts are the same ones; else None."""
     last = context.workspace.stage_report(report.stage, context.shard.label if context.shard else "")
     if report.done or report.failures or context.overwrite or not last.is_file():
-        return {}
+        return None
     found = read_json(last)
-    return dict(found["facts"]) if found.get("fingerprint") == report.fingerprint and not found["failed"] else {}
+    same = found.get("fingerprint") == report.fingerprint and not found["failed"]
+    return FilterResult.of_json(found.get("result")) if same else None
 
 
 def outdated_pairs(context: Context) -> list[Pair]:
@@ -224,7 +226,7 @@ def verified_pairs(context: Context, features: Callable[[str], str] | None = Non
             yield pair, entry
 
 
-def summarise(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> dict[str, Any]:
+def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | None = None) -> FilterResult:
     """States of the pairs, verified matches, sizes of the groups of images that verified pairs connect, and images
     that are weakly tied or not at all.
 
@@ -246,13 +248,13 @@ def summarise(context: Context, judged: Iterable[tuple[str, str, str, int]] | No
             ties.update({id0: count, id1: count})
             links.append((id0, id1))
     ids = [image.image_id for image in context.block.images]
-    return {
-        "pairs": dict(sorted(states.items())),
-        "verified_matches": matches,
-        "components": sorted(Counter(components(ids, links).values()).values(), reverse=True),
-        "weakly_tied": sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
-        "unconnected": sorted(image_id for image_id in ids if not ties[image_id]),
-    }
+    return FilterResult(
+        pairs=dict(sorted(states.items())),
+        verified_matches=matches,
+        components=sorted(Counter(components(ids, links).values()).values(), reverse=True),
+        weakly_tied=sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
+        unconnected=sorted(image_id for image_id in ids if not ties[image_id]),
+    )
 
 
 def components(ids: Iterable[str], links: Iterable[tuple[str, str]]) -> dict[str, str]:

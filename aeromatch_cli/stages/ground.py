@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from aeromatch_cli.fingerprints import image_fingerprint
 from aeromatch_cli.orientation.dem import Terrain
 from aeromatch_cli.orientation.heights import height_remedy, zeros_words
 from aeromatch_cli.orientation.judgement import heights_above_m
+from aeromatch_cli.results.stages import OrientResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.orienters import GivenPoses
 
@@ -66,15 +66,15 @@ def _number(text: str) -> float | None:
 
 
 def judged_ground(
-    context: Context, terrains: Sequence[Terrain], facts: Mapping[str, Any]
+    context: Context, terrains: Sequence[Terrain], found: OrientResult
 ) -> tuple[Ground | None, str, list[str]]:
     """The ground that later stages use, where it comes from in words, and what contradicts it.
 
-    terrains: of the pictures, one for each flight. facts: those of the orientation. A stated ground wins, unless it
+    terrains: of the pictures, one for each flight. found: by the orientation. A stated ground wins, unless it
     cannot be right.
     """
     ground, source = context.block.ground, context.block.ground_source
-    own_frame = facts["frame"] == "own"
+    own_frame = found.frame == "own"
     if not terrains:
         return (None, "", []) if own_frame else (ground, source, [])
     parts = tuple(
@@ -82,7 +82,7 @@ def judged_ground(
         for one in terrains
     )
     shown: Ground = parts[0] if len(parts) == 1 else SeveralGrounds(parts)
-    words = f"terrain from {facts['points']} points of the first pass"
+    words = f"terrain from {found.points} points of the first pass"
     if ground is None or own_frame:
         return shown, words, []
     centers_m = _centers_m(context.block)
@@ -110,10 +110,10 @@ def judged_ground(
 
 
 def judged_altitudes(
-    ground: Ground | None, block: Block, facts: Mapping[str, Any], altitudes: tuple[Ground, str] | None
+    ground: Ground | None, block: Block, found: OrientResult, altitudes: tuple[Ground, str] | None
 ) -> list[str]:
-    """What the ground says against heights above the take-off point. facts: those of the orientation."""
-    if altitudes is None or ground is None or not block.poses or facts["frame"] == "own":
+    """What the ground says against heights above the take-off point. found: by the orientation."""
+    if altitudes is None or ground is None or not block.poses or found.frame == "own":
         return []
     off_m, _, flying_m = heights_above_m(altitudes[0], ground, _centers_m(block))
     if abs(off_m) <= _ALTITUDE_SHARE * flying_m:

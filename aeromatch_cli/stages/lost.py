@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from aeromatch_cli.files import write_text
 from aeromatch_cli.formats.tables import csv_text
-from aeromatch_cli.stages.quality import final_links
+from aeromatch_cli.results.stages import BlockResults
 from aeromatch_cli.workspace import Workspace
 
 _NAMED = 5
@@ -18,20 +17,17 @@ _FAILED, _UNORIENTED, _UNCONNECTED = "not read", "not oriented", "not connected"
 Lost = tuple[str, str, str]
 
 
-def lost_images(
-    facts: Mapping[str, Mapping[str, Any]], unread: Sequence[tuple[str, str]], names: Mapping[str, str]
-) -> list[Lost]:
+def lost_images(results: BlockResults, unread: Sequence[tuple[str, str]], names: Mapping[str, str]) -> list[Lost]:
     """Name, what became of it, and the reason, of every image that the result does not hold.
 
-    facts: by stage. unread: images that are not part of the block, with the reason. names: of the files, by image_id.
+    unread: images that are not part of the block, with the reason. names: of the files, by image_id.
     """
     lost = [(name, _FAILED, reason) for name, reason in unread]
-    adjust = facts["adjust"]
-    if adjust.get("images"):
-        lost += [(names.get(i, i), _UNORIENTED, reason) for i, reason in adjust.get("outside", {}).items()]
-    else:
+    if results.adjust is not None and results.adjust.images:
+        lost += [(names.get(i, i), _UNORIENTED, reason) for i, reason in results.adjust.outside.items()]
+    elif results.connection is not None:
         reason = "no pair of it is verified"
-        lost += [(names.get(i, i), _UNCONNECTED, reason) for i in final_links(facts).get("unconnected", ())]
+        lost += [(names.get(i, i), _UNCONNECTED, reason) for i in results.connection.unconnected]
     return sorted(lost)
 
 

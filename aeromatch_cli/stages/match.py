@@ -15,6 +15,7 @@ from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
+from aeromatch_cli.results.stages import MatchResult
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import matched_in_batches
 from aeromatch_cli.stages.context import Context
@@ -178,6 +179,7 @@ def run(context: Context) -> StageReport:
     report.failures.extend(failure for result in results for failure in result.failures)
     report.done = sum(result.done for result in results)
     report.skipped = 0 if context.overwrite else sum(rows.kept(task.pairs, on_file[task.image_id0]) for task in tasks)
-    report.facts = {"matches": sum(result.found for result in results)} if report.done else {}
+    if report.done:
+        report.result = MatchResult(matches=sum(result.found for result in results))
     report.fingerprint = fingerprint(sorted(pair.fingerprint for task in tasks for pair in task.pairs))
     return report.write(context.workspace, context.shard)

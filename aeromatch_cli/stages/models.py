@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.orientation.growth import grown
 from aeromatch_cli.orientation.mapping import MAPPERS, Mapper, Model, map_block
 from aeromatch_cli.orientation.solution import Evidence
 from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
+from aeromatch_cli.results.stages import FurtherFirstPass
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -45,7 +45,7 @@ class Mapped:
     @property
     def contradicted(self) -> bool:
         """Whether the given positions do not fit: the largest model contradicts them, or nothing was mapped."""
-        return not self.models or bool(self.models[0].figures["contradiction"])
+        return not self.models or bool(self.models[0].figures.contradiction)
 
     def beats(self, other: Mapped) -> bool:
         """Whether its largest model has more images, and none that models at their right places hold is lost for it.
@@ -59,10 +59,10 @@ class Mapped:
 
 def best_mapped(
     context: Context, recipe: FirstPass, first: Context, evidence: Evidence
-) -> tuple[Mapped, list[dict[str, Any]]]:
+) -> tuple[Mapped, list[FurtherFirstPass]]:
     """Models of a first pass, or of a further one where that has better ones, and what further ones were tried."""
     best = _mapped(context, recipe, first, evidence)
-    tried: list[dict[str, Any]] = []
+    tried: list[FurtherFirstPass] = []
     for words, further in (
         ("more keypoints", _with_more_keypoints),
         ("pairs chosen without positions", _without_positions),
@@ -72,7 +72,7 @@ def best_mapped(
             continue
         counts = {"images": _largest(best.models), "images_then": _largest(found.models)}
         used = found.beats(best)
-        tried.append({"with": words, **counts, "used": used})
+        tried.append(FurtherFirstPass(change=words, used=used, **counts))
         best = found if used else best
     return best, tried
 

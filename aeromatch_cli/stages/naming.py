@@ -23,10 +23,10 @@ def item_named(item: str, names: Mapping[str, str]) -> str:
     return " and ".join(names[i] for i in ids) if all(i in names for i in ids) else item
 
 
-def facts_named(value: Any, names: Mapping[str, str]) -> Any:
-    """Facts of stages with names in place of all image ids, as keys and as values."""
+def with_names(value: Any, names: Mapping[str, str]) -> Any:
+    """Results of stages, as JSON, with names in place of all image ids, as keys and as values."""
     if isinstance(value, Mapping):
-        return {names.get(key, key): facts_named(item, names) for key, item in value.items()}
+        return {names.get(key, key): with_names(item, names) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [facts_named(item, names) for item in value]
+        return [with_names(item, names) for item in value]
     return names.get(value, value) if isinstance(value, str) else value

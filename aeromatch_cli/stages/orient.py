@@ -7,7 +7,7 @@ the pictures. Later stages read the result from the workspace's orientation fold
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
+from aeromatch_cli.results.stages import FurtherFirstPass, OrientResult
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.exchanged import exchanged_columns
@@ -43,7 +44,7 @@ from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
-VERSION, _LARGE_BLOCK_VERSION = 23, 1
+VERSION, _LARGE_BLOCK_VERSION = 24, 1
 # What failures.csv calls the mapper's process.
 _MAPPING = "mapping"
 
@@ -75,18 +76,19 @@ def run(
     if record is None:
         same = before.get("settings") == settings
         kept = {i for i, value in images.items() if same and before.get("images", {}).get(i) == value}
-        solution = _solution(context, recipe, kept, before)
+        solution, seen = _solution(context, recipe, kept, before)
         head = {"fingerprint": report.fingerprint, "settings": settings, "images": images}
-        record = _write(context, solution, head)
+        record = _write(context, solution, {**head, **seen})
         report.done = report.items
     else:
         report.skipped = report.items
     folder = context.workspace.orientation
-    ground, source, ground_remarks = judged_ground(context, _terrains(context, record), record["facts"])
-    remarks = [*frame_remarks(record), *ground_remarks]
-    remarks += judged_altitudes(ground, context.block, record["facts"], altitudes)
-    report.facts = record["facts"] | {"remarks": [*record["facts"]["remarks"], *remarks]}
-    if record["facts"]["frame"] == "own":
+    found = OrientResult(**record["result"])
+    ground, source, ground_remarks = judged_ground(context, _terrains(context, record), found)
+    remarks = [*found.remarks, *frame_remarks(found, groups(context)), *ground_remarks]
+    remarks += judged_altitudes(ground, context.block, found, altitudes)
+    report.result = found.model_copy(update={"remarks": remarks})
+    if found.frame == "own":
         # Given positions are in another frame, and nothing ties this one to a CRS.
         context = replace(
             context,
@@ -101,12 +103,12 @@ def run(
         ground_source=source,
         tied=tuple((id0, id1) for id0, id1 in record["tied"]),
         similar=tuple((id0, id1) for id0, id1 in record["similar"]),
-        outside=frozenset(record["facts"]["outside"]),
+        outside=frozenset(found.outside),
     )
     report.failures = _failed_images(context, record["failed"])
-    if stopped := record["facts"].get("stopped"):  # records of earlier versions lack it
-        report.failures.append((_MAPPING, stopped))
-    context = replace(context, block=block, calibrated=frozenset(report.facts.get("calibrated", ())))
+    if found.stopped:
+        report.failures.append((_MAPPING, found.stopped))
+    context = replace(context, block=block, calibrated=frozenset(found.calibrated))
     return context, report if dry else report.write(context.workspace)
 
 
@@ -125,9 +127,14 @@ def groups(context: Context) -> list[Group]:
     return [Group(str(one["kind"]), tuple(one["images"])) for one in record.get("groups", ()) if one["images"]]
 
 
-def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mapping[str, Any]) -> Solution:
-    """What the first pass says. kept: images that have not changed since an earlier run, whose poses and terrain stay
-    as they were where the new ones agree with them. before: the record of that run."""
+def _solution(
+    context: Context, recipe: FirstPass, kept: set[str], before: Mapping[str, Any]
+) -> tuple[Solution, dict[str, Any]]:
+    """What the first pass says; and its pairs, those that look alike, and what failed in it.
+
+    kept: images that have not changed since an earlier run, whose poses and terrain stay as they were where the new
+    ones agree with them. before: the record of that run.
+    """
     block = context.block
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
@@ -136,7 +143,7 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     if recipe.replaces:
         context, first, evidence = _with_better_cameras(context, first, evidence)
     good = evidence.explained()
-    tried: list[dict[str, Any]] = []
+    tried: list[FurtherFirstPass] = []
     stopped = ""
     if looks and recipe.replaces and not suffices(evidence, good):
         first, evidence = evidence_of(context, recipe)
@@ -144,29 +151,33 @@ def _solution(context: Context, recipe: FirstPass, kept: set[str], before: Mappi
     if not evidence.pairs or suffices(evidence, good):
         solution = from_given(evidence, good, correct=recipe.replaces)
         if not evidence.pairs and not given:
-            solution.facts["remarks"].append(unoriented_remark(evidence))
+            solution.result.remarks.append(unoriented_remark(evidence))
     else:
         mapped, tried = best_mapped(context, recipe, first, evidence)
         models, first, evidence, stopped = mapped.models, mapped.first, mapped.evidence, mapped.stopped
         exchanged = exchanged_columns(block, models[0]) if models and mapped.contradicted else ""
         solution = from_models(evidence, models, _before(context, kept, before), context.angles, exchanged)
         if not models and not stopped:
-            solution.facts["remarks"].append(unoriented_remark(evidence))
+            solution.result.remarks.append(unoriented_remark(evidence))
         if not recipe.replaces:
             solution = judged(from_given(evidence, good, correct=False), solution)
-    counts = {"images_matched": len(evidence.matched), "positions_given": len(block.poses)}
-    facts = {**counts, "given_poses_explained": len(good), **solution.facts}
-    facts["further_first_passes"] = tried
-    facts["tied"] = [(pair.image_id0, pair.image_id1) for pair in evidence.pairs]
-    facts["similar"] = list(first.block.similar)
-    facts["failed"] = [*evidence.failed, *([_MAPPING] if stopped else [])]  # is tried again by the next run
-    facts["stopped"] = stopped
+    counts = {
+        "images_matched": len(evidence.matched),
+        "positions_given": len(block.poses),
+        "given_poses_explained": len(good),
+    }
+    result = solution.result.model_copy(update={**counts, "further_first_passes": tried, "stopped": stopped})
+    seen = {
+        "tied": [(pair.image_id0, pair.image_id1) for pair in evidence.pairs],
+        "similar": list(first.block.similar),
+        "failed": [*evidence.failed, *([_MAPPING] if stopped else [])],  # is tried again by the next run
+    }
     terrains = solution.terrains
     old = _terrains(context, before) if kept else ()
     if len(old) == len(terrains):
         centers_m = np.array([pose.center_m for pose in solution.poses.values()])
         terrains = tuple(continued(one, new, centers_m) for one, new in zip(old, terrains, strict=True))
-    return replace(solution, terrains=terrains, facts=facts)
+    return replace(solution, terrains=terrains, result=result), seen
 
 
 def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -> tuple[Context, Context, Evidence]:
@@ -228,15 +239,14 @@ def _write(context: Context, solution: Solution, head: Mapping[str, Any]) -> dic
     names = ["cameras.csv", "poses.csv"]
     for number, terrain in enumerate(solution.terrains, start=1):
         place = terrain.west_m, terrain.north_m, terrain.cell_m
-        data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.facts))
+        data = terrain_bytes(terrain.heights_m, *place, *_frame(context, solution.result))
         names.append("terrain.tif" if number == 1 else f"terrain-{number}.tif")
         write_bytes(folder / names[-1], data)
     with translated_os_errors(folder):
         for old in set(folder.glob("terrain*.tif")) - {folder / name for name in names}:
             old.unlink(missing_ok=True)
-    large = {key: solution.facts[key] for key in ("tied", "similar", "groups", "failed")}
-    facts = {key: value for key, value in solution.facts.items() if key not in large}
-    write_record(path, {**head, "facts": facts, **large}, names)
+    held = [asdict(group) for group in solution.groups]
+    write_record(path, {**head, "result": solution.result.as_json(), "groups": held}, names)
     return read_json(path)
 
 
@@ -247,11 +257,11 @@ def _terrains(context: Context, record: Mapping[str, Any]) -> tuple[Terrain, ...
     )
     if not names:
         return ()
-    origin_m, _ = _frame(context, record["facts"])
+    origin_m, _ = _frame(context, OrientResult(**record["result"]))
     return tuple(Terrain(*read_terrain(context.workspace.orientation / name, origin_m)) for name in names)
 
 
-def _frame(context: Context, facts: Mapping[str, Any]) -> tuple[FloatArray, str]:
+def _frame(context: Context, found: OrientResult) -> tuple[FloatArray, str]:
     """Origin and CRS of what the orientation has found."""
-    own = facts["frame"] == "own"
+    own = found.frame == "own"
     return (np.zeros(3), "local") if own else (np.array(context.block.origin_m), context.block.crs)

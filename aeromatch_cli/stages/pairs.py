@@ -16,6 +16,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json, write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.tables import cameras_text, images_text, pairs_text, poses_text, read_pairs
+from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
@@ -74,18 +75,21 @@ def prepare(
     report.fingerprint = _fingerprint(context)
     pairs = _listed(context, report, anew=overwrite or dry)
     summary, pairs_csv = summarise(context.block, pairs), pairs_text(pairs)
-    oriented_lines = orientation_lines(oriented.facts, found.block, context.block)
-    said_later = [*oriented.facts.get("remarks", []), *(w for w in summary.warnings if w not in known)]
-    report.facts = {
-        "summary": [*given_lines, *oriented_lines, *summary.lines(), *_remarks(settings)],
-        "block": summary.figures(),
-        "warnings": [*known, *said_later],
-        "images": len(found.block.images),
-        "pairs_sha256": hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
-    }
+    as_oriented = oriented.result if isinstance(oriented.result, OrientResult) else None
+    oriented_lines = [] if as_oriented is None else orientation_lines(as_oriented, found.block, context.block)
+    remarks = [] if as_oriented is None else as_oriented.remarks
+    said_later = [*remarks, *(w for w in summary.warnings if w not in known)]
+    result = PairsResult(
+        summary=[*given_lines, *oriented_lines, *summary.lines(), *_remarks(settings)],
+        block=summary.figures(),
+        warnings=[*known, *said_later],
+        images=len(found.block.images),
+        pairs_sha256=hashlib.sha256(pairs_csv.encode("utf-8")).hexdigest(),
+    )
+    report.result = result
     report.failures = list(found.failures)
     context = replace(context, pairs=tuple(pairs))
-    for line in report.facts["summary"]:
+    for line in result.summary:
         say(line)
     for warning in said_later:
         log.warning("warning: %s", warning)
@@ -221,7 +225,8 @@ def _stored_pairs(workspace: Workspace, wanted: str) -> list[Pair] | None:
     if not (path.is_file() and workspace.pairs.is_file()):
         return None
     report = read_json(path)
-    if report.get("fingerprint") != wanted or report["facts"].get("pairs_sha256") != file_digest(workspace.pairs):
+    found = PairsResult.of_json(report.get("result"))
+    if report.get("fingerprint") != wanted or found is None or found.pairs_sha256 != file_digest(workspace.pairs):
         return None
     return read_pairs(workspace.pairs)
 

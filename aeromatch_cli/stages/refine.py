@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
 from aeromatch_cli.formats.refined import write_refined
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
+from aeromatch_cli.results.stages import RefineResult
 from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.enhance import source_of
@@ -42,7 +43,7 @@ from aeromatch_cli.stages.stage_report import StageReport, run_stage
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 
-VERSION = 1
+VERSION = 2
 # Images whose keypoints are measured before patches are given up that no later image needs.
 _IMAGES_AT_ONCE = 128
 
@@ -53,27 +54,27 @@ def run(context: Context) -> StageReport:
     recipe, folder = context.settings.refine, context.workspace.refined_files.parent
     if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
         _remove(folder)
-        report.facts = {"keypoints": None, "measured": None, "shift_px": None}
+        report.result = RefineResult()
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
     report.items, report.fingerprint = len(context.block.images), current_fingerprint(context)
     record = {} if context.overwrite else whole_record(context.workspace.refined_files, say=True)
     if record.get("asked") == report.fingerprint and _nothing_is_back(context, record["lacking"], report):
-        report.skipped, report.facts = report.items - len(report.failures), record["facts"]
+        report.skipped, report.result = report.items - len(report.failures), RefineResult(**record["result"])
         return report.write(context.workspace)
     report.failures.clear()
     _make_room(context)
     with context.executor.step("refine"):
         table = _Table.of(context)
     found = _measured(context, table, recipe, report)
-    report.facts = _write(context, table, found, recipe)
+    report.result = _write(context, table, found, recipe)
     report.done = report.items - len(report.failures)
     # What is made of places that lack some must not count as made of all. Measurements that failed are tried again as
     # soon as their pictures can be read, that is with the next command.
     lacking = sorted({item for item, _ in report.failures})
     made = fingerprint(report.fingerprint, lacking) if lacking else report.fingerprint
     names = sorted(path.name for path in folder.glob("*.npz"))
-    head = {"asked": report.fingerprint, "fingerprint": made, "lacking": lacking, "facts": report.facts}
+    head = {"asked": report.fingerprint, "fingerprint": made, "lacking": lacking, "result": report.result.as_json()}
     write_record(context.workspace.refined_files, head, names)
     return report.write(context.workspace)
 
@@ -265,8 +266,8 @@ def _geometry(context: Context, first: str, second: str) -> PairGeometry:
     return geometry if first < second else geometry.turned()
 
 
-def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquares) -> dict[str, Any]:
-    """Files of all images; figures of what was measured."""
+def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquares) -> RefineResult:
+    """Files of all images, and what was measured."""
     # What could not be measured stands for itself, and for those that are measured by it.
     trees = replace(table.trees, depth=_depths(table.trees, found.held))
     moved = shifts_through(trees, found.matrices, found.shifts_px)
@@ -284,11 +285,11 @@ def _write(context: Context, table: _Table, found: Measured, recipe: LeastSquare
         features = known_fingerprint(context.workspace.features(image_id)) or ""
         write_atomically(context.workspace.refined(image_id), partial(_written, (places, measured, features)))
     lengths = np.linalg.norm(moved[held], axis=1)
-    return {
-        "keypoints": int((table.trees.depth > 0).sum()),
-        "measured": int(held.sum()),
-        "shift_px": round(float(np.median(lengths)), 4) if len(lengths) else None,
-    }
+    return RefineResult(
+        keypoints=int((table.trees.depth > 0).sum()),
+        measured=int(held.sum()),
+        shift_px=round(float(np.median(lengths)), 4) if len(lengths) else None,
+    )
 
 
 def _written(values: tuple[FloatArray, BoolArray, str], stream: BinaryIO) -> None:

@@ -19,7 +19,8 @@ from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.orientation.quality import Level, Quality
+from aeromatch_cli.orientation.quality import Level
+from aeromatch_cli.results.stages import ExportResult, FilterResult, PairsResult, ReportResult
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -42,8 +43,8 @@ from aeromatch_cli.stages.closing import closing_lines, verdict_lines
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
-from aeromatch_cli.stages.naming import facts_named, item_named, names_on_file
-from aeromatch_cli.stages.quality import facts_told, quality_of
+from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
+from aeromatch_cli.stages.quality import quality_of, results_of
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -73,13 +74,15 @@ _CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "
 @dataclass(frozen=True)
 class Result:
     """What a command says: lines for people, facts for machines; failures, and the verdict on the block where there is
-    one, for the exit code. urgent: those of the lines that are said even where quiet is asked for."""
+    one, for the exit code. urgent: those of the lines that are said even where quiet is asked for. reports: of the
+    stages."""
 
     lines: tuple[str, ...]
     facts: dict[str, Any] = field(default_factory=dict)
     failures: tuple[tuple[str, str, str], ...] = ()
     verdict: Level | None = None
     urgent: tuple[str, ...] = ()
+    reports: tuple[StageReport, ...] = ()
 
 
 def execute(
@@ -115,7 +118,7 @@ def execute(
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 result = _repairing(command, settings, executor, part, overwrite, _Said(say))
             if whole and not result.failures:
-                unchanged.remember(Workspace(root), inputs, result.facts["stages"])
+                unchanged.remember(Workspace(root), inputs, result.reports)
             return _named(result, root)
         except BaseException as error:
             # Workers are stopped in the middle of what they write.
@@ -131,17 +134,17 @@ def _named(result: Result, root: Path) -> Result:
     """The same as people and other programs get it: with names of files in place of image ids."""
     names = names_on_file(Workspace(root))
     failures = tuple((stage, item_named(item, names), reason) for stage, item, reason in result.failures)
-    return replace(result, facts=facts_named(result.facts, names), failures=failures)
+    return replace(result, facts=with_names(result.facts, names), failures=failures)
 
 
 def _unchanged(settings: Settings, reports: list[StageReport], said: _Said) -> Result:
     """Of a whole run that has nothing to do."""
     workspace = Workspace(Path(settings.workspace).absolute())
     names = {image.image_id: image.name for image in read_images(workspace.images)}
-    block = next(report for report in reports if report.stage == "pairs")
-    for line in block.facts["summary"]:
+    block = _block_of(reports)
+    for line in block.summary:
         said(line)
-    for warning in block.facts["warnings"]:
+    for warning in block.warnings:
         log.warning("warning: %s", warning)
     return _result("run", settings, workspace, names, reports, (), said)
 
@@ -301,7 +304,8 @@ def _run_all(context: Context) -> list[StageReport]:
     """extract, match, filter; then adjust, consistency, export and report."""
     context, reports = _to_filter(context)
     if context.shard is None:
-        if not reports[-1].facts["verified_matches"]:
+        judged = reports[-1].result
+        if not isinstance(judged, FilterResult) or not judged.verified_matches:
             report.run(context)  # in any case: nothing else says why
             raise InputError(
                 f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
@@ -343,7 +347,7 @@ def _current_page(workspace: Workspace, *, settings: bool = True) -> StageReport
         before, now = ({**told, workspace.config.name: ""} for told in (before, now))
     if before != now:
         return None
-    return StageReport("report", items=1, skipped=1, facts=read_json(own)["facts"])
+    return StageReport("report", items=1, skipped=1, result=ReportResult.of_json(read_json(own).get("result")))
 
 
 def _to_filter(context: Context) -> tuple[Context, list[StageReport]]:
@@ -367,16 +371,17 @@ def _result(
 ) -> Result:
     """names: of the files, by image_id. part: of a shard."""
     first = next(report for report in reports if report.stage == "pairs")
-    lines = said.rest(first.facts["summary"])
+    lines = said.rest(_block_of(reports).summary)
     for stage in reports:
         lines += stage_lines(stage, names, part=part)
-    quality, told = _quality(command, workspace, reports, names, part=part)
+    results = results_of(workspace, reports)
+    quality = quality_of(results, names) if command in _JUDGED and not part else None
     lost, urgent = list[Lost](), list[str]()
     if quality is not None:
-        lost = lost_images(told, first.failures, names)
+        lost = lost_images(results, first.failures, names)
         write_lost(workspace, lost)
         told_lost = lost_lines(workspace, lost, len(names) + len(first.failures))
-        lines += [*closing_lines(quality, told, names), *told_lost]
+        lines += [*closing_lines(quality, results, names), *told_lost]
         urgent = [*([] if quality.verdict == "good" else verdict_lines(quality)), *told_lost]
     lines.append(f"workspace {workspace.root}")
     if reports[-1].stage == "report":
@@ -389,7 +394,7 @@ def _result(
             for folder in workspace.exported()
         ]
     if command in ("run", "export") and not part:
-        written = next((report.facts for report in reports if report.stage == "export"), {})
+        written = next((r.result.exporters for r in reports if isinstance(r.result, ExportResult)), {})
         lines += [f"export    {workspace.export(e.name)}" for e in settings.export if e.name in written]
         lines += [f"export    {folder} is of earlier settings, not made anew" for folder in _left(workspace, settings)]
     if failures:
@@ -403,17 +408,13 @@ def _result(
     if quality is not None:
         facts["quality"] = quality.as_facts()
         facts["lost"] = {name: reason for name, _, reason in lost}
-    return Result(tuple(lines), facts, failures, None if quality is None else quality.verdict, tuple(urgent))
+    verdict = None if quality is None else quality.verdict
+    return Result(tuple(lines), facts, failures, verdict, tuple(urgent), tuple(reports))
 
 
-def _quality(
-    command: str, workspace: Workspace, reports: Sequence[StageReport], names: Mapping[str, str], *, part: bool
-) -> tuple[Quality | None, Mapping[str, Any]]:
-    """The verdict on the block after `run` and `adjust`, and the facts by stage that it rests on."""
-    if command not in _JUDGED or part:
-        return None, {}
-    facts = facts_told(workspace, reports)
-    return quality_of(facts, names), facts
+def _block_of(reports: Sequence[StageReport]) -> PairsResult:
+    """What the stage pairs has found; every command runs it."""
+    return next(report.result for report in reports if isinstance(report.result, PairsResult))
 
 
 def _left(workspace: Workspace, settings: Settings) -> list[Path]:
@@ -434,7 +435,7 @@ def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
             "skipped": r.skipped,
             "failed": len(r.failures),
             "seconds": r.seconds,
-            "facts": r.facts,
+            "result": None if r.result is None else r.result.as_json(),
         }
     return found
 
@@ -450,19 +451,19 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
 
 
 def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
-    settled = bool(oriented.facts) or not isinstance(context.settings.orient, FirstPass)
-    quality = picture_quality.measured(context)
+    settled = oriented.result is not None or not isinstance(context.settings.orient, FirstPass)
+    read, quality = _block_of([first]), picture_quality.measured(context)
     looks = picture_quality.remarks(context, quality)
     for warning in looks:
-        if warning not in first.facts["warnings"]:
+        if warning not in read.warnings:
             log.warning("warning: %s", warning)
     found = check.run(context, time.perf_counter() - first.started, len(first.failures), oriented=settled)
-    lines = (*said.rest(first.facts["summary"]), *found.lines)
+    lines = (*said.rest(read.summary), *found.lines)
     failures = tuple(("check", item, reason) for item, reason in [*first.failures, *found.failures])
     for _, item, reason in failures:
         log.error("failed: %s: %s", item, reason)
     facts = {
-        "warnings": [*dict.fromkeys([*first.facts["warnings"], *looks])],
+        "warnings": [*dict.fromkeys([*read.warnings, *looks])],
         "estimate": found.estimate,
         "failures": len(failures),
     }

@@ -16,6 +16,7 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import write_png
 from aeromatch_cli.images.views import render_view
+from aeromatch_cli.results.stages import ViewsResult
 from aeromatch_cli.stages import enhance
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.stage_report import StageReport, run_stage
@@ -161,18 +162,10 @@ def degenerate_view(workspace: Workspace, image: Image) -> str:
     return f"degenerate ground view ({width_px}x{height_px} px of an image of {image.width_px}x{image.height_px} px)"
 
 
-def cost_facts(costs: Sequence[ViewCost], earlier: Mapping[str, Any]) -> dict[str, Any]:
-    """What views cost: sums over the images made, the `earlier` ones of the same command included, and means."""
-    images = len(costs) + earlier.get("images", 0)
-    views = sum(cost.views for cost in costs) + earlier.get("views", 0)
-    megapixels = math.fsum(cost.megapixels for cost in costs) + earlier.get("view_megapixels", 0.0)
-    return {
-        "images": images,
-        "views": views,
-        "view_megapixels": round(megapixels, 6),
-        "views_per_image": round(views / images, 3),
-        "view_megapixels_per_image": round(megapixels / images, 3),
-    }
+def views_result(costs: Sequence[ViewCost]) -> ViewsResult:
+    """The views of images made now."""
+    megapixels = round(math.fsum(cost.megapixels for cost in costs), 6)
+    return ViewsResult(images=len(costs), views=sum(cost.views for cost in costs), view_megapixels=megapixels)
 
 
 def _run_task(task: SimulateTask) -> ViewCost:
@@ -189,7 +182,7 @@ def run(context: Context) -> StageReport:
     report.items, report.skipped = len(tasks), len(tasks) - len(todo)
     costs = run_stage(context, report, _run_task, todo, [task.enhance.image_id for task in todo])
     if costs:
-        report.facts = cost_facts(costs, {})
+        report.result = views_result(costs)
     report.fingerprint = fingerprint([task.fingerprint for task in tasks])
     return report.write(context.workspace, context.shard)
 

@@ -8,27 +8,26 @@ import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from aeromatch_cli.data import Pair
 from aeromatch_cli.executor import Outcome
 from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.results.stages import RESULTS, StageResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.naming import item_named, names_on_file
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.workspace import Workspace
 
 T = TypeVar("T")
-
-R = TypeVar("R")
+V = TypeVar("V")
+R = TypeVar("R", bound=StageResult)
 
 log = logging.getLogger("aeromatch")
 
 # Stages whose items are images or pairs; the others name files or exporters.
 ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
-# Of what facts are called and mean: those of another version are not read.
-_FACTS_VERSION = 1
 
 
 @dataclass
@@ -45,7 +44,7 @@ class StageReport:
     done: int = 0
     skipped: int = 0
     fingerprint: str = ""
-    facts: dict[str, Any] = field(default_factory=dict)
+    result: StageResult | None = None
     failures: list[tuple[str, str]] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     part: str = ""
@@ -65,8 +64,7 @@ class StageReport:
             "skipped": self.skipped,
             "failed": len(self.failures),
             "fingerprint": self.fingerprint,
-            "facts_version": _FACTS_VERSION,
-            "facts": self.facts,
+            "result": None if self.result is None else self.result.as_json(),
             "failures": [list(failure) for failure in self.failures],
         }
         path = context_workspace.stage_report(self.stage, shard.label if shard else "")
@@ -83,20 +81,17 @@ class StageReport:
         if self.done or not path.is_file():
             return False
         old = read_json(path)
-        # Without facts of its own the stage only counts what it makes: those on file still hold.
-        self.facts = self.facts or old.get("facts", {})
+        before = RESULTS[self.stage].of_json(old.get("result"))
+        # Without a result of its own the stage only counts what it makes: the one on file still holds.
+        self.result = self.result or before
         failures = [list(failure) for failure in self.failures]
-        known = [old.get(key) for key in ("failures", "fingerprint", "facts_version", "facts")]
-        return known == [failures, self.fingerprint, _FACTS_VERSION, self.facts]
+        return (old.get("failures"), old.get("fingerprint"), before) == (failures, self.fingerprint, self.result)
 
 
-def facts_on_file(workspace: Workspace, stage: str) -> dict[str, Any]:
-    """What a stage left in its report, nothing where there is none of this version."""
-    path = workspace.stage_report(stage)
-    if not path.is_file():
-        return {}
-    report = read_json(path)
-    return dict(report["facts"]) if report.get("facts_version") == _FACTS_VERSION else {}
+def result_on_file(workspace: Workspace, kind: type[R]) -> R | None:
+    """What a stage left in its report, None where there is none, or one of another version."""
+    path = workspace.stage_report(kind.stage)
+    return kind.of_json(read_json(path).get("result")) if path.is_file() else None
 
 
 def _shard_failed_since(path: Path) -> bool:
@@ -177,19 +172,19 @@ def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[t
 def run_stage(
     context: Context,
     report: StageReport,
-    function: Callable[[T], R],
+    function: Callable[[T], V],
     tasks: Sequence[T],
     names: Sequence[str],
     sizes: Sequence[int] | None = None,
     *,
     network: bool = False,
-) -> list[R]:
+) -> list[V]:
     """Run tasks, put failures into the report under their names, return the values of the rest.
 
     sizes: how many items each task counts while it is shown how far the stage is. network: whether tasks run one.
     """
     label = context.part + report.stage
-    outcomes: list[Outcome[R]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
+    outcomes: list[Outcome[V]] = context.executor.run(function, tasks, label, sizes, network=network) if tasks else []
     values = []
     for name, outcome in zip(names, outcomes, strict=True):
         if outcome.value is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.images.remote import is_remote
+from aeromatch_cli.results.stages import RESULTS
 from aeromatch_cli.stages.pairs import chosen_strategies
-from aeromatch_cli.stages.stage_report import StageReport, facts_on_file
+from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.workspace import Workspace
 
@@ -60,28 +61,27 @@ def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[S
         now = {**inputs, "files": _state_of_files(workspace)}
         if any(record.get(key) != value for key, value in now.items()):
             return None
-        return [
-            StageReport(
-                stage, items=own["items"], skipped=own["items"], facts=own["facts"] or facts_on_file(workspace, stage)
-            )
-            for stage, own in record["stages"].items()
-        ]
+        return [_report(workspace, stage, **own) for stage, own in record["stages"].items()]
     except BrokenFileError:  # the long way makes it again
         return None
 
 
-def remember(workspace: Workspace, inputs: Mapping[str, str], stages: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write the record of a run that has ended without a failure. inputs: from before it began. stages: facts of its
-    stages, in order; those that their reports on file tell are not written once more."""
+def _report(workspace: Workspace, stage: str, *, items: int, result: Any) -> StageReport:
+    """Of a stage that has made nothing. result: None for the one on file."""
+    kind = RESULTS[stage]
+    found = result_on_file(workspace, kind) if result is None else kind(**result)
+    return StageReport(stage, items=items, skipped=items, result=found)
+
+
+def remember(workspace: Workspace, inputs: Mapping[str, str], reports: Sequence[StageReport]) -> None:
+    """Write the record of a run that has ended without a failure. inputs: from before it began. reports: of its stages,
+    in order; results that are on file are not written once more."""
     if not inputs:
         return
-    told = {
-        stage: {
-            "items": own["items"],
-            "facts": None if own["facts"] == facts_on_file(workspace, stage) else own["facts"],
-        }
-        for stage, own in stages.items()
-    }
+    told = {}
+    for one in reports:
+        known = one.result is None or one.result == result_on_file(workspace, RESULTS[one.stage])
+        told[one.stage] = {"items": one.items, "result": None if known or one.result is None else one.result.as_json()}
     write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
 
 

@@ -28,11 +28,12 @@ from aeromatch_cli.formats.rows import (
     write_match_row,
 )
 from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.results.stages import ExtractResult, MatchResult
 from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
 from aeromatch_cli.stages.context import Context, Union
 from aeromatch_cli.stages.rows import features_of
-from aeromatch_cli.stages.stage_report import StageReport, facts_on_file, gather_failures, run_stage
+from aeromatch_cli.stages.stage_report import StageReport, gather_failures, result_on_file, run_stage
 from aeromatch_cli.strategies.matchers.descriptors.assignment import distinct, one_to_one
 from aeromatch_cli.workspace import Workspace
 
@@ -125,11 +126,11 @@ def _join_keypoints(context: Context, steps: Sequence[StepContext]) -> StageRepo
     run_stage(context, report, join_keypoints, tasks, [task.image_id for task in tasks])
     # An image that fails in one step has the keypoints of the others.
     report.skipped = joined - len(tasks)
-    found = facts_on_file(steps[0].context.workspace, "extract")
-    report.facts = {
-        "images_by_step": {step.name: len(step.images) for step in steps if step.own_features},
-        "images_without_keypoints": found.get("images_without_keypoints", 0),
-    }
+    found = result_on_file(steps[0].context.workspace, ExtractResult)
+    report.result = ExtractResult(
+        images_by_step={step.name: len(step.images) for step in steps if step.own_features},
+        images_without_keypoints=0 if found is None else found.images_without_keypoints,
+    )
     report.fingerprint = fingerprint(sorted(context.union.features.values()))
     return report.write(context.workspace)
 
@@ -219,11 +220,9 @@ def _join_matches(context: Context, steps: Sequence[StepContext]) -> StageReport
         counts = [_matches_on_file(task) for task in tasks]
     outcomes = cascade.outcomes(context, steps)
     by = Counter(outcome.settled_by for outcome in outcomes.values())
-    report.facts = {
-        "matches": sum(counts),
-        "settled_by": {step.name: by[step.name] for step in steps},
-        "not_settled": by[""],
-    }
+    report.result = MatchResult(
+        matches=sum(counts), settled_by={step.name: by[step.name] for step in steps}, not_settled=by[""]
+    )
     _write_steps(context, steps, outcomes)
     report.fingerprint = fingerprint(sorted(fp for task in tasks for fp in task.pairs.values()))
     return report.write(context.workspace)

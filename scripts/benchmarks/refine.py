@@ -39,7 +39,7 @@ def row_of(args: argparse.Namespace, preset: str, scene: str, flight: str) -> Ro
                 raise SystemExit(f"aeromatch run {preset} on {block} failed with exit code {run.code}:\n{run.said}")
             totals = evaluated(work, block, mapping=False)["totals"]
             row |= {f"{key}_{label}": totals[key] for key in _FIGURES}
-            row |= {"seconds": run.answer["stages"]["refine"]["seconds"], **run.answer["stages"]["refine"]["facts"]}
+            row |= {"seconds": run.answer["stages"]["refine"]["seconds"], **run.answer["stages"]["refine"]["result"]}
         write_json(path, row)
         print(f"{preset} {row['block']}", file=sys.stderr, flush=True)
     found: Row = read_json(path)

@@ -49,7 +49,7 @@ def our_chain(args: Any, images: Path, reference: Path, folder: Path, case: str)
     run = whole_run("run", args.preset, images, work, extra=extra, jobs=args.jobs, settings=settings)
     if not run.answer:
         raise SystemExit(f"aeromatch run {args.preset} failed with exit code {run.code}:\n{run.said[-2000:]}")
-    facts = run.answer["stages"]["adjust"]["facts"]
+    facts = run.answer["stages"]["adjust"]["result"]
     best = max(facts["groups"], key=lambda group: group["images"], default={"images": 0})
     row: Row = {"registered": best["images"], "models": len(facts["groups"]), "seconds": run.seconds}
     row |= {key: best.get(key) for key in ("points", "track_length", "reprojection_error_px")}

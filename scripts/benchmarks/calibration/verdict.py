@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +14,8 @@ from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.orientation.quality import Evidence
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.results.adjustment import GroupResult
+from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
@@ -24,31 +24,32 @@ def of_adjusted(
     contents: ExportContents,
     observed: Observed,
     adjusted: AdjustedBlock,
-    groups: Sequence[Mapping[str, Any]],
+    groups: Sequence[GroupResult],
     *,
     metric: bool,
 ) -> Evidence:
-    """groups: facts of `refine_block`. metric: whether the world frame's lengths are metres."""
+    """groups: results of `refine_block`. metric: whether the world frame's lengths are metres."""
     images = contents.block.images
     tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in contents.pairs])
     alone = len(images) - sum(map(len, tied))
     residuals = residuals_of(adjusted, observed.poses, images, contents.keypoints_px)
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in images}
     control = control_figures(adjusted, cameras, observed.control, metric=metric) if observed.control else None
-    facts = {
+    result = AdjustResult(
         **block_figures(adjusted, images, groups),
-        "positions_given": len(observed.poses),
-        "outside": {i.image_id: "" for i in images if i.image_id not in adjusted.poses},
-        "control": control,
-        "residuals": residual_figures(residuals, {}),
-        "remarks": [] if adjusted.poses else ["no image could be oriented"],
-    }
-    evidence = Evidence(images=len(images), adjust=facts, components=[*map(len, tied), *[1] * alone], refined=True)
+        positions_given=len(observed.poses),
+        outside={i.image_id: "" for i in images if i.image_id not in adjusted.poses},
+        control=control,
+        residuals=residual_figures(residuals, {}),
+        remarks=[] if adjusted.poses else ["no image could be oriented"],
+    )
+    components = (*map(len, tied), *[1] * alone)
+    evidence = Evidence(images=len(images), adjust=result, components=components, refined=True)
     if not adjusted.poses or not contents.pairs:
         return evidence
     found = _contradictions(contents, adjusted, cameras)
     share = float(np.concatenate(found.masks).mean())
-    return replace(evidence, contradicted=share, contradicting=found.doubtful)
+    return evidence.model_copy(update={"contradicted": share, "contradicting": tuple(found.doubtful)})
 
 
 def _contradictions(contents: ExportContents, adjusted: AdjustedBlock, cameras: Mapping[str, Camera]) -> Contradictions:

@@ -76,9 +76,9 @@ def run_case(args: Any, block: str, every: int, case: str) -> Row:
     if case == "level":  # heights count from the flight
         row["terrain_share"] = None
     row |= {"correct": facts["totals"]["correct"], "kept": facts["totals"]["kept"]}
-    row |= {"pairs": stages["filter"]["facts"]["pairs"].get("verified", 0), "seconds": run.seconds}
+    row |= {"pairs": stages["filter"]["result"]["pairs"].get("verified", 0), "seconds": run.seconds}
     row |= {"stages": {name: stage["seconds"] for name, stage in stages.items()}}
-    row |= {"unregistered": sorted(stages["adjust"]["facts"].get("outside", names))}
+    row |= {"unregistered": sorted(stages["adjust"]["result"].get("outside", names))}
     row |= {"registered": facts["consumer"].get("registered")}
     write_json(answer, row)
     if not args.keep:

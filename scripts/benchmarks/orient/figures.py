@@ -39,7 +39,7 @@ def judged(work: Path, reference: Path, names: Sequence[str], wrong: set[str]) -
     true = {k: lenses[k if k in lenses else next(iter(lenses))]["params"][0] for k in focal}
     shares = [focal[k] / float(true[k]) - 1.0 for k in focal]
     record = work / "reports" / "orient.json"
-    facts = read_json(record)["facts"] if record.is_file() else {}
+    facts = read_json(record)["result"] if record.is_file() else {}
     remarks = facts.get("remarks", [])
     whole = any("angles" in remark for remark in remarks)
     own = facts.get("frame") == "own"
@@ -109,7 +109,7 @@ def terrain_error(work: Path, rendered: Path) -> float:
     own = np.array([found[i].center_m for i in ids])
     origin_m = np.array(read_json(work / "block.json")["origin_m"])
     true = np.array([truth.poses[name_of[i]].center_m for i in ids]) - origin_m
-    if read_json(work / "reports" / "orient.json")["facts"].get("frame") == "world":
+    if read_json(work / "reports" / "orient.json")["result"].get("frame") == "world":
         scale, rotation, shift_m = 1.0, np.eye(3), np.zeros(3)
     else:
         scale, rotation, shift_m = similarity(true, own)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.orientation.mapping import refine_block
 from aeromatch_cli.orientation.quality import Evidence, judged
+from aeromatch_cli.results.stages import AdjustResult
 from aeromatch_cli.stages import adjust
 from benchmarks import options
 from benchmarks.calibration.accuracy import Found
@@ -43,8 +44,8 @@ def evidence_of(task: Task) -> tuple[Evidence, Row]:
     try:
         adjusted, groups = refine_block(task.contents, task.observed, task.groups, fixed=task.fixed)
     except AeromatchError as error:
-        facts: dict[str, Any] = {"images": 0, "remarks": [str(error)]}
-        return Evidence(images=len(task.contents.block.images), adjust=facts, refined=True), {}
+        nothing = AdjustResult(images=0, remarks=[str(error)])
+        return Evidence(images=len(task.contents.block.images), adjust=nothing, refined=True), {}
     one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
     whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
     errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
@@ -56,7 +57,7 @@ def _run(name: str, expected: str, path: Path, tie_points: int) -> None:
     plan, spoil = (FAULTS if expected == "spoilt" else GOOD)[name]
     evidence, errors = evidence_of(spoil(plan.task(tie_points)))
     height = errors.get("absolute_height_px", errors.get("height_px"))
-    write_json(path, {"block": name, "expected": expected, "height_px": height, "evidence": asdict(evidence)})
+    write_json(path, {"block": name, "expected": expected, "height_px": height, "evidence": evidence.as_json()})
 
 
 def _judged(row: Row) -> Row:
