@@ -489,11 +489,10 @@ def test_every_program_of_the_tests_is_on_the_page() -> None:
 def test_remarks_reach_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The stage says what an exporter could not write exactly, and keeps it in its facts."""
+    """The stage says what an exporter could not write exactly, and keeps it in its result."""
     from aeromatch_cli.stages import export as stage
 
     monkeypatch.setattr(stage, "contents_of", lambda *_: contents_with(block_camera(), (1.0, 2.0)))
     task: Any = stage.ExportTask(EXPORTERS["bundler"](), None, tmp_path / "bundler", None)  # type: ignore[arg-type]
-    facts = stage._run_task(task)
-    (remark,) = facts["remarks"]
+    (remark,) = stage._run_task(task).remarks
     assert f"warning: export bundler: {remark}" in caplog.text

@@ -161,6 +161,36 @@ def test_check_points_alone_have_the_residuals_of_the_block_as_it_is(truth: Trut
     assert not own.residuals  # nothing says what its units are
 
 
+def test_points_in_one_place_or_on_one_line_determine_no_transformation(truth: Truth) -> None:
+    rows = list(range(0, 400, 50))
+    points = surveyed(truth, rows, np.zeros((8, 3)), set())
+    same = [replace(point, position_m=points[0].position_m) for point in points]
+    line = [replace(point, position_m=np.array([10.0 * k, 20.0 * k, 5.0])) for k, point in enumerate(points)]
+    for wrong in (same, line):
+        found = control_figures(adjusted_truth(truth), cameras(truth), wrong)
+        assert (found.control, found.transformation, found.control_rmse_m) == (8, None, None)
+        assert json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_image_points_that_count_from_below_are_said(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adjust.orient, "groups", lambda _: [])
+    images = {image.image_id: image for image in truth.block.images}
+
+    def said(points: list[ControlPoint]) -> list[str]:
+        context = SimpleNamespace(control=points, block=truth.block, image_by_id=images)
+        figures = control_figures(adjusted_truth(truth), cameras(truth), points)
+        return adjust._counted_from_below(context, adjusted_truth(truth), figures)
+
+    points = surveyed(truth, list(range(0, 400, 50)), np.zeros((8, 3)), set())
+    below = [
+        replace(p, pixels={i: np.array([x, images[i].height_px - 1.0 - y]) for i, (x, y) in p.pixels.items()})
+        for p in points
+    ]
+    assert said(points) == []
+    [words] = said(below)
+    assert "to 0.0 px if y in their list counts from the lower edge" in words
+
+
 @pytest.mark.parametrize("head", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
 def test_a_list_is_read_into_the_block(tmp_path: Path, head: str) -> None:
     path = tmp_path / "gcp_list.txt"
@@ -269,7 +299,7 @@ def test_the_run_says_the_errors(done_site: Site, rendered: Path) -> None:
     inside = outcome.facts["stages"]["adjust"]["result"]["groups"][0]["control"]
     assert (len(inside["used"]), inside["wrong"], inside["exchanged"]) == (control["control"], [], [])
     assert max(inside["held_out_rms_m"][:2]) < 0.5 < max(inside["without_rms_m"])
-    assert "take part in the adjustment: RMSE at each control point, adjusted without it" in outcome.stdout
+    assert "take part in the adjustment; RMSE at control points left out in turn: " in outcome.stdout
     assert control["doubtful"] == []
     page = (done_site.work / "report" / "index.html").read_text()
     assert "Control points, each left out once" in page
@@ -305,6 +335,6 @@ def test_what_control_points_did_in_the_adjustment_is_said() -> None:
     assert control_words(filled(Control, control), [filled(ControlInGroup, adjusted)]) == [
         "control: 5 control points, 0 check points",
         "control points that the others contradict: e; they were left out",
-        "4 control points take part in the adjustment: RMSE at each control point, adjusted without it x 0.020, y "
-        "0.030, z 0.040 m, x 2.000, y 3.000, z 4.000 m without control",
+        "4 control points take part in the adjustment; RMSE at control points left out in turn: x 0.020, y 0.030, z "
+        "0.040 m, without any control x 2.000, y 3.000, z 4.000 m",
     ]

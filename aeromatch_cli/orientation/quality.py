@@ -495,8 +495,8 @@ def _refused(control: ControlInGroup, stated_m: FloatArray) -> Finding:
     words = (
         f"the control points fit the block if {control.fault}; they were left out: correct the list"
         if control.fault
-        else "the control points do not make points better that took no part, and were left out: check their "
-        "coordinate system, their heights and where they were measured"
+        else "the control points contradict the images and their positions, and were left out: check their coordinate "
+        "system, their heights, their names, and where they were measured in the pictures"
     )
     return Finding("control points", sigmas if np.isfinite(sigmas) else None, limit, "doubtful", words)
 

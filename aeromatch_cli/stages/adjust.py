@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.blocks.crs import LOCAL
-from aeromatch_cli.data import AdjustedBlock, PoseResidual
+from aeromatch_cli.data import AdjustedBlock, ControlPoint, PoseResidual
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.files import translated_os_errors, whole_record, write_atomically, write_record, write_text
 from aeromatch_cli.fingerprints import fingerprint
@@ -44,6 +44,9 @@ VERSION = 26
 _FOCAL_SHARE = 0.01
 # Control points are said to lie elsewhere beyond this, metres, and so many standard deviations of a given position.
 _FAR_CONTROL_M, _FAR_CONTROL_SIGMAS = 10.0, 5.0
+# Image points of surveyed points count from below where their rays meet so many times better then; and beyond so many
+# pixels.
+_FROM_BELOW, _FROM_BELOW_PX = 5.0, 20.0
 _NOTHING = "not done: no image is oriented; exports have poses only where some are given"
 # An image with fewer keypoints than this share of the median shows hardly any texture, or is blurred.
 _FEW_KEYPOINTS = 0.1
@@ -226,7 +229,9 @@ def _remarks(
                 f"focal length of camera {camera_id}: {new_px:.0f} px after the adjustment, {old_px:.0f} px before"
             )
     remarks += height_remarks(groups)
-    return remarks + control_remarks(context, None if control is None else control.offset_m)
+    if control is None:
+        return remarks
+    return remarks + (_counted_from_below(context, adjusted, control) or control_remarks(context, control.offset_m))
 
 
 def height_remarks(groups: Sequence[GroupResult]) -> list[str]:
@@ -267,12 +272,34 @@ def _control(context: Context, adjusted: AdjustedBlock, groups: Sequence[GroupRe
         return None
     found = [group.control for group in groups if group.control is not None]
     left_out = {name for one in found for name in (*one.wrong, *one.exchanged)}
+    return _control_figures(context, adjusted, [point for point in context.control if point.name not in left_out])
+
+
+def _control_figures(context: Context, adjusted: AdjustedBlock, points: Sequence[ControlPoint]) -> Control:
     cameras = {image.image_id: adjusted.cameras[image.camera_id] for image in context.block.images}
     # Images that no position has placed lie beside the others: their rays meet those at no surveyed point.
     beside = {i for group in orient.groups(context) if group.kind == "level" for i in group.images}
     placed = {i: pose for i, pose in adjusted.poses.items() if i not in beside} or adjusted.poses
-    points = [point for point in context.control if point.name not in left_out]
     return control_figures(replace(adjusted, poses=placed), cameras, points, metric=context.block.metric)
+
+
+def _counted_from_below(context: Context, adjusted: AdjustedBlock, control: Control) -> list[str]:
+    """What is said of image points of surveyed points whose y counts from the lower edge of the picture."""
+    images = context.image_by_id
+    turned = [
+        replace(point, pixels={i: np.array([x, images[i].height_px - 1.0 - y]) for i, (x, y) in point.pixels.items()})
+        for point in context.control
+    ]
+    as_given_px, turned_px = (
+        control.reprojection_error_px,
+        _control_figures(context, adjusted, turned).reprojection_error_px,
+    )
+    if as_given_px is None or turned_px is None or as_given_px < max(_FROM_BELOW * turned_px, _FROM_BELOW_PX):
+        return []
+    return [
+        f"rays of surveyed points meet to {as_given_px:.0f} px, and to {turned_px:.1f} px if y in their list counts "
+        "from the lower edge of the pictures: it has to count from the upper edge, correct the list"
+    ]
 
 
 def _reasons(context: Context, adjusted: AdjustedBlock) -> dict[str, str]:

@@ -240,10 +240,12 @@ def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = 
     if any(one.used for one in adjusted) or (taking_part and not control.control):
         return [counts, *wrong, *taking_part]
     if control.control_rmse_m is None:
-        few = f"{counts}: fewer than 3 control points are measured in two oriented images, no similarity to them"
+        few = f"{counts}: fewer than 3 control points are measured in two oriented images; a transformation needs 3"
         return [few, *wrong, *taking_part]
     words = [counts, *wrong, *taking_part, offset_words(control)]
-    words.append(f"after a similarity to the control points: RMSE of the fit {_axes(control.control_rmse_m)} m")
+    words.append(
+        f"after a similarity transformation onto the control points: RMSE at these {_axes(control.control_rmse_m)} m"
+    )
     if control.check_rmse_m is not None and control.check_kind is not None:
         words[-1] += f", at {_CHECKED[control.check_kind]} {_axes(control.check_rmse_m)} m"
     if control.doubtful:
@@ -264,15 +266,15 @@ def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
     if control.wrong:
         yield f"control points that the others contradict: {_listed(control.wrong)}; they were left out"
     with_m, without_m = control.held_out_rms_m, control.without_rms_m
-    held_out = "check points" if control.held_out == "check points" else "each control point, adjusted without it"
-    errors = "" if with_m is None else f": RMSE at {held_out} {_axes(with_m)} m"
-    errors += "" if with_m is None or without_m is None else f", {_axes(without_m)} m without control"
+    held_out = "check points" if control.held_out == "check points" else "control points left out in turn"
+    errors = "" if with_m is None else f"; RMSE at {held_out}: {_axes(with_m)} m"
+    errors += "" if with_m is None or without_m is None else f", without any control {_axes(without_m)} m"
     if control.kept and not control.used:
         yield f"the block as it is: RMSE at check points {_axes(with_m)} m" if with_m else "no check points"
     elif control.kept:
         yield f"{len(control.used)} control points take part in the adjustment{errors}"
     else:
-        yield f"control points do not take part in the adjustment, which they do not make better{errors}"
+        yield f"the control points were left out of the adjustment, since they make it no better{errors}"
 
 
 def _listed(names: list[str], shown: int = 10) -> str:
