@@ -6,7 +6,8 @@ import json
 
 import pytest
 
-from aeromatch_cli.cli.progress import RUN_STAGES, JsonProgress, LineProgress, ProgressKind, progress_shown
+from aeromatch_cli import graph
+from aeromatch_cli.cli.progress import JsonProgress, LineProgress, ProgressKind, progress_shown
 from aeromatch_cli.executor import SilentProgress
 
 
@@ -22,7 +23,7 @@ def test_plain_progress_says_percent_and_time_left(capsys):
 
 
 def test_progress_says_which_stage_of_how_many(capsys):
-    progress = LineProgress(RUN_STAGES)
+    progress = LineProgress(graph.RUN)
     for label, total, counts in (
         ("first pass: match", 1, [1]), ("step first: match", 10, [7, 3]), ("step guided: extract", 1, [1]),
         ("read", 1, [1]),
@@ -48,7 +49,7 @@ def told(monkeypatch, parts):
     monkeypatch.setattr("aeromatch_cli.cli.progress._JSON_EVERY_S", 0.0)
     lines: list[str] = []
     monkeypatch.setattr("aeromatch_cli.cli.progress.printed", lambda line, err: lines.append(line))
-    progress = JsonProgress(RUN_STAGES)
+    progress = JsonProgress(graph.RUN)
     whole_s = sum(seconds for _, seconds in parts)
     pairs = []
     for label, seconds in parts:
@@ -92,7 +93,7 @@ def test_the_end_does_not_come_before_that_of_the_present_part(monkeypatch):
 
 
 def test_json_progress_is_a_line_for_machines(capsys):
-    progress = JsonProgress(RUN_STAGES)
+    progress = JsonProgress(graph.RUN)
     progress.start("read", 2)
     progress.advance(2)
     progress.start("step first: match", 3)

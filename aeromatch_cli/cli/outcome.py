@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, create_model
 
-from aeromatch_cli.results.stages import RESULTS
+from aeromatch_cli import graph
 
 
 class StageOutcome(BaseModel):
@@ -33,9 +33,9 @@ class StageOutcome(BaseModel):
 def _stages() -> type[BaseModel]:
     """The stages that a command has run, in order; `steps`: what the steps of a shard's cascade did."""
     fields: dict[str, Any] = {"steps": (dict[str, dict[str, StageOutcome]], {})}
-    for stage, kind in RESULTS.items():
-        result: Any = (kind | None, ...)
-        fields[stage] = (create_model(stage.capitalize(), __base__=StageOutcome, result=result) | None, None)
+    for stage in graph.STAGES:
+        result: Any = (stage.result | None, ...)
+        fields[stage.name] = (create_model(stage.name.capitalize(), __base__=StageOutcome, result=result) | None, None)
     return create_model("Stages", __config__=ConfigDict(extra="forbid"), **fields)
 
 

@@ -45,9 +45,6 @@ _PARTS = (
 )  # fmt: skip
 # While given poses are looked at nobody knows whether they do, or are to be found from the pictures.
 _CHANCE = 0.5
-RUN_STAGES = tuple(dict.fromkeys(part.stage for part in _PARTS))
-# A shard ends there: what follows needs the whole block.
-SHARD_STAGES = RUN_STAGES[: RUN_STAGES.index("filter") + 1]
 # JSON lines come no faster than this, seconds, but for the first and the last of every part.
 _JSON_EVERY_S = 0.5
 

@@ -39,7 +39,7 @@ from aeromatch_cli.cli.options import (
     WorkspaceDir,
 )
 from aeromatch_cli.cli.output import as_texts, guarded, said
-from aeromatch_cli.cli.progress import RUN_STAGES, SHARD_STAGES, ProgressKind, progress_shown
+from aeromatch_cli.cli.progress import ProgressKind, progress_shown
 from aeromatch_cli.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -177,6 +177,7 @@ def stage_command(name: str) -> Callable[..., None]:
         run |= {"scheduler": scheduler, "executor": executor or ("dask" if scheduler else None)}
 
         def call() -> Result:
+            from aeromatch_cli import graph
             from aeromatch_cli.config import load
             from aeromatch_cli.stages.run import execute
 
@@ -195,8 +196,8 @@ def stage_command(name: str) -> Callable[..., None]:
                 workspace=_absolute(workspace),
             )
             _check_control(block, settings.block)
-            course = SHARD_STAGES if shard else RUN_STAGES
-            shown = progress_shown(progress, quiet=quiet, stages=course if name == "run" else ())
+            course = graph.course(shard=shard is not None) if name == "run" else ()
+            shown = progress_shown(progress, quiet=quiet, stages=course)
             return execute(name, settings, shard=shard, overwrite=overwrite, progress=shown, say=say)
 
         guarded(call, name, quiet=quiet, as_json=json_, log_file=log_file, context=context, strict=strict)

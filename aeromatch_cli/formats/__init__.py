@@ -289,6 +289,7 @@ plus the origin; `unit`: `m`, or `arbitrary` in a frame of the pictures' own.
 
 def page() -> str:
     """docs/workspace.md: this specification as Markdown, and the results of stages by their types."""
+    from aeromatch_cli import graph
     from aeromatch_cli.results.page import text
 
     heading, _, rest = (__doc__ or "").partition("\n\n")
@@ -296,4 +297,5 @@ def page() -> str:
         "This page is made from the specification in the code: `python -m aeromatch_cli.formats > docs/workspace.md`."
     )
     words = "This is what stages find: it stands in their reports and in the last line that `--json` prints."
-    return f"{heading}\n\n{made}\n\n{rest}\n## Results of stages\n\n{words}\n\n{text()}"
+    results = text(stage.result for stage in graph.STAGES)
+    return f"{heading}\n\n{made}\n\n{rest}\n## Results of stages\n\n{words}\n\n{results}"

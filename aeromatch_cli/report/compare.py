@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli import graph
 from aeromatch_cli.config import differing, load
 from aeromatch_cli.data import Image
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_csv, read_images, read_pairs
 from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
-from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
+from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult
 from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
@@ -63,7 +64,7 @@ def compare(first: Path, second: Path) -> tuple[list[str], dict[str, Any]]:
     lines += [*_image_lines(one, two), *_match_lines(one, two)]
     if one.adjusted is not None and two.adjusted is not None:
         lines += _adjusted_lines(one.adjusted, two.adjusted)
-    for stage in (stage for stage in STAGE_ORDER if stage in one.seconds and stage in two.seconds):
+    for stage in (stage for stage in graph.ORDER if stage in one.seconds and stage in two.seconds):
         lines.append(f"seconds     {stage}: {one.seconds[stage]:.1f} and {two.seconds[stage]:.1f}")
     common = one.images.keys() & two.images.keys()
     found = criteria(_standing(one, common), _standing(two, common))

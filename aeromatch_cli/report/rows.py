@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli import graph
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_csv
 from aeromatch_cli.results.stages import (
-    RESULTS,
     AdjustResult,
     ConsistencyResult,
     EnhanceResult,
@@ -34,19 +34,6 @@ from aeromatch_cli.workspace import Workspace
 
 NOT_JUDGED = "not judged"
 _UNENHANCED = "images not enhanced (same illumination)"
-STAGE_ORDER = (
-    "orient",
-    "pairs",
-    "enhance",
-    "simulate",
-    "extract",
-    "match",
-    "filter",
-    "refine",
-    "adjust",
-    "consistency",
-    "export",
-)
 
 
 @dataclass(frozen=True)
@@ -142,7 +129,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
         if shard:
             shards.setdefault(str(report["stage"]), set()).add(shard[1])
 
-    order = {name: place for place, name in enumerate(STAGE_ORDER)}
+    order = {name: place for place, name in enumerate(graph.ORDER)}
     rows = []
     for name, sharded in sorted(groups, key=lambda key: (order.get(key[0], len(order)), key)):
         # The report stage is running now: what is on file of it is about an earlier page.
@@ -154,7 +141,7 @@ def stage_rows(workspace: Workspace) -> list[StageRow]:
             sum(int(report[key]) for report in reports) for key in ("items", "done", "skipped", "failed")
         )
         label = f"{name} ({len(shards[name])} shards)" if sharded else name
-        found = "" if sharded else ", ".join(_details(RESULTS[name].of_json(reports[0].get("result"))))
+        found = "" if sharded else ", ".join(_details(graph.BY_NAME[name].result.of_json(reports[0].get("result"))))
         rows.append(StageRow(label, seconds, items, done, skipped, failed, found))
     return rows
 

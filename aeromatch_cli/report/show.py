@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from aeromatch_cli import graph
 from aeromatch_cli.config import Settings, load
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image, Pair, Pose
 from aeromatch_cli.errors import ConfigError, InputError, WorkspaceError
@@ -28,9 +29,9 @@ from aeromatch_cli.geometry.rotations import tilt_deg, to_omega_phi_kappa
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.remote import is_remote, on_disk, remote_file
 from aeromatch_cli.report.pictures import image_picture, pair_picture
-from aeromatch_cli.report.rows import STAGE_ORDER, seconds_by_stage
+from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.report.tiles import Tile, aligned, tiles_of_image, write_tiles
-from aeromatch_cli.results.stages import RESULTS, AdjustResult, ConsistencyResult, ExportResult, FilterResult
+from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, ExportResult, FilterResult
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
@@ -160,12 +161,12 @@ def _workspace(work: _Work) -> Shown:
     lines.append(f"world       {block['crs']}{scale}, origin {' '.join(f'{v:.0f}' for v in block['origin_m'])}")
     lines.append(f"pairs       {len(work.pairs)}")
     stages, seconds = dict[str, Any](), seconds_by_stage(workspace)
-    for stage in STAGE_ORDER:
+    for stage in graph.ORDER:
         path = workspace.stage_report(stage)
         if path.is_file():
             found = stages[stage] = read_json(path)
             lines.append(f"{stage:<11} {found['items']} items, {found['failed']} failed, {seconds[stage]:.1f} s")
-            match RESULTS[stage].of_json(found.get("result")):
+            match graph.BY_NAME[stage].result.of_json(found.get("result")):
                 case FilterResult() as judged:
                     states = ", ".join(f"{count} {state}" for state, count in judged.pairs.items())
                     lines.append(f"            {states}; {judged.verified_matches} verified matches")

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
 
-from aeromatch_cli.results.stages import RESULTS
+from aeromatch_cli.results.stages import StageResult
 
 _WIDTH = 118
 
 
-def text() -> str:
+def text(kinds: Iterable[type[StageResult]]) -> str:
     """Markdown: the result of every stage, then the types that these are made of."""
     lines, inner = [], dict[str, type]()
-    for stage, kind in RESULTS.items():
-        lines += [f"### Result of {stage}", "", *_described(kind, inner), ""]
+    for kind in kinds:
+        lines += [f"### Result of {kind.stage}", "", *_described(kind, inner), ""]
     described = set[str]()
     while left := [name for name in inner if name not in described]:
         described.add(left[0])

@@ -312,13 +312,3 @@ class BlockResults(Record):
         """How the final matches connect the images."""
         judged = self.consistency
         return judged if judged is not None and judged.components is not None else self.filter
-
-
-RESULTS: dict[str, type[StageResult]] = {
-    one.stage: one
-    for one in (
-        OrientResult, PairsResult, EnhanceResult, ViewsResult, ExtractResult, MatchResult, FilterResult, RefineResult,
-        AdjustResult, ConsistencyResult, ExportResult, ReportResult,
-    )
-}  # fmt: skip
-"""Stage -> type of its result, in the order in which `run` takes them."""

@@ -71,7 +71,7 @@ def run(context: Context) -> StageReport:
     try:
         with context.executor.step("adjust"):
             fixed = isinstance(recipe, FirstPass) and not recipe.replaces
-            adjusted, found = refine_block(contents_of(context), context.observed, groups, fixed=fixed)
+            adjusted, found = refine_block(contents_of(context, raw=False), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
         report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment

@@ -8,32 +8,12 @@ from typing import Any
 
 import yaml
 
+from aeromatch_cli import graph
 from aeromatch_cli.config import Settings, differing, dump, load
 from aeromatch_cli.errors import ConfigError
 
 # Most settings that are named.
 _NAMED = 4
-# Section of the settings, or setting -> the first stage that reads it; others, as `run`, change no result.
-_FIRST_STAGE = {
-    "block.gcp": "adjust",
-    "block.gcp_marks": "adjust",
-    "block.gcp_use": "adjust",
-    "block": "orient",
-    "orient": "orient",
-    "pairs": "pairs",
-    "enhance": "extract",
-    "simulate": "extract",
-    "extract": "extract",
-    "match": "match",
-    "cascade": "match",
-    "seed": "filter",
-    "filter": "filter",
-    "refine": "refine",
-    "adjust": "adjust",
-    "consistency": "consistency",
-    "export": "export",
-}
-_ORDER = tuple(dict.fromkeys(_FIRST_STAGE.values()))
 
 
 def changed_words(config: Path, settings: Settings) -> str:
@@ -46,19 +26,14 @@ def changed_words(config: Path, settings: Settings) -> str:
     changed = [
         (key, old, new)
         for key, new, old in differing(yaml.safe_load(dump(settings)), before)
-        if _stage(key) and _resolved(old) != _resolved(new)
+        if graph.first_reader(key) and _resolved(old) != _resolved(new)
     ]
     if not changed:
         return ""
     named = ", ".join(f"{key} {said_value(old)} -> {said_value(new)}" for key, old, new in changed[:_NAMED])
     more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
-    first = min((_stage(key) for key, *_ in changed), key=_ORDER.index)
+    first = min((graph.first_reader(key) for key, *_ in changed), key=graph.ORDER.index)
     return f"{named}{more}: what depends on it is made again, from {first} on"
-
-
-def _stage(key: str) -> str:
-    """The first that reads a setting; "" where it changes no result."""
-    return _FIRST_STAGE.get(key) or _FIRST_STAGE.get(key.partition(".")[0], "")
 
 
 def _resolved(value: Any) -> Any:

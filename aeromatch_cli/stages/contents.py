@@ -47,11 +47,14 @@ def contents_of(
     context: Context,
     adjusted: AdjustedBlock | None = None,
     verified: _Verified = verified_pairs,
+    *,
+    raw: bool = True,
 ) -> ExportContents:
     """What exporters and mappers get. Read lazily: one row and one image's keypoints at a time.
 
     adjusted: keypoints are those that its poses see, without what a rolling shutter has moved. verified: where the
-    verified matches come from.
+    verified matches come from. raw: whether the matches before verification are wanted; else the verified ones stand
+    for them.
     """
 
     def keypoints_px(image_id: str) -> FloatArray:
@@ -59,7 +62,7 @@ def contents_of(
         return read_final_keypoints(context.workspace.features(image_id), context.workspace.refined(image_id))
 
     if not context.settings.match.reads_pixels:
-        return _contents(context, keypoints_px, _pairs(context, verified), adjusted)
+        return _contents(context, keypoints_px, _pairs(context, verified, raw=raw), adjusted)
     matched = list(_matched(context, verified))
     tracks = tracks_of(matched, keypoints_px, lambda image_id: context.block.camera(context.image_by_id[image_id]))
 
@@ -108,8 +111,9 @@ def _joined(matched: Iterable[MatchedPair], tracks: Tracks) -> Iterator[PairCont
         yield PairContents(item.pair, tracks.raw[key], tracks.verified[key], verdict.model_kind, verdict.model)
 
 
-def _pairs(context: Context, verified: _Verified) -> Iterator[PairContents]:
-    for item in _matched(context, verified):
+def _pairs(context: Context, verified: _Verified, *, raw: bool) -> Iterator[PairContents]:
+    pairs = _matched(context, verified) if raw else (MatchedPair(pair, e.matches, e) for pair, e in verified(context))
+    for item in pairs:
         verdict, kept = item.verified.verdict, item.verified.matches.indices
         # A filter may keep matches of a pair that it cannot verify.
         kept = kept if verdict.state == "verified" else kept[:0]

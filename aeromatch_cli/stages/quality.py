@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from aeromatch_cli import graph
 from aeromatch_cli.orientation.quality import Evidence, Quality, judged
-from aeromatch_cli.results.stages import RESULTS, BlockResults, ConsistencyResult
+from aeromatch_cli.results.stages import BlockResults, ConsistencyResult
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace
 
@@ -45,7 +46,7 @@ def _contradicted(consistency: ConsistencyResult) -> float | None:
 def results_of(workspace: Workspace, reports: Sequence[StageReport] = ()) -> BlockResults:
     """Those of a command's own reports, and of other stages those on file."""
     own = {report.stage: report.result for report in reports if not report.part}
-    kinds = {stage: RESULTS[stage] for stage in BlockResults.model_fields}
+    kinds = {stage: graph.BY_NAME[stage].result for stage in BlockResults.model_fields}
     return BlockResults(
         **{stage: own[stage] if stage in own else result_on_file(workspace, kind) for stage, kind in kinds.items()}
     )

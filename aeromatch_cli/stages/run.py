@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from aeromatch_cli import report
+from aeromatch_cli import graph, report
 from aeromatch_cli.config import Settings
 from aeromatch_cli.errors import BrokenFileError, ConfigError, InputError, WorkspaceError
 from aeromatch_cli.executor import Executor, Progress
@@ -52,23 +52,17 @@ from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
 
-STAGES: Mapping[str, Callable[[Context], StageReport]] = {
-    "enhance": enhance.run,
-    "simulate": simulate.run,
-    "extract": extract.run,
-    "filter": filter.run,
+FUNCTIONS: dict[str, Callable[[Context], StageReport]] = {
+    "enhance": enhance.run, "simulate": simulate.run, "extract": extract.run, "match": match.run, "filter": filter.run,
+    "refine": refine.run, "adjust": adjust.run, "consistency": consistency.run, "export": export.run,
     "report": report.run,
-}
-# Stages whose items are independent: these can be cut into shards, the others need everything.
-SHARDED = ("enhance", "simulate", "extract", "match", "filter")
+}  # fmt: skip
+"""What brings each stage up to date but orient and pairs, with which every command begins."""
+
 # Of a cascade these work on what its steps have found together.
 _AFTER_CASCADE = ("match", "filter", "adjust", "export", "report")
 # Commands that export, and the one that says what they would do.
 _EXPORTING = ("run", "export", "check")
-# These look at what other commands have made.
-_NEEDS_RESULTS = ("filter", "adjust", "export")
-# What a command rests on: everything before it in this chain.
-_CHAIN = ("orient", "pairs", "extract", "match", "filter", "refine", "adjust", "consistency", "export", "report")
 
 
 @dataclass(frozen=True)
@@ -99,10 +93,10 @@ def execute(
     say: gets the summary of the block before the long stages; without it the summary stands in the result's lines.
     """
     part = Shard.parse(shard) if shard else None
-    if part and command not in (*SHARDED, "run", "orient", "pairs"):
+    if part and not graph.sharded(command):
         raise ConfigError(f"--shard does not work with {command}: run it without, after all shards are done")
     root = Path(settings.workspace)
-    if settings.block.images and command in _NEEDS_RESULTS and not root.exists():
+    if settings.block.images and command in graph.NEED_RESULTS and not root.exists():
         raise InputError(f"the workspace {root} does not exist: run `aeromatch run`, which makes it, or name another")
     with ExitStack() as stack:
         stack.enter_context(_nothing_left_of_a_failed_start(Workspace(root), shared=part is not None))
@@ -206,29 +200,12 @@ def _repairing(
 
 # Commands that end with a verdict on the block.
 _JUDGED = ("run", "adjust")
-# What each command makes again of what it finds damaged, besides the tables of the block and the orientation.
-_MAKES = {
-    "extract": ("extract",), "match": ("extract", "match"), "filter": ("filter",),
-    "adjust": ("refine", "adjust", "consistency"), "export": ("refine", "adjust", "consistency", "export"),
-    "report": ("report",),
-}  # fmt: skip
-_MADE_BY = {
-    "features": "extract", "matches": "match", "verified": "filter", "export": "export", "report": "report",
-    "steps": "match", "refined": "refine",
-}  # fmt: skip
 
 
 def _makes(command: str, workspace: Workspace, path: Path) -> bool:
     """Whether a command makes a file of the workspace."""
-    if command == "run":
-        return True
-    folder, *rest = path.absolute().relative_to(workspace.root.absolute()).parts
-    stage = _MADE_BY.get(folder, "")
-    if folder == "reports":
-        stage = path.name.partition(".")[0]
-    elif path.name in (workspace.adjusted.name, workspace.dropped.name, workspace.final.name) and rest:
-        stage = "adjust"
-    return stage in ("", "orient", "pairs", "enhance", "simulate", *_MAKES.get(command, ()))
+    below = path.absolute().relative_to(workspace.root.absolute())
+    return graph.makes(command, PurePosixPath(below.as_posix()))
 
 
 def _attempt(
@@ -253,12 +230,12 @@ def _attempt(
         context, made = _cascaded(context) if command == "match" else (_joined(context), [])
         reports += made
         if command != "match":
-            reports += _one_stage(command, context)
+            reports += _stages_of(command, context)
     elif command == "match":
         features = extract.run(replace(context, overwrite=False), match.images_of_rows(context))
         reports += [features, match.run(context)]
     elif command not in ("orient", "pairs"):
-        reports += _one_stage(command, context)
+        reports += _stages_of(command, context)
     if command == "filter" and not reports[-1].items and reports[-1].failures:
         raise InputError(
             "no pair has matches made with the present settings and inputs: run `aeromatch match` first "
@@ -277,13 +254,11 @@ def _there(settings: Settings) -> bool:
     return bool(images) and (is_remote(images) or Path(images).is_dir())
 
 
-def _one_stage(command: str, context: Context) -> list[StageReport]:
-    if command == "adjust":
-        return [refine.run(context), adjust.run(context), consistency.run(context)]
-    if command == "export":
-        kept = replace(context, overwrite=False)
-        return [refine.run(kept), adjust.run(kept), consistency.run(kept), export.run(context)]
-    return [STAGES[command](context)]
+def _stages_of(command: str, context: Context) -> list[StageReport]:
+    """What a command brings up to date; made anew, where that is asked for, is only its own stage, and of `adjust` what
+    belongs to it."""
+    kept = replace(context, overwrite=False) if command == "export" else context
+    return [FUNCTIONS[name](context if name == command else kept) for name in graph.COMMANDS[command]]
 
 
 def _cascaded(context: Context) -> tuple[Context, list[StageReport]]:
@@ -311,7 +286,7 @@ def _run_all(context: Context) -> list[StageReport]:
                 f"no pair could be verified: the table of pairs in {context.workspace.report} says why"
                 + _without_keypoints(context)
             )
-        reports += [refine.run(context), adjust.run(context), consistency.run(context), export.run(context)]
+        reports += [FUNCTIONS[name](context) for name in ("refine", "adjust", "consistency", "export")]
         if context.settings.run.report:
             reports.append(_page(context))
     return reports
@@ -443,7 +418,7 @@ def _stage_facts(reports: Sequence[StageReport]) -> dict[str, Any]:
 def _all_failures(command: str, context: Context, reports: list[StageReport]) -> tuple[tuple[str, str, str], ...]:
     """What failed now, and what failed in the stages before this command and still stands."""
     failures = {(r.stage, item, reason) for r in reports for item, reason in r.failures}
-    before = _CHAIN if command == "run" else _CHAIN[: _CHAIN.index(command)] if command in _CHAIN else ()
+    before = graph.RUN if command == "run" else graph.RUN[: graph.RUN.index(command)] if command in graph.RUN else ()
     for stage, item, reason in gather_failures(context.workspace):
         if stage in before and context.owns(owner(item)):
             failures.add((stage, item, reason))

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from aeromatch_cli import graph
 from aeromatch_cli.data import Pair
 from aeromatch_cli.executor import Outcome
 from aeromatch_cli.files import read_json, write_json, write_text
 from aeromatch_cli.formats.tables import csv_text
-from aeromatch_cli.results.stages import RESULTS, StageResult
+from aeromatch_cli.results.stages import StageResult
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.naming import item_named, names_on_file
 from aeromatch_cli.stages.shard import Shard
@@ -25,9 +26,6 @@ V = TypeVar("V")
 R = TypeVar("R", bound=StageResult)
 
 log = logging.getLogger("aeromatch")
-
-# Stages whose items are images or pairs; the others name files or exporters.
-ITEM_STAGES = ("enhance", "simulate", "extract", "match", "filter")
 
 
 @dataclass
@@ -81,7 +79,7 @@ class StageReport:
         if self.done or not path.is_file():
             return False
         old = read_json(path)
-        before = RESULTS[self.stage].of_json(old.get("result"))
+        before = graph.BY_NAME[self.stage].result.of_json(old.get("result"))
         # Without a result of its own the stage only counts what it makes: the one on file still holds.
         self.result = self.result or before
         failures = [list(failure) for failure in self.failures]
@@ -144,7 +142,7 @@ def forget_absent(context: Context) -> None:
     pairs = {f"{pair.image_id0} {pair.image_id1}" for pair in context.pairs}
     for path in sorted(context.workspace.reports.glob("*.json")):
         report = read_json(path)
-        if report.get("stage") not in ITEM_STAGES:
+        if report.get("stage") not in graph.per_item():
             continue
         kept = [row for row in report["failures"] if row[0] in images or row[0] in pairs]
         if len(kept) < len(report["failures"]):
@@ -158,7 +156,8 @@ def unexplained(context: Context, pairs: Iterable[Pair], command: str) -> list[t
 
     Pairs that have failed there or before, themselves or by one of their images, are explained already.
     """
-    before = ITEM_STAGES[: ITEM_STAGES.index(command) + 1]
+    items = graph.per_item()
+    before = items[: items.index(command) + 1]
     failed = {item for stage, item, _ in gather_failures(context.workspace) if stage in before}
     rows: dict[str, int] = {}
     for pair in pairs:

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from aeromatch_cli import graph
 from aeromatch_cli.blocks.left_out import list_files
 from aeromatch_cli.config import PATH_KEYS, Settings, dump
 from aeromatch_cli.errors import BrokenFileError, ConfigError
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.results.stages import RESULTS
 from aeromatch_cli.stages.pairs import chosen_strategies
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.stages.versions import library_version
@@ -68,7 +68,7 @@ def unchanged_reports(workspace: Workspace, inputs: Mapping[str, str]) -> list[S
 
 def _report(workspace: Workspace, stage: str, *, items: int, result: Any) -> StageReport:
     """Of a stage that has made nothing. result: None for the one on file."""
-    kind = RESULTS[stage]
+    kind = graph.BY_NAME[stage].result
     found = result_on_file(workspace, kind) if result is None else kind(**result)
     return StageReport(stage, items=items, skipped=items, result=found)
 
@@ -80,7 +80,7 @@ def remember(workspace: Workspace, inputs: Mapping[str, str], reports: Sequence[
         return
     told = {}
     for one in reports:
-        known = one.result is None or one.result == result_on_file(workspace, RESULTS[one.stage])
+        known = one.result is None or one.result == result_on_file(workspace, graph.BY_NAME[one.stage].result)
         told[one.stage] = {"items": one.items, "result": None if known or one.result is None else one.result.as_json()}
     write_json(workspace.finished, {**inputs, "files": _state_of_files(workspace), "stages": told})
 
