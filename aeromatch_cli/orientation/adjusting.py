@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
+from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.orientation.bundle.adjust import Adjusted, Options, adjust
 from aeromatch_cli.orientation.bundle.network import LENS, READOUT, SLOPES, Network, Unknowns, drift_of
 from aeromatch_cli.orientation.bundle.of_model import (
@@ -30,7 +31,6 @@ from aeromatch_cli.orientation.bundle.of_model import (
 from aeromatch_cli.orientation.bundle.projection import project
 from aeromatch_cli.orientation.bundle.shared import lenses_if_freed
 from aeromatch_cli.orientation.bundle.solve import solve
-from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.placing import Placement, delay_s, height_steps_m, place
 from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of, rotations_of
 

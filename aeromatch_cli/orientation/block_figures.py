@@ -9,6 +9,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, FloatArray, Image, IntArray
 from aeromatch_cli.geometry.cameras import corner_params, focal_px
+from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.results.adjustment import GroupResult
 from aeromatch_cli.results.stages import AdjustedCamera
 
@@ -55,7 +56,6 @@ def tied_parts(adjusted: AdjustedBlock) -> list[int]:
     """Sizes of the parts of the block within which images are connected by pairs that share 20 points, the largest
     first."""
     from scipy import sparse
-    from scipy.sparse import csgraph
 
     tracks = [np.unique(track[:, 1]) for track in adjusted.tracks.values()]
     if not tracks:
@@ -64,7 +64,7 @@ def tied_parts(adjusted: AdjustedBlock) -> list[int]:
     seen = sparse.csr_matrix(
         (np.ones(ends[-1]), np.concatenate(tracks), ends), shape=(len(tracks), len(adjusted.points_m))
     )
-    _, part = csgraph.connected_components(seen @ seen.T >= _FEW_POINTS, directed=False)
+    part = component_labels(len(tracks), np.column_stack((seen @ seen.T >= _FEW_POINTS).nonzero()))
     return sorted(np.bincount(part).tolist(), reverse=True)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from aeromatch_cli.data import BoolArray, FloatArray
+from aeromatch_cli.geometry.components import labels_by_name
 
 # Matches left to a pair without which images fall apart: enough for a relative orientation, few among all others.
 _BRIDGING = 30
@@ -22,25 +23,11 @@ def probable_enough(
     ids. likely: probabilities (M,). min_matches: a pair with fewer ties nothing.
     """
     keep = [None if p is None else p >= least for p in likely]
-    part = _parts(
-        [both for both, mask in zip(ends, keep, strict=True) if mask is None or mask.sum() >= min_matches], ends
-    )
+    tied = [both for both, mask in zip(ends, keep, strict=True) if mask is None or mask.sum() >= min_matches]
+    part = labels_by_name(sorted({image_id for both in ends for image_id in both}), tied)
     for n, (both, p) in enumerate(zip(ends, likely, strict=True)):
         if p is not None and len(p) >= min_matches and part[both[0]] != part[both[1]]:
             best = np.zeros(len(p), dtype=bool)
             best[np.argsort(-p, kind="stable")[: max(_BRIDGING, min_matches)]] = True
             keep[n] = best | (p >= least)
     return keep
-
-
-def _parts(tied: Sequence[tuple[str, str]], ends: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """image id -> number of its part: images that tied pairs connect. Images of all pairs have one."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
-    ids = sorted({image_id for both in ends for image_id in both})
-    row = {image_id: n for n, image_id in enumerate(ids)}
-    first, second = ([row[both[side]] for both in tied] for side in range(2))
-    graph = sparse.coo_matrix((np.ones(len(tied)), (first, second)), shape=(len(ids), len(ids)))
-    _, labels = connected_components(graph, directed=False)
-    return dict(zip(ids, labels.tolist(), strict=True))

@@ -15,6 +15,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
 from aeromatch_cli.geometry.cameras import focal_px, world_rays
+from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.epipolar import ray_depths
 from aeromatch_cli.orientation.bridges import probable_enough
 from aeromatch_cli.orientation.probability import MatchEvidence, off_neighbours_px, probabilities, usual_off_px
@@ -204,16 +205,11 @@ def _worst_held(pairs: Sequence[MatchedKeypoints], masks: Sequence[BoolArray | N
 
 def _groups(block: AdjustedBlock) -> dict[str, int]:
     """image_id -> number of its group: images that points connect."""
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
     ids = sorted(block.poses)
     tracks = [block.tracks.get(i, np.zeros((0, 2), np.int32))[:, 1] for i in ids]
     rows = np.repeat(np.arange(len(ids)), [len(one) for one in tracks])
     points = np.concatenate([np.zeros(0, np.int64), *tracks])
-    size = len(ids) + len(block.points_m)
-    graph = sparse.coo_matrix((np.ones(len(rows)), (rows, len(ids) + points)), shape=(size, size))
-    _, labels = connected_components(graph, directed=False)
+    labels = component_labels(len(ids) + len(block.points_m), np.column_stack([rows, len(ids) + points]))
     return dict(zip(ids, labels[: len(ids)].tolist(), strict=True))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, Ground, IntArray, Pose
 from aeromatch_cli.geometry.cameras import undistort, world_rays
+from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, sampson_distance_px, triangulate
 from aeromatch_cli.geometry.footprints import view_angles_deg
 from aeromatch_cli.geometry.rotations import angle_between_deg
@@ -97,19 +98,6 @@ def grouped_images(good: Mapping[tuple[str, str], bool], matches: Mapping[tuple[
         if sum(matches[ids] for ids in across) <= _BY_CHANCE * within:
             taken |= group
     return taken
-
-
-def connected_groups(edges: Sequence[tuple[N, N]]) -> list[set[N]]:
-    """Connected groups of nodes, the largest first; among equal ones the first in order."""
-    group: dict[N, set[N]] = {}
-    for one, other in edges:
-        first, second = group.setdefault(one, {one}), group.setdefault(other, {other})
-        if first is not second:
-            larger, smaller = (first, second) if len(first) >= len(second) else (second, first)
-            larger |= smaller
-            group.update(dict.fromkeys(smaller, larger))
-    unique = {id(members): members for members in group.values()}
-    return sorted(unique.values(), key=lambda members: (-len(members), min(members)))
 
 
 def triangulated(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, IntArray
+from aeromatch_cli.geometry.components import component_labels
 
 # Ids of both images of a pair, its verified matches (M, 2) as numbers of their keypoints, and which are kept (M,).
 JudgedPair = tuple[str, str, IntArray, BoolArray]
@@ -19,9 +20,6 @@ def without_dropped(adjusted: AdjustedBlock, pairs: Iterable[JudgedPair]) -> Adj
     A point that lost a match keeps the largest part of its observations that kept matches still tie to each other, and
     goes where none ties two. Points that lost no match stay as they are. pairs: all with verified matches.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     ids = sorted(adjusted.tracks)
     first = dict(zip(ids, np.cumsum([0, *(len(adjusted.tracks[i]) for i in ids)]).tolist(), strict=False))
     point_of = np.concatenate([np.zeros(0, np.int64), *(adjusted.tracks[i][:, 1] for i in ids)]).astype(np.int64)
@@ -39,10 +37,7 @@ def without_dropped(adjusted: AdjustedBlock, pairs: Iterable[JudgedPair]) -> Adj
         ties.append(nodes[inside & kept].astype(np.int32))
     if not lost.any():
         return adjusted
-    joined = np.concatenate(ties)
-    count = len(point_of)
-    graph = coo_matrix((np.ones(len(joined), bool), (joined[:, 0], joined[:, 1])), (count, count))
-    _, part = connected_components(graph, directed=False)
+    part = component_labels(len(point_of), np.concatenate(ties))
     return _with(adjusted, ids, ~lost[point_of] | _in_largest(part, point_of, len(lost)))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from aeromatch_cli.data import Block, Camera, FloatArray, Pose
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import focal_px
+from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.orientation.arrangement import SAME_SHARE, Before, arranged
 from aeromatch_cli.orientation.consistency import consistent_images
 from aeromatch_cli.orientation.conventions import Recognised, recognised
@@ -17,7 +18,6 @@ from aeromatch_cli.orientation.dem import Terrain, ground_points, terrains_of
 from aeromatch_cli.orientation.judgement import (
     PairPoints,
     attitude_errors_deg,
-    connected_groups,
     explained_images,
     explained_share,
     position_errors_m,

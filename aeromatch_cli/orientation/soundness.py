@@ -15,11 +15,11 @@ from itertools import combinations
 import numpy as np
 
 from aeromatch_cli.data import Camera, Pose
+from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.orientation.judgement import (
     EXPLAINED_SHARE,
     MIN_MATCHES,
     PairPoints,
-    connected_groups,
     explained_share,
 )
 from aeromatch_cli.orientation.mapping import Model

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aeromatch_cli.data import FloatArray, IntArray
+from aeromatch_cli.geometry.components import component_labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +25,6 @@ def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
     The keypoint of a point with most matches is its first one; each other is measured by the nearest to that, by the
     match with the best score. The result does not depend on the order of the matches.
     """
-    from scipy import sparse
-    from scipy.sparse.csgraph import connected_components
-
     parent, depth = np.full(keypoints, -1, np.int32), np.full(keypoints, -1, np.int32)
     if not len(ends):
         return Trees(parent, depth)
@@ -34,9 +32,7 @@ def trees_of(keypoints: int, ends: IntArray, scores: FloatArray) -> Trees:
     order = np.lexsort((both[:, 0], -np.concatenate([scores, scores]), both[:, 1]))
     towards, nearer = both[order, 1], both[order, 0]
     degree = np.bincount(ends.ravel(), minlength=keypoints)
-    there = np.ones(len(ends), np.int8)
-    graph = sparse.coo_matrix((there, (ends[:, 0], ends[:, 1])), shape=(keypoints, keypoints))
-    _, point = connected_components(graph, directed=False)
+    point = component_labels(keypoints, ends)
     matched = np.flatnonzero(degree)
     matched = matched[np.lexsort((matched, -degree[matched], point[matched]))]
     first = matched[np.unique(point[matched], return_index=True)[1]]

@@ -24,6 +24,7 @@ from aeromatch_cli.formats.rows import (
     row_fingerprints,
     write_verified_row,
 )
+from aeromatch_cli.geometry.components import labels_by_name
 from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import extract, match, rows
 from aeromatch_cli.stages.context import Context
@@ -251,23 +252,7 @@ def connection(context: Context, judged: Iterable[tuple[str, str, str, int]] | N
     return FilterResult(
         pairs=dict(sorted(states.items())),
         verified_matches=matches,
-        components=sorted(Counter(components(ids, links).values()).values(), reverse=True),
+        components=sorted(Counter(labels_by_name(ids, links).values()).values(), reverse=True),
         weakly_tied=sorted(image_id for image_id in ids if ties[image_id] < WEAK_MATCHES),
         unconnected=sorted(image_id for image_id in ids if not ties[image_id]),
     )
-
-
-def components(ids: Iterable[str], links: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Image -> the image that stands for all those that links connect with it."""
-    parent = {image_id: image_id for image_id in ids}
-
-    def root(image_id: str) -> str:
-        while parent[image_id] != image_id:
-            parent[image_id] = parent[parent[image_id]]
-            image_id = parent[image_id]
-        return image_id
-
-    for id0, id1 in links:
-        first, second = sorted((root(id0), root(id1)))
-        parent[second] = first
-    return {image_id: root(image_id) for image_id in parent}

@@ -11,6 +11,7 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Camera, FloatArray, Image, IntArray
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.geometry.components import component_labels
 from aeromatch_cli.geometry.lenses import Nearest
 from aeromatch_cli.strategies.exporters.contents import Colours, ExportContents, ExportSummary
 
@@ -109,9 +110,6 @@ def _joined(
     pairs: Sequence[tuple[str, str, IntArray]], place: Mapping[str, int]
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Image, keypoint and track of every observation, by connected components of the matches."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     if not pairs:
         return (np.zeros(0, np.int64),) * 3
     ends = [
@@ -121,9 +119,7 @@ def _joined(
         for side in range(2)
     ]
     nodes, inverse = np.unique(np.concatenate(ends), axis=0, return_inverse=True)
-    first, second = np.split(inverse.ravel(), 2)
-    edges = coo_array((np.ones(len(first), np.int8), (first, second)), shape=(len(nodes),) * 2)
-    _, label = connected_components(edges, directed=False)
+    label = component_labels(len(nodes), inverse.reshape(2, -1).T)
     # A track that sees one image twice is none.
     seen, times = np.unique(np.column_stack([label, nodes[:, 0]]), axis=0, return_counts=True)
     bad = np.unique(seen[times > 1, 0])

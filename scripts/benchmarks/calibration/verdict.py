@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera
+from aeromatch_cli.geometry.components import connected_groups
 from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.orientation.contradictions import Contradictions, Limits, MatchedKeypoints, contradicting
 from aeromatch_cli.orientation.control import control_figures
-from aeromatch_cli.orientation.judgement import connected_groups
 from aeromatch_cli.orientation.mapping import Observed
 from aeromatch_cli.orientation.quality import Evidence
 from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
