@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.images.files import beyond_bytes
 from aeromatch_cli.images.png import SIGNATURE
+from aeromatch_cli.recent import read_once
 from aeromatch_cli.strategies import Strategy
 
 _PROBE_BYTES = 1 << 20
@@ -57,15 +57,13 @@ def file_digest(path: Path) -> str:
     Of an SQLite database, what programs change that only read it is left out. Raises ConfigError.
     """
     try:
-        status = path.stat()
-        return _file_digest(path, status.st_size, status.st_mtime_ns)
+        return _file_digest(path)
     except OSError as error:
         raise ConfigError(f"cannot read {path}, which the configuration names: {error.strerror}") from None
 
 
-@lru_cache(maxsize=64)
-def _file_digest(path: Path, size: int, stamp: int) -> str:
-    del size, stamp  # only tell changed files apart
+@read_once(64)
+def _file_digest(path: Path) -> str:
     with path.open("rb") as stream:
         head = bytearray(stream.read(100))
         if head.startswith(_SQLITE) and head[_SQLITE_MODE] in (b"\1\1", b"\2\2"):
@@ -95,15 +93,9 @@ def picture_fingerprint(path: Path) -> str:
     return fingerprint(found, _DEEP_PICTURES) if beyond_bytes(path) else found
 
 
+@read_once(4096)
 def mask_fingerprint(path: Path) -> str:
     """The same of a mask, read again only when it has changed: one file may be the mask of all images."""
-    status = path.stat()
-    return _mask_fingerprint(path, status.st_size, status.st_mtime_ns)
-
-
-@lru_cache(maxsize=4096)
-def _mask_fingerprint(path: Path, size: int, stamp: int) -> str:
-    del size, stamp  # only tell changed files apart
     with path.open("rb") as stream:
         head = stream.read(_PNG_KIND.stop)
     gray8 = head.startswith(SIGNATURE) and head[_PNG_KIND] in _PNG_GRAY

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,6 +17,7 @@ from aeromatch_cli.data import (
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.archives import load_arrays, load_checked, save_arrays
 from aeromatch_cli.formats.reading import say_damaged
+from aeromatch_cli.recent import read_once
 
 _FEATURE_ARRAYS = tuple(field.name for field in fields(Features) if field.name != "colours")
 
@@ -81,10 +81,7 @@ def _checked(path: Path, *names: str) -> dict[str, NDArray[Any]] | None:
 
 def known_fingerprint(path: Path) -> str | None:
     """The same, read once as long as the file is not written again."""
-    return _cached_fingerprint(path, path.stat().st_mtime_ns) if path.is_file() else None
+    return _fingerprint_read_once(path) if path.is_file() else None
 
 
-@lru_cache(maxsize=1 << 16)
-def _cached_fingerprint(path: Path, stamp: int) -> str | None:
-    del stamp  # only tells rewritten files apart
-    return features_fingerprint(path)
+_fingerprint_read_once = read_once(1 << 16)(features_fingerprint)

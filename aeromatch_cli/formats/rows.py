@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,6 +19,7 @@ from aeromatch_cli.data import (
 from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.archives import ARCHIVE_FAULTS, load_all, load_checked, save_arrays
 from aeromatch_cli.formats.reading import readable, say_damaged
+from aeromatch_cli.recent import read_once
 
 # Features of rows that earlier versions wrote.
 UNKNOWN = ("", "")
@@ -122,15 +122,11 @@ def row_fingerprints(path: Path) -> Mapping[str, str]:
     """image_id1 -> fingerprint of a matches or verified row; empty when absent or any array is broken. Read once
     as long as the file is not written again.
     """
-    try:
-        return _cached_fingerprints(path, path.stat().st_mtime_ns)
-    except FileNotFoundError:
-        return {}
+    return _fingerprints(path) if path.is_file() else {}
 
 
-@lru_cache(maxsize=1 << 16)
-def _cached_fingerprints(path: Path, stamp: int) -> Mapping[str, str]:
-    del stamp  # only tells rewritten files apart
+@read_once(1 << 16)
+def _fingerprints(path: Path) -> Mapping[str, str]:
     try:
         arrays = load_checked(path, ("image_id1", "fingerprint"))
         with readable(path, *ARCHIVE_FAULTS):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from aeromatch_cli.formats.rows import (
     write_verified_row,
 )
 from aeromatch_cli.geometry.components import labels_by_name
+from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import FilterResult
 from aeromatch_cli.stages import extract, match, rows
 from aeromatch_cli.stages.context import Context
@@ -160,15 +161,10 @@ def select(matches: Matches, keep: Any) -> Matches:
     )
 
 
-@lru_cache(maxsize=256)
-def _cached_keypoints(path: Path, stamp: int) -> Side:
-    del stamp  # only tells rewritten files apart
+@read_once(256)
+def _keypoints(path: Path) -> Side:
     keypoints_px, _, colours = read_keypoints(path)
     return keypoints_px, colours
-
-
-def _keypoints(path: Path) -> Side:
-    return _cached_keypoints(path, path.stat().st_mtime_ns)
 
 
 def run(context: Context) -> StageReport:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 
 from aeromatch_cli.data import Features, Matches, Pair, PairGeometry
@@ -15,6 +14,7 @@ from aeromatch_cli.formats.features import read_features
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row, row_fingerprints, write_match_row
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.images.stored import StoredRaster
+from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import MatchResult
 from aeromatch_cli.stages import extract, rows
 from aeromatch_cli.stages.batches import matched_in_batches
@@ -104,7 +104,7 @@ def run_task(task: MatchTask) -> RowResult:
     """Match what is not up to date in one row."""
     path = task.workspace.matches(task.image_id0)
     old = rows.readable(read_match_row, path, task.overwrite)
-    features0 = _features(task.workspace.features(task.image_id0), _stamp(task.workspace.features(task.image_id0)))
+    features0 = _features(task.workspace.features(task.image_id0))
     ahead = matched_in_batches(task.matchers, rows.missing(task.pairs, old), lambda pair: _sides(task, pair, features0))
     first = task.workspace.features_of
     scanned = None if first is None else read_match_row(first.matches(task.image_id0))
@@ -140,7 +140,7 @@ def _match_pair(
 
 def _sides(task: MatchTask, pair: PairTask, features0: Features) -> tuple[Features, Features]:
     path1 = task.workspace.features(pair.image_id1)
-    return features0, _features(path1, _stamp(path1))
+    return features0, _features(path1)
 
 
 def compared(
@@ -155,14 +155,9 @@ def compared(
     return matcher(*features, geometry, (StoredRaster(sources[0]), StoredRaster(sources[1])))
 
 
-def _stamp(path: Path) -> int:
-    return path.stat().st_mtime_ns if path.exists() else 0
-
-
-@lru_cache(maxsize=64)
-def _features(path: Path, stamp: int) -> Features:
-    """Features of the last images that this worker saw; the stamp notices rewritten files."""
-    del stamp
+@read_once(64)
+def _features(path: Path) -> Features:
+    """Features of the last images that this worker saw."""
     return read_features(path)
 
 

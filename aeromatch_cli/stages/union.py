@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from aeromatch_cli.formats.rows import (
     write_match_row,
 )
 from aeromatch_cli.formats.tables import csv_text
+from aeromatch_cli.recent import read_once
 from aeromatch_cli.results.stages import ExtractResult, MatchResult
 from aeromatch_cli.stages import cascade, extract, match
 from aeromatch_cli.stages.cascade import StepContext
@@ -305,11 +305,6 @@ def _rows_in(rows: IntArray, wanted: IntArray) -> BoolArray:
     return np.isin(codes, known)
 
 
+@read_once(64)
 def _joined(path: Path) -> JoinedKeypoints:
-    return _cached(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=64)
-def _cached(path: Path, stamp: int) -> JoinedKeypoints:
-    del stamp  # only tells rewritten files apart
     return read_joined(path)
