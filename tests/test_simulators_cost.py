@@ -6,9 +6,9 @@ import numpy as np
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.images.views import render_view
+from aeromatch_cli.lab.strategies.tilts import Tilts
 from aeromatch_cli.stages.simulate import ViewCost, cost_facts
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.simulators.tilts import Tilts
 
 
 def test_cost_is_counted_over_views() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from aeromatch_cli.lab.strategies import add_arms
 from benchmarks.launcher import Table, launch
 
 TABLE: Table = {
@@ -53,4 +54,5 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
+    add_arms()  # which settings of benchmarks may name
     sys.exit(main(sys.argv[1:]))

@@ -15,7 +15,7 @@ from itertools import product
 
 from aeromatch_cli.config import load
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.lab.synthetic import PRESETS
 from benchmarks import options, stamps
 from benchmarks.processes import limit_threads
 from benchmarks.scenes import NOISY_POSES, render_asked

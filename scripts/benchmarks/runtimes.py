@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from aeromatch_cli.data import Camera, Features, View
+from aeromatch_cli.lab.synthetic.block import render_block
 from aeromatch_cli.nets.detector import PIECE_PX, REACH_PX, Detector, evened, load_detector
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.geodesc import load_geodesc
@@ -37,7 +38,6 @@ from aeromatch_cli.nets.patches import BATCH, SIDE_PX
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.matchers.lightglue.inference import NetworkOptions, loaded_network, network_input
-from aeromatch_cli.synthetic.block import render_block
 from benchmarks import options, stamps
 from benchmarks.processes import fresh_process, limit_threads, median_seconds
 from benchmarks.tables import Row, code, factor, markdown, number, percent, write_rows
