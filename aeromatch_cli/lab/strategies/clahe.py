@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from aeromatch_cli.data import BoolArray
+from aeromatch_cli.lab.strategies.rescaling import with_brightness
 from aeromatch_cli.strategies import Enhanced
-from aeromatch_cli.strategies.enhancers.brightness import brightness, with_brightness
+from aeromatch_cli.strategies.enhancers.brightness import brightness
 from aeromatch_cli.strategies.enhancers.kept_source import KeepsSource
 
 
