@@ -21,7 +21,7 @@ import numpy as np
 from chaos_faults import OF_FILES, OF_RUNS, PASSING, RUNS, Fault, Site, ended
 from conftest import contents
 
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.synthetic import render_block
 
 _IMAGES, _WIDTH, _HEIGHT = 4, 240, 180
 KINDS = {**OF_RUNS, **OF_FILES}

@@ -26,10 +26,12 @@ from hypothesis import settings
 from typer.testing import CliRunner
 
 from aeromatch_cli.cli import app
+from aeromatch_cli.config import FAMILIES, Settings
+from aeromatch_cli.lab.strategies import add_arms
+from aeromatch_cli.lab.synthetic import block, render_block, truth
+from aeromatch_cli.lab.synthetic.raycast import RayCaster
+from aeromatch_cli.lab.synthetic.scene import build_scene
 from aeromatch_cli.orientation import process
-from aeromatch_cli.synthetic import block, render_block, truth
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.scene import build_scene
 
 # Under load single examples take seconds; what is too slow shows in the durations.
 settings.register_profile("unhurried", deadline=None)
@@ -92,6 +94,16 @@ def scenes_built_once() -> Iterator[Callable[[], None]]:
             patched.setattr(module, "build_scene", build)
             patched.setattr(module, "RayCaster", cast)
         yield forget
+
+
+@pytest.fixture
+def arms() -> Iterator[None]:
+    """Settings can name the laboratory's strategies, for one test."""
+    own = {family: dict(table) for family, table in FAMILIES.items()}
+    add_arms()
+    yield
+    FAMILIES.update(own)
+    Settings.model_rebuild(force=True)
 
 
 @pytest.fixture(autouse=True, scope="session")

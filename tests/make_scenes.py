@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.synthetic.light import Light
-from aeromatch_cli.synthetic.paint import Painted, Samples, shades
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.render import View
-from aeromatch_cli.synthetic.scene import Scene, assemble
-from aeromatch_cli.synthetic.scenes import Plan
-from aeromatch_cli.synthetic.solids import Footprint, Material, Surface, box
-from aeromatch_cli.synthetic.stations import Exterior
-from aeromatch_cli.synthetic.terrain import Area, Flat, Terrain
-from aeromatch_cli.synthetic.truth import Truth
+from aeromatch_cli.lab.synthetic.light import Light
+from aeromatch_cli.lab.synthetic.paint import Painted, Samples, shades
+from aeromatch_cli.lab.synthetic.raycast import RayCaster
+from aeromatch_cli.lab.synthetic.render import View
+from aeromatch_cli.lab.synthetic.scene import Scene, assemble
+from aeromatch_cli.lab.synthetic.scenes import Plan
+from aeromatch_cli.lab.synthetic.solids import Footprint, Material, Surface, box
+from aeromatch_cli.lab.synthetic.stations import Exterior
+from aeromatch_cli.lab.synthetic.terrain import Area, Flat, Terrain
+from aeromatch_cli.lab.synthetic.truth import Truth
 
 PLAIN = (Material.PAINT, (0.4, 0.4, 0.4))
 NOON_WEST = Light(sun_azimuth_deg=270.0, sun_elevation_deg=45.0, haze_per_km=0.0)

@@ -25,10 +25,10 @@ from aeromatch_cli.formats.adjusted import orientation_text, read_adjusted, writ
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
+from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.orientation.mapping import Group, Observed, refine_block
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
-from aeromatch_cli.synthetic import load_truth
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
 

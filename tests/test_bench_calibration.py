@@ -19,8 +19,8 @@ from benchmarks.calibration.simulate import (
 
 from aeromatch_cli.files import read_json
 from aeromatch_cli.geometry.cameras import distort, focal_px, parameters, project, undistort
-from aeromatch_cli.synthetic.lenses import real_lens
-from aeromatch_cli.synthetic.receivers import gps_errors_m
+from aeromatch_cli.lab.synthetic.lenses import real_lens
+from aeromatch_cli.lab.synthetic.receivers import gps_errors_m
 
 
 @pytest.fixture(scope="module")

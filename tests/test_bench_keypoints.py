@@ -14,7 +14,8 @@ from benchmarks.peers import base
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate import RenderedTruth, open_truth
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.rendered import RenderedTruth
 
 pytestmark = pytest.mark.slow
 

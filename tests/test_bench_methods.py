@@ -16,7 +16,8 @@ from benchmarks.peers import matching, table
 from benchmarks.peers.base import Options, Scene
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate import Conditions, open_truth
+from aeromatch_cli.evaluate import Conditions
+from aeromatch_cli.lab.opening import open_truth
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,8 @@ from benchmarks.peers import base, ground, table
 from conftest import HEIGHT, WIDTH, Site
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate import Conditions, open_truth
+from aeromatch_cli.evaluate import Conditions
+from aeromatch_cli.lab.opening import open_truth
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ from benchmarks.views import ImageView
 
 from aeromatch_cli.data import Camera, View
 from aeromatch_cli.geometry.frames import apply_homography
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.synthetic import render_block
 
 pytestmark = pytest.mark.slow
 

@@ -19,6 +19,7 @@ from aeromatch_cli.errors import ConfigError
 GIVEN = {"DATA": "/data", "WEIGHTS": "/weights", "SEED": "7", "OUT": "/out"}
 
 
+@pytest.mark.usefixtures("arms")
 @pytest.mark.parametrize("run", [*fusion.RUNS, *oblique.RUNS], ids=lambda run: re.sub(r"--methods \S+", "", run)[:60])
 def test_every_run_is_a_command_with_methods_that_there_are(run: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found: list[argparse.Namespace] = []

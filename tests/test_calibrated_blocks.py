@@ -14,12 +14,12 @@ from benchmarks.calibration.simulate import HEIGHT_PX, WIDTH_PX, SimulatedBlock,
 from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS
 from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, project
+from aeromatch_cli.lab.synthetic.lenses import real_lens
 from aeromatch_cli.orientation.calibration import lens_of
 from aeromatch_cli.orientation.mapping import Group, refine_block
 from aeromatch_cli.orientation.residuals import residuals_of
 from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.strategies.exporters.contents import ExportContents
-from aeromatch_cli.synthetic.lenses import real_lens
 
 pytestmark = pytest.mark.slow
 

@@ -94,6 +94,7 @@ def test_stage_by_stage_gives_what_run_gives(done_site):
     assert done_site("run", "--workspace", work).done().keys() <= {"report"}
 
 
+@pytest.mark.usefixtures("arms")
 @pytest.mark.parametrize("command", ["pairs", "enhance", "simulate", "extract", "match"])
 def test_commands_that_make_what_they_need(site, command):
     outcome = site(command, "--set", "enhance=clahe")
@@ -354,8 +355,8 @@ def test_every_other_command_as_a_process(done_site: Site, tmp_path: Path):
 
 def test_help_of_synth_names_every_scene_and_flight() -> None:
     from aeromatch_cli.cli import commands
-    from aeromatch_cli.synthetic import PRESETS
-    from aeromatch_cli.synthetic.flight_plans import FLIGHTS
+    from aeromatch_cli.lab.synthetic import PRESETS
+    from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
 
     assert commands._SCENES.split(", ") == list(PRESETS)
     assert commands._FLIGHTS.split(", ") == list(FLIGHTS)

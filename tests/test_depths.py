@@ -18,7 +18,10 @@ from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images import gdal
 from aeromatch_cli.images.depth import _stretched, in_16_bits, to_gray8
 from aeromatch_cli.images.files import read_pixels, write_png
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.strategies.enhancers import ENHANCERS
+
+EVERY = {**ENHANCERS, **ARMS["enhance"]}
 
 
 def pattern(height: int = 30, width: int = 40) -> NDArray[np.uint8]:
@@ -107,7 +110,7 @@ def test_a_png_of_another_depth_is_refused(dtype: type) -> None:
         write_png(io.BytesIO(), np.ones((4, 4), dtype))
 
 
-@pytest.mark.parametrize("name", sorted(ENHANCERS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 @pytest.mark.parametrize(("dtype", "scale"), [("float32", 1 / 255), ("int16", 50), ("float64", 1e5)])
 def test_enhancers_take_every_depth_and_keep_the_picture(tmp_path: Path, name: str, dtype: str, scale: float) -> None:
     """Half the picture in shadow; afterwards there are still hundreds of levels, and the order of the bands holds."""
@@ -116,7 +119,7 @@ def test_enhancers_take_every_depth_and_keep_the_picture(tmp_path: Path, name: s
     lit[..., 64:] *= 0.25
     bands = np.concatenate([lit, 0.8 * lit, 0.6 * lit]) * scale
     pixels = read_pixels(write_bands(tmp_path / "a.tif", bands.astype(dtype)), colour=True)
-    found = ENHANCERS[name]()(pixels, None).pixels
+    found = EVERY[name]()(pixels, None).pixels
     assert found.dtype == np.uint16
     assert len(np.unique(found)) > 1000
     assert np.mean((found[..., 0] >= found[..., 1]) & (found[..., 1] >= found[..., 2])) == 1.0

@@ -16,7 +16,7 @@ from trainings.detector.shapes import shape
 from trainings.detector.validation import pairs_of, scores, table
 
 from aeromatch_cli.geometry.cameras import project
-from aeromatch_cli.synthetic import load_truth
+from aeromatch_cli.lab.synthetic import load_truth
 
 pytestmark = pytest.mark.slow
 

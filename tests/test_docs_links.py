@@ -17,9 +17,9 @@ from aeromatch_cli.cli.look_commands import LOOK
 from aeromatch_cli.cli.stage_commands import STAGES
 from aeromatch_cli.config import load, preset_names
 from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
+from aeromatch_cli.lab.synthetic.scenes.table import SCENES
 from aeromatch_cli.stages.shard import Shard
-from aeromatch_cli.synthetic.flight_plans import FLIGHTS
-from aeromatch_cli.synthetic.scenes.table import SCENES
 
 # What may stand for a preset or a file of the reader's own.
 PLACEHOLDERS = ("WORK", "CONFIG", "PRESET", "CONFIG|PRESET")

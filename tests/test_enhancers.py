@@ -6,12 +6,15 @@ import json
 import numpy as np
 import pytest
 
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.strategies import Enhanced
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 
+EVERY = {**ENHANCERS, **ARMS["enhance"]}
+
 
 def enhance(name: str, pixels: np.ndarray, valid: np.ndarray | None = None, **settings: object) -> Enhanced:
-    return ENHANCERS[name](**settings)(pixels, valid)
+    return EVERY[name](**settings)(pixels, valid)
 
 
 def textured(shape: tuple[int, ...], dtype: type, *, top: int) -> np.ndarray:
@@ -24,7 +27,7 @@ def textured(shape: tuple[int, ...], dtype: type, *, top: int) -> np.ndarray:
     return (values * top).astype(dtype)
 
 
-@pytest.mark.parametrize("name", sorted(ENHANCERS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 @pytest.mark.parametrize("shape", [(40, 60), (40, 60, 3), (1, 1), (2, 300), (33, 31, 3), (40, 60, 2)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_shape_dtype_and_input_stay(name, shape, dtype):
@@ -38,7 +41,7 @@ def test_shape_dtype_and_input_stay(name, shape, dtype):
     json.dumps(enhanced.info, allow_nan=False)
 
 
-@pytest.mark.parametrize("name", sorted(ENHANCERS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 @pytest.mark.parametrize("level", [0, 90, 255])
 def test_a_flat_picture_and_one_without_valid_pixels_pass(name, level):
     pixels = np.full((64, 80, 3), level, dtype=np.uint8)
@@ -87,7 +90,7 @@ def test_wallis_brings_halves_of_different_light_to_the_same_mean_and_spread():
 
 
 def test_wallis_is_the_same_wherever_its_strips_end(monkeypatch):
-    from aeromatch_cli.strategies.enhancers import wallis
+    from aeromatch_cli.lab.strategies import wallis
 
     pixels = textured((150, 90), np.uint8, top=255)
     whole = enhance("wallis", pixels).pixels

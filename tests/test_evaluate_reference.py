@@ -10,8 +10,9 @@ import pytest
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError
-from aeromatch_cli.evaluate import ReferenceTruth, open_truth
-from aeromatch_cli.synthetic.stations import Exterior
+from aeromatch_cli.evaluate import ReferenceTruth
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic.stations import Exterior
 
 CAMERA = Camera("SIMPLE_PINHOLE", 201, 201, (100.0, 100.0, 100.0))
 EXTERIORS = {"a.jpg": (0.0, 0.0, 110.0, 0.0, 0.0, 0.0), "b.jpg": (60.0, 0.0, 110.0, 0.0, 0.0, 0.0)}

@@ -11,12 +11,12 @@ import pytest
 from make_scenes import PLAIN, make_scene, make_truth, one_box
 
 from aeromatch_cli.data import Camera
-from aeromatch_cli.evaluate.rendered import RenderedTruth
-from aeromatch_cli.evaluate.surfaces import surfaces
-from aeromatch_cli.synthetic.scene import Scene
-from aeromatch_cli.synthetic.solids import Footprint, box
-from aeromatch_cli.synthetic.stations import Exterior
-from aeromatch_cli.synthetic.truth import Truth
+from aeromatch_cli.lab.rendered import RenderedTruth
+from aeromatch_cli.lab.surfaces import surfaces
+from aeromatch_cli.lab.synthetic.scene import Scene
+from aeromatch_cli.lab.synthetic.solids import Footprint, box
+from aeromatch_cli.lab.synthetic.stations import Exterior
+from aeromatch_cli.lab.synthetic.truth import Truth
 
 CAMERA = Camera("SIMPLE_PINHOLE", 201, 201, (100.0, 100.0, 100.0))
 # Seen from above the origin at 100 m: ground x maps to column 100 + x - camera's x, a roof at 20 m to 100 + that / 0.8.

@@ -23,6 +23,7 @@ from aeromatch_cli.evaluate.work import Evaluation
 from aeromatch_cli.files import read_json, write_record
 from aeromatch_cli.formats.features import features_fingerprint, read_features, write_features
 from aeromatch_cli.formats.rows import read_verified_row, write_verified_row
+from aeromatch_cli.lab.opening import open_truth
 
 pytestmark = pytest.mark.slow
 
@@ -35,9 +36,13 @@ def work(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
+def judged(work: Path, truth: Path, *, mapping: bool = True) -> Evaluation:
+    return evaluate_workspace(work, truth, open_truth, mapping=mapping)
+
+
 @pytest.fixture(scope="module")
 def evaluation(work: Path, rendered: Path) -> Evaluation:
-    return evaluate_workspace(work, rendered)
+    return judged(work, rendered)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -68,7 +73,7 @@ def test_shifted_keypoints_are_nearly_all_wrong(work: Path, rendered: Path, tmp_
     features, same = read_features(path), str(features_fingerprint(path))
     with path.open("wb") as stream:
         write_features(stream, replace(features, keypoints_px=features.keypoints_px + np.float32(12.0)), same)
-    found = evaluate_workspace(copy, rendered, mapping=False)
+    found = judged(copy, rendered, mapping=False)
     name = next(row["name"] for row in rows(copy / "images.csv") if row["image_id"] == path.stem)
     moved = [row for row in found.pairs if name in (row.name0, row.name1)]
     assert sum(row.score.kept for row in moved) > 50
@@ -88,7 +93,7 @@ def test_pairs_that_were_rejected_or_never_tried_count_as_found_nothing(
     entries[0] = replace(entries[0], verdict=replace(entries[0].verdict, state="rejected"))
     with path.open("wb") as stream:
         write_verified_row(stream, entries[:1])
-    found = evaluate_workspace(copy, rendered, mapping=False)
+    found = judged(copy, rendered, mapping=False)
     before = {(row.name0, row.name1): row for row in evaluation.pairs}
     after = {(row.name0, row.name1): row for row in found.pairs}
     changed = [key for key in before if key not in after or after[key].state != before[key].state]
@@ -133,7 +138,7 @@ def test_a_workspace_judged_by_poses_alone(work: Path, rendered: Path, tmp_path:
     """The exact poses of a rendered block, taken as reference poses of a real one."""
     for name in ("poses.csv", "block.json"):
         shutil.copy(rendered / name, tmp_path / name)
-    found = evaluate_workspace(work, tmp_path, mapping=False)
+    found = judged(work, tmp_path, mapping=False)
     figures = total(found.pairs)
     assert found.truth_kind == "reference"
     assert figures["correctness"] >= total(evaluation.pairs)["correctness"]
@@ -143,7 +148,7 @@ def test_a_workspace_judged_by_poses_alone(work: Path, rendered: Path, tmp_path:
     # An image without reference pose is left out, and said so.
     *listed, last = (tmp_path / "poses.csv").read_text().splitlines()
     (tmp_path / "poses.csv").write_text("\n".join(listed) + "\n")
-    without = evaluate_workspace(work, tmp_path, mapping=False)
+    without = judged(work, tmp_path, mapping=False)
     assert without.left_out == (last.split(",")[0],)
     assert dict(summary_rows(without))["truth"] == f"reference, {IMAGES - 1} images (1 left out: no reference pose)"
     # Mapping takes it all the same.
@@ -156,23 +161,23 @@ def test_an_export_of_earlier_matches_is_not_mapped(work: Path, rendered: Path, 
     report = tmp_path / "later" / "reports" / "filter.json"
     later_s = report.stat().st_mtime + 3600.0
     os.utime(report, (later_s, later_s))
-    consumer = evaluate_workspace(tmp_path / "later", rendered).consumer
+    consumer = judged(tmp_path / "later", rendered).consumer
     assert consumer == {"skipped": "the export is of earlier matches: run aeromatch export"}
 
 
 def test_what_does_not_belong_together_is_refused(work: Path, rendered: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no workspace.*images\.csv"):
-        evaluate_workspace(tmp_path, rendered)
+        judged(tmp_path, rendered)
     with pytest.raises(InputError, match="holds no truth"):
-        evaluate_workspace(work, tmp_path)
+        judged(work, tmp_path)
     copy = tmp_path / "work"
     shutil.copytree(work, copy)
     name = rows(copy / "images.csv")[0]["name"]
     with pytest.raises(InputError, match=rf"1 of the {IMAGES} images .*holiday\.jpg"):
-        evaluate_workspace(_with_images(copy, name, "holiday.jpg"), rendered)
+        judged(_with_images(copy, name, "holiday.jpg"), rendered)
     _with_images(copy, "holiday.jpg", name)
     with pytest.raises(InputError, match=rf"{2 * WIDTH}x{HEIGHT} px in the workspace and {WIDTH}x{HEIGHT} px"):
-        evaluate_workspace(_with_images(copy, f",{WIDTH},{HEIGHT},", f",{2 * WIDTH},{HEIGHT},"), rendered)
+        judged(_with_images(copy, f",{WIDTH},{HEIGHT},", f",{2 * WIDTH},{HEIGHT},"), rendered)
 
 
 def _with_images(work: Path, old: str, new: str) -> Path:
@@ -188,18 +193,18 @@ def test_the_truth_of_another_block_of_the_same_names_is_refused(work: Path, ren
     shutil.copytree(rendered, tmp_path / "other")
     picture = sorted((tmp_path / "other" / "images").iterdir())[1]
     cv2.imwrite(str(picture), 255 - cv2.imread(str(picture)))
-    assert evaluate_workspace(work, rendered, mapping=False).pairs
+    assert judged(work, rendered, mapping=False).pairs
     with pytest.raises(InputError, match=rf"{picture.name} is not the picture"):
-        evaluate_workspace(work, tmp_path / "other", mapping=False)
+        judged(work, tmp_path / "other", mapping=False)
 
 
 def test_a_workspace_that_lost_its_files_says_so(work: Path, rendered: Path, tmp_path: Path) -> None:
     shutil.copytree(work, tmp_path / "a", ignore=shutil.ignore_patterns("features"))
     with pytest.raises(InputError, match=r"features of .* are gone"):
-        evaluate_workspace(tmp_path / "a", rendered, mapping=False)
+        judged(tmp_path / "a", rendered, mapping=False)
     shutil.copytree(work, tmp_path / "b", ignore=shutil.ignore_patterns("verified"))
     with pytest.raises(InputError, match="has a verdict"):
-        evaluate_workspace(tmp_path / "b", rendered, mapping=False)
+        judged(tmp_path / "b", rendered, mapping=False)
 
 
 def test_a_mapping_that_fails_says_so(tmp_path: Path) -> None:
@@ -210,6 +215,6 @@ def test_a_mapping_that_fails_says_so(tmp_path: Path) -> None:
 def test_without_export_mapping_is_skipped_with_a_reason(work: Path, rendered: Path, tmp_path: Path) -> None:
     copy = tmp_path / "work"
     shutil.copytree(work, copy, ignore=shutil.ignore_patterns("export"))
-    found = evaluate_workspace(copy, rendered)
+    found = judged(copy, rendered)
     assert "aeromatch export" in found.consumer["skipped"]
     assert dict(summary_rows(found))["mapping"].startswith("skipped: ")

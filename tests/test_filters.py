@@ -10,9 +10,12 @@ from aeromatch_cli.data import Camera, Candidates, Pair, PairGeometry, Pose, Ver
 from aeromatch_cli.geometry.cameras import project, undistort
 from aeromatch_cli.geometry.epipolar import fundamental_from_poses, relative_pose, sampson_distance_px
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.strategies.filters import FILTERS, apply_chain
 from aeromatch_cli.strategies.filters.pose import PoseBand, predicted_sigma_px
 from aeromatch_cli.strategies.filters.poselib import Poselib
+
+EVERY = {**FILTERS, **ARMS["filter"]}
 
 CAMERA0 = Camera("RADIAL", 2000, 1500, (1500.0, 999.5, 749.5, -0.05, 0.01))
 CAMERA1 = Camera("PINHOLE", 1600, 1200, (1100.0, 1105.0, 805.0, 596.0))
@@ -118,10 +121,10 @@ def test_points_without_a_ray_are_dropped():
     assert not verdict.keep[:5].any()
 
 
-@pytest.mark.parametrize("name", sorted(FILTERS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 def test_two_runs_are_equal_to_the_bit(name):
     points0, points1, _ = scene(300, outliers=0.6, seed=3)
-    first, second = (FILTERS[name]()(Candidates(points0, points1), GEOMETRY, 11) for _ in range(2))
+    first, second = (EVERY[name]()(Candidates(points0, points1), GEOMETRY, 11) for _ in range(2))
     assert np.array_equal(first.keep, second.keep)
     assert np.array_equal(first.model, second.model)
     assert np.array_equal(first.errors_px, second.errors_px)

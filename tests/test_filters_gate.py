@@ -10,10 +10,10 @@ from aeromatch_cli.data import Candidates, Verdict
 from aeromatch_cli.geometry.epipolar import relative_pose, sampson_distance_px
 from aeromatch_cli.geometry.rotations import angle_between_deg
 from aeromatch_cli.geometry.two_view import chance_errors_px, log10_false_alarms
+from aeromatch_cli.lab.strategies.magsac import Magsac
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
-from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
 GATES = [Poselib(), Poselib(model="fundamental"), Epipolar(), Epipolar(model="fundamental"), Magsac()]

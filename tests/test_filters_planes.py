@@ -9,10 +9,10 @@ from make_matches import CAMERA0, CAMERA1, GEOMETRY, chance, houses
 from aeromatch_cli.data import Candidates
 from aeromatch_cli.geometry.cameras import undistort
 from aeromatch_cli.geometry.planes import plane_distances_px
+from aeromatch_cli.lab.strategies.homography import Homography
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
-from aeromatch_cli.strategies.filters.homography import Homography
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
 

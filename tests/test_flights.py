@@ -15,9 +15,9 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import FISHEYE, MODELS, distort, focal_px, has_distortion, parameters, undistort
 from aeromatch_cli.geometry.footprints import ground_footprint, view_angles_deg
-from aeromatch_cli.synthetic.flight_plans import FLIGHTS, SWEEP_ANGLES_DEG
-from aeromatch_cli.synthetic.flights import Flight, ground_area, gsd_m, noisy, plan_flight
-from aeromatch_cli.synthetic.stations import Exterior, Station, make_camera
+from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS, SWEEP_ANGLES_DEG
+from aeromatch_cli.lab.synthetic.flights import Flight, ground_area, gsd_m, noisy, plan_flight
+from aeromatch_cli.lab.synthetic.stations import Exterior, Station, make_camera
 
 WIDTH, HEIGHT, HEIGHT_M = 800, 600, 90.0
 # 90 m over 0.9 x 800 px of focal length.

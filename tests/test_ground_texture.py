@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.synthetic import noise, render_block
-from aeromatch_cli.synthetic.light import Light
+from aeromatch_cli.lab.synthetic import noise, render_block
+from aeromatch_cli.lab.synthetic.light import Light
 
 
 def test_texture_fades_out_where_it_cannot_be_sampled() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aeromatch_cli.synthetic.houses import house
-from aeromatch_cli.synthetic.solids import Footprint
+from aeromatch_cli.lab.synthetic.houses import house
+from aeromatch_cli.lab.synthetic.solids import Footprint
 
 
 @pytest.mark.parametrize("length_m", [4.2, 5.0, 12.0])

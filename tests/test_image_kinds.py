@@ -87,6 +87,7 @@ def test_sizes_depths_and_formats_mixed(site):
     assert outcome.facts["stages"]["filter"]["result"]["pairs"].get("verified", 0) >= PAIRS // 2
 
 
+@pytest.mark.usefixtures("arms")
 def test_tiffs_of_five_bands_of_floats_and_of_signed_numbers(site):
     """With an enhancement and colours, so that every stage sees them."""
     renamed = {}

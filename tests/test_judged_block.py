@@ -15,7 +15,7 @@ from conftest import IMAGES, PAGE, Site, contents
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.tables import read_poses
 from aeromatch_cli.geometry.rotations import angle_between_deg
-from aeromatch_cli.synthetic import load_truth
+from aeromatch_cli.lab.synthetic import load_truth
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from aeromatch_cli.config.text import default_yaml
 from aeromatch_cli.files import read_json
 from aeromatch_cli.formats.features import read_features
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("arms")]
 SETTINGS = UNORIENTED
 
 BESIDE = ("--set", "enhance=clahe", "--set", "enhance.keep_source=true")

@@ -9,9 +9,9 @@ import torch
 from trainings.lightglue.blocks import Pair, block_pairs
 from trainings.lightglue.validation import Found, compared
 
+from aeromatch_cli.lab.synthetic import render_block
 from aeromatch_cli.nets.files import SHIPPED_LIGHTGLUE
 from aeromatch_cli.nets.lightglue_file import load_lightglue, read_calibration
-from aeromatch_cli.synthetic import render_block
 
 pytestmark = pytest.mark.slow
 

@@ -15,11 +15,14 @@ from PIL import Image as Picture
 from aeromatch_cli.data import BoolArray, Camera, Features, View
 from aeromatch_cli.images.files import read_pixels, read_raster
 from aeromatch_cli.images.source import Source, read_source
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.strategies.enhancers.shadow_mask import make_overview
 from aeromatch_cli.strategies.enhancers.tone import tone_of, white_of
 from aeromatch_cli.strategies.extractors.sift import Sift
+
+EVERY = {**ENHANCERS, **ARMS["enhance"]}
 
 HEIGHT, WIDTH, FRAME = 240, 320, 80
 
@@ -234,11 +237,11 @@ def test_white_is_that_of_the_valid_pixels(shape: tuple[int, ...]) -> None:
     assert white_of(deep.astype(np.uint8), framed()) == 255.0
 
 
-@pytest.mark.parametrize("name", sorted(ENHANCERS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 @pytest.mark.parametrize("deep", [False, True])
 def test_a_mask_that_masks_nothing_changes_nothing(name: str, deep: bool) -> None:
     pixels = texture().astype(np.uint16) * 200 if deep else texture()
     everywhere = np.ones((HEIGHT, WIDTH), bool)
-    found = ENHANCERS[name]()(pixels, everywhere).pixels
-    expected = ENHANCERS[name]()(pixels, None).pixels
+    found = EVERY[name]()(pixels, everywhere).pixels
+    expected = EVERY[name]()(pixels, None).pixels
     assert np.abs(found.astype(int) - expected).max() <= (1 if name == "wallis" else 0)

@@ -10,7 +10,8 @@ from conftest import Outcome, invoke
 
 from aeromatch_cli.evaluate import evaluate_workspace
 from aeromatch_cli.evaluate.totals import total
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import render_block
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,7 @@ def matched(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(suburb: Path, work: Path) -> dict[str, float]:
-    return total(evaluate_workspace(work, suburb, mapping=False).pairs)
+    return total(evaluate_workspace(work, suburb, open_truth, mapping=False).pairs)
 
 
 def test_oblique_finds_more_than_baseline(suburb: Path, matched: Path, tmp_path: Path) -> None:

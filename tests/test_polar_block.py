@@ -13,7 +13,8 @@ from aeromatch_cli.evaluate import evaluate_workspace
 from aeromatch_cli.evaluate.totals import total
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_pairs
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import render_block
 
 pytestmark = pytest.mark.slow
 
@@ -38,7 +39,7 @@ def work(grass: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_pair_that_shares_enough_is_verified(work: Path, grass: Path) -> None:
-    figures = total(evaluate_workspace(work, grass, mapping=False).pairs)
+    figures = total(evaluate_workspace(work, grass, open_truth, mapping=False).pairs)
     assert figures["correctness"] > 0.995
     assert figures["median_error_px"] < 0.15
     assert figures["coverage"] > 0.8

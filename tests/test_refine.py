@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
-from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.fingerprints import picture_fingerprint
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.refined import checked_final_keypoints, read_final_keypoints
@@ -25,6 +24,7 @@ from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.images.source import Source
+from aeromatch_cli.lab.opening import open_truth
 from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages import measuring
 from aeromatch_cli.stages.measuring import _far_inside

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from aeromatch_cli.config import FAMILIES, load
-from aeromatch_cli.config.renamed import SETTINGS, STRATEGIES
+from aeromatch_cli.config.renamed import DROPPED, SETTINGS, STRATEGIES
 from aeromatch_cli.errors import ConfigError
 
 CHAINED = ("filter", "export")
@@ -40,3 +40,9 @@ def test_an_old_strategy_names_the_new_one() -> None:
     assert STRATEGIES == {"extract": {"lattice": "grid"}}
     with pytest.raises(ConfigError, match="extract: the strategy 'lattice' is now named 'grid'"):
         load("polar", ["extract=lattice"])
+
+
+@pytest.mark.parametrize(("section", "name"), [(section, name) for section in DROPPED for name in DROPPED[section]])
+def test_a_strategy_that_is_gone_names_those_that_there_are(section: str, name: str) -> None:
+    with pytest.raises(ConfigError, match=f"{section}: there is no strategy '{name}' any more; take '"):
+        load("baseline", [f"{section}={name}"])

@@ -5,20 +5,20 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from aeromatch_cli.synthetic.buildings import draw_style, hall, slab, tower, town_house
-from aeromatch_cli.synthetic.cars import car, lorry
-from aeromatch_cli.synthetic.houses import house, pool, shed
-from aeromatch_cli.synthetic.materials import PAINTERS
-from aeromatch_cli.synthetic.noise import hash01
-from aeromatch_cli.synthetic.paint import Samples
-from aeromatch_cli.synthetic.rasters import look_up
-from aeromatch_cli.synthetic.scenes import city, suburb
-from aeromatch_cli.synthetic.scenes.city_blocks import build_block
-from aeromatch_cli.synthetic.scenes.lots import bent, straight
-from aeromatch_cli.synthetic.scenes.streets import blocks_near, mesh, street_map
-from aeromatch_cli.synthetic.solids import Footprint, Material, boxes, shrunk, turned
-from aeromatch_cli.synthetic.terrain import Area
-from aeromatch_cli.synthetic.trees import Species, hedge, tree
+from aeromatch_cli.lab.synthetic.buildings import draw_style, hall, slab, tower, town_house
+from aeromatch_cli.lab.synthetic.cars import car, lorry
+from aeromatch_cli.lab.synthetic.houses import house, pool, shed
+from aeromatch_cli.lab.synthetic.materials import PAINTERS
+from aeromatch_cli.lab.synthetic.noise import hash01
+from aeromatch_cli.lab.synthetic.paint import Samples
+from aeromatch_cli.lab.synthetic.rasters import look_up
+from aeromatch_cli.lab.synthetic.scenes import city, suburb
+from aeromatch_cli.lab.synthetic.scenes.city_blocks import build_block
+from aeromatch_cli.lab.synthetic.scenes.lots import bent, straight
+from aeromatch_cli.lab.synthetic.scenes.streets import blocks_near, mesh, street_map
+from aeromatch_cli.lab.synthetic.solids import Footprint, Material, boxes, shrunk, turned
+from aeromatch_cli.lab.synthetic.terrain import Area
+from aeromatch_cli.lab.synthetic.trees import Species, hedge, tree
 
 pytestmark = pytest.mark.slow
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.synthetic.fields import RELIEF_REACH_M, random_waves, turned, unturned
-from aeromatch_cli.synthetic.noise import octave, octave_slope, slopes
-from aeromatch_cli.synthetic.paint import Painted, Samples
-from aeromatch_cli.synthetic.scenes import SceneKind, desert, farmland, grass, hills, parcels, water_edge
-from aeromatch_cli.synthetic.scenes.growth import winding_path
-from aeromatch_cli.synthetic.solids import Material, Surface
-from aeromatch_cli.synthetic.terrain import Area
-from aeromatch_cli.synthetic.water import BANK_M, DEEPEST_M, LEVEL_M, paint_water, shore
+from aeromatch_cli.lab.synthetic.fields import RELIEF_REACH_M, random_waves, turned, unturned
+from aeromatch_cli.lab.synthetic.noise import octave, octave_slope, slopes
+from aeromatch_cli.lab.synthetic.paint import Painted, Samples
+from aeromatch_cli.lab.synthetic.scenes import SceneKind, desert, farmland, grass, hills, parcels, water_edge
+from aeromatch_cli.lab.synthetic.scenes.growth import winding_path
+from aeromatch_cli.lab.synthetic.solids import Material, Surface
+from aeromatch_cli.lab.synthetic.terrain import Area
+from aeromatch_cli.lab.synthetic.water import BANK_M, DEEPEST_M, LEVEL_M, paint_water, shore
 
 pytestmark = pytest.mark.slow
 

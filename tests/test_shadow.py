@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from aeromatch_cli.lab.synthetic import render_block
 from aeromatch_cli.nets.shadow import network_weights, shadow_logits
 from aeromatch_cli.strategies.enhancers.relight import relit
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
 from aeromatch_cli.strategies.enhancers.shadow_mask import SoftMask, make_overview, shadow_share, soft_mask
 from aeromatch_cli.strategies.enhancers.shadow_regions import MAX_LISTED_REGIONS, find_regions, gain_field, region_table
 from aeromatch_cli.strategies.enhancers.tone import Tone
-from aeromatch_cli.synthetic import render_block
 
 SKY_SHARE = np.array([0.21, 0.25, 0.33])  # of sun and sky together: shadow is bluer
 HEIGHT, WIDTH = 240, 320

@@ -17,10 +17,13 @@ from aeromatch_cli.geometry.frames import apply_homography
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.geometry.warps import area_scale, border_px, source_from_view, view_from_source
 from aeromatch_cli.images.views import render_view
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.sift import Sift
 from aeromatch_cli.strategies.simulators import SIMULATORS
 from aeromatch_cli.strategies.simulators.ground import GroundView
+
+EVERY = {**SIMULATORS, **ARMS["simulate"]}
 
 PINHOLE = Camera("PINHOLE", 1000, 800, (1000.0, 1000.0, 499.5, 399.5))
 LENS = Camera("OPENCV", 1000, 800, (820.0, 815.0, 503.2, 391.1, -0.08, 0.03, 1e-3, -5e-4))
@@ -42,25 +45,25 @@ def world_from_view(camera: Camera, seen_from: Pose, view: View, points_px: Floa
     return np.column_stack([xy, np.full(len(xy), GROUND_Z)])
 
 
-@pytest.mark.parametrize("name", sorted(SIMULATORS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 @pytest.mark.parametrize("known", [(None, GROUND_Z, 0.1), (pose(0, 0, 0), None, 0.1), (pose(0, 0, 0), GROUND_Z, None)])
 def test_without_geometry_every_simulator_gives_the_source(
     name: str, known: tuple[Pose | None, float | None, float | None]
 ) -> None:
-    view, *others = SIMULATORS[name]()(LENS, *known)
+    view, *others = EVERY[name]()(LENS, *known)
     assert view.is_source
     assert not others or name == "tilts"
     assert (view.name, view.width_px, view.height_px, view.angle_deg) == ("source", 1000, 800, 0.0)
     np.testing.assert_array_equal(view.undistorted_from_view, np.eye(3))
 
 
-@pytest.mark.parametrize("name", sorted(SIMULATORS))
+@pytest.mark.parametrize("name", sorted(EVERY))
 def test_simulators_are_frozen_recipes(name: str) -> None:
-    recipe = SIMULATORS[name]()
+    recipe = EVERY[name]()
     assert recipe.name == name
-    assert hash(recipe) == hash(SIMULATORS[name]())
+    assert hash(recipe) == hash(EVERY[name]())
     with pytest.raises(ValueError, match="Extra inputs"):
-        SIMULATORS[name](unknown=1)  # type: ignore[call-arg]
+        EVERY[name](unknown=1)  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, LENS])

@@ -6,10 +6,10 @@ import numpy as np
 
 from aeromatch_cli.data import Camera
 from aeromatch_cli.images.views import render_view
+from aeromatch_cli.lab.strategies.tilts import Tilts
 from aeromatch_cli.results.stages import ExtractResult
 from aeromatch_cli.stages.simulate import ViewCost, views_result
 from aeromatch_cli.strategies import ViewPixels
-from aeromatch_cli.strategies.simulators.tilts import Tilts
 
 
 def test_cost_is_counted_over_views() -> None:

@@ -8,7 +8,7 @@ import pytest
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.warps import area_scale, source_from_view, view_from_source
 from aeromatch_cli.images.views import render_view
-from aeromatch_cli.strategies.simulators.tilts import Tilts
+from aeromatch_cli.lab.strategies.tilts import Tilts
 
 PINHOLE = Camera("PINHOLE", 400, 300, (380.0, 380.0, 199.5, 149.5))
 LENS = Camera("OPENCV", 400, 300, (380.0, 378.0, 203.2, 141.1, -0.08, 0.03, 1e-3, -5e-4))

@@ -83,6 +83,7 @@ def test_a_focal_length_that_is_no_guess_any_more_is_exported_anew(site: Site) -
     assert prior() == 1
 
 
+@pytest.mark.usefixtures("arms")
 def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
     workspace = Workspace(site.work)
     image_id = site.names()[0].replace(".", "_")
@@ -98,6 +99,7 @@ def test_pictures_of_other_settings_do_not_stay(site: Site) -> None:
     assert not tilted <= {f"{name}.png" for name in names}
 
 
+@pytest.mark.usefixtures("arms")
 def test_pictures_of_views_outlive_features_of_other_settings(site: Site) -> None:
     """They were asked for, and features are found without them."""
     workspace = Workspace(site.work)

@@ -18,14 +18,14 @@ from aeromatch_cli.data import Camera
 from aeromatch_cli.errors import ConfigError, InputError
 from aeromatch_cli.geometry.cameras import MODELS, corner_params, project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa, to_omega_phi_kappa
-from aeromatch_cli.synthetic import Truth, load_truth, render_block, transfer
-from aeromatch_cli.synthetic.receivers import gps_errors_m, rtk_errors_m
-from aeromatch_cli.synthetic.render import render_image
-from aeromatch_cli.synthetic.sensor import Development
-from aeromatch_cli.synthetic.shade import Stage
-from aeromatch_cli.synthetic.solids import Material
-from aeromatch_cli.synthetic.stations import Exterior, Station, taken_s
-from aeromatch_cli.synthetic.terrain import Area, Flat, sample_terrain
+from aeromatch_cli.lab.synthetic import Truth, load_truth, render_block, transfer
+from aeromatch_cli.lab.synthetic.receivers import gps_errors_m, rtk_errors_m
+from aeromatch_cli.lab.synthetic.render import render_image
+from aeromatch_cli.lab.synthetic.sensor import Development
+from aeromatch_cli.lab.synthetic.shade import Stage
+from aeromatch_cli.lab.synthetic.solids import Material
+from aeromatch_cli.lab.synthetic.stations import Exterior, Station, taken_s
+from aeromatch_cli.lab.synthetic.terrain import Area, Flat, sample_terrain
 
 pytestmark = pytest.mark.slow
 

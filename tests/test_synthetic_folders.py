@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from aeromatch_cli.errors import ConfigError, WorkspaceError
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.synthetic import render_block
 
 
 def test_arguments_that_cannot_be_used_are_refused_before_anything_is_written(tmp_path: Path) -> None:

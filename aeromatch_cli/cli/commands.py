@@ -68,9 +68,11 @@ def evaluate(
         from aeromatch_cli.errors import WorkspaceError
         from aeromatch_cli.evaluate import evaluate_workspace
         from aeromatch_cli.evaluate.output import facts, lines, refresh_report, write_evaluation
+        from aeromatch_cli.lab.opening import open_truth
         from aeromatch_cli.stages.run import Result
 
-        evaluation = evaluate_workspace(work, truth, mapping=mapping, progress=progress_shown(progress, quiet=quiet))
+        shown = progress_shown(progress, quiet=quiet)
+        evaluation = evaluate_workspace(work, truth, open_truth, mapping=mapping, progress=shown)
         try:
             written = write_evaluation(evaluation)
         except WorkspaceError as error:  # an archive that nobody may write: its figures are no less true
@@ -157,8 +159,8 @@ def synth(
     """Render a block of images with exact truth."""
 
     def call() -> Result:
+        from aeromatch_cli.lab.synthetic import render_block
         from aeromatch_cli.stages.run import Result
-        from aeromatch_cli.synthetic import render_block
 
         width_px, height_px = _parse_size(size)
         summary = render_block(

@@ -79,7 +79,7 @@ STAGES: Mapping[str, tuple[str, Sequence[str]]] = {
         "Write the enhanced picture of every image that is enhanced.",
         (
             "aeromatch enhance fusion --images IMGS --poses poses.csv --workspace WORK",
-            "aeromatch enhance baseline --images IMGS --set enhance=wallis --workspace WORK",
+            "aeromatch enhance baseline --images IMGS --set enhance=shadow --workspace WORK",
         ),
     ),
     "simulate": (

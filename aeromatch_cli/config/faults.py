@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-from aeromatch_cli.config.renamed import STRATEGIES, new_key
+from aeromatch_cli.config.renamed import DROPPED, STRATEGIES, new_key
 
 Families = Mapping[str, Mapping[str, type[BaseModel]]]
 
@@ -61,6 +61,10 @@ def describe(fault: ErrorDetails, root: type[BaseModel], families: Families) -> 
         renamed = STRATEGIES.get(str(location[0]), {}).get(name)
         if renamed:
             return f"{place.removesuffix('.name')}: the strategy {name!r} is now named {renamed!r}"
+        if name in DROPPED.get(str(location[0]), ()):
+            return (
+                f"{place.removesuffix('.name')}: there is no strategy {name!r} any more; take {_either(list(family))}"
+            )
         return f"{place.removesuffix('.name')}: no strategy is named {name!r}{nearest(name, list(family))}"
     if kind == "union_tag_not_found":
         return f"{place}: name the strategy (name: ...), one of {', '.join(family)} (got {_shown(fault['input'])})"
@@ -162,17 +166,13 @@ def _visible(location: tuple[Any, ...], families: Families) -> Iterator[Any]:
 
 def _siblings(location: tuple[Any, ...], root: type[BaseModel], families: Families) -> list[str]:
     """The keys that are valid at a place."""
+    family = families.get(str(location[0])) if location else None
+    if family is not None:
+        named = [family[part] for part in location[1:] if part in family]
+        # pydantic leaves out the name where the family has only one.
+        strategy = named[0] if named else next(iter(family.values()))
+        return list(strategy.model_fields)
     model: Any = root
     for part in location:
-        if isinstance(part, int):
-            continue
-        if isinstance(model, type) and issubclass(model, BaseModel) and part in model.model_fields:
-            model = model.model_fields[part].annotation
-        else:
-            model = families.get(str(location[0]), {}).get(str(part), model)
-    if len(location) > 1 and isinstance(location[1], int) and len(families[str(location[0])]) == 1:
-        model = next(iter(families[str(location[0])].values()))
-    for candidate in (model, *get_args(model)):
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return list(candidate.model_fields)
-    return []
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)

@@ -1,4 +1,4 @@
-"""Settings and strategies that had another name before: an old name is an error that says the new one."""
+"""Settings and strategies that had another name before, or are gone: an old name is an error that says what to take."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from collections.abc import Mapping
 SETTINGS: Mapping[str, Mapping[str, Mapping[str, str]]] = {
     "enhance": {
         "": {"beside": "keep_source", "one_sun_minutes": "same_illumination_minutes"},
-        "wallis": {"spread": "standard_deviation"},
     },
     "simulate": {
         "": {"source": "keep_source"},
         "neighbours": {"min_tilt": "min_stretch"},
-        "tilts": {"turns": "rotations"},
     },
     "match": {
         "": {"ample": "guide_below_matches"},
@@ -36,6 +34,12 @@ SETTINGS: Mapping[str, Mapping[str, Mapping[str, str]]] = {
 }
 # Section -> old name of a strategy -> new name.
 STRATEGIES: Mapping[str, Mapping[str, str]] = {"extract": {"lattice": "grid"}}
+# Section -> strategies that are gone: benchmarks alone still know them.
+DROPPED: Mapping[str, tuple[str, ...]] = {
+    "enhance": ("clahe", "wallis"),
+    "simulate": ("tilts",),
+    "filter": ("homography", "magsac"),
+}
 
 
 def new_key(section: str, key: str, valid: frozenset[str]) -> str | None:

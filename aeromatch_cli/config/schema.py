@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import CoreSchema
 
 from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.strategies import Strategy
@@ -50,12 +60,33 @@ def chain(value: Any) -> Any:
     return [named(item) for item in value] if isinstance(value, Sequence) else value
 
 
-def _choice(table: Mapping[str, type[Strategy]]) -> Any:
-    """Type of "one of this family", chosen by `name`."""
-    classes = tuple(table.values())
-    if len(classes) == 1:
-        return Annotated[classes[0], BeforeValidator(named)]
-    return Annotated[Union[classes], Field(discriminator="name"), BeforeValidator(named)]  # noqa: UP007
+# Section -> name -> strategy. Of a process that called `add_strategies` they are more than the product's own.
+FAMILIES: dict[str, dict[str, type[Strategy]]] = {
+    "orient": dict(ORIENTERS),
+    "pairs": dict(PAIRINGS),
+    "enhance": dict(ENHANCERS),
+    "simulate": dict(SIMULATORS),
+    "extract": dict(EXTRACTORS),
+    "match": dict(MATCHERS),
+    "cascade": dict(STEPS),
+    "filter": dict(FILTERS),
+    "refine": dict(REFINERS),
+    "consistency": dict(CONSISTENCIES),
+    "export": dict(EXPORTERS),
+}
+
+
+@dataclass(frozen=True)
+class _OneOf:
+    """Annotates a setting as "one of this family, chosen by `name`". pydantic asks for the family's table whenever it
+    builds a schema, not when this file is read: strategies can be added to the table in between."""
+
+    family: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        classes = tuple(FAMILIES[self.family].values())
+        chosen = classes[0] if len(classes) == 1 else Annotated[Union[classes], Field(discriminator="name")]  # noqa: UP007
+        return handler.generate_schema(Annotated[chosen, BeforeValidator(named)])
 
 
 class _Section(BaseModel):
@@ -225,43 +256,41 @@ class Settings(_Section):
     seed: int = Field(0, ge=0, description="Seed of the estimators that verify pairs.")
     block: BlockSettings = Field(BlockSettings(), description="What was flown: images, poses, cameras, ground.")
     run: RunSettings = Field(RunSettings(), description="How it is run. Nothing here changes a result.")
-    orient: _choice(ORIENTERS) = Field(  # type: ignore[valid-type]
+    orient: Annotated[Any, _OneOf("orient")] = Field(
         ORIENTERS["global"](), description="How cameras, poses and terrain are found from a first pass."
     )
-    pairs: _choice(PAIRINGS) = Field(  # type: ignore[valid-type]
-        PAIRINGS["overlap"](), description="Which images are compared."
-    )
-    enhance: _choice(ENHANCERS) = Field(  # type: ignore[valid-type]
+    pairs: Annotated[Any, _OneOf("pairs")] = Field(PAIRINGS["overlap"](), description="Which images are compared.")
+    enhance: Annotated[Any, _OneOf("enhance")] = Field(
         ENHANCERS["none"](), description="What is done to an image before anything else."
     )
-    simulate: _choice(SIMULATORS) = Field(  # type: ignore[valid-type]
+    simulate: Annotated[Any, _OneOf("simulate")] = Field(
         SIMULATORS["ground"](), description="From which virtual views an image is described."
     )
-    extract: _choice(EXTRACTORS) = Field(  # type: ignore[valid-type]
+    extract: Annotated[Any, _OneOf("extract")] = Field(
         EXTRACTORS["sift"](), description="Features of each image, over all its views."
     )
-    match: _choice(MATCHERS) = Field(  # type: ignore[valid-type]
+    match: Annotated[Any, _OneOf("match")] = Field(
         MATCHERS["nearest"](), description="Which features of two images correspond."
     )
-    cascade: Annotated[tuple[_choice(STEPS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+    cascade: Annotated[tuple[Annotated[Any, _OneOf("cascade")], ...], BeforeValidator(chain)] = Field(
         (),
         description="Further steps for pairs that the settings above leave with too few matches, or that may have many "
         "more, cheapest first; the "
         "matches of all steps of a pair are verified together.",
     )
-    filter: Annotated[tuple[_choice(FILTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+    filter: Annotated[tuple[Annotated[Any, _OneOf("filter")], ...], BeforeValidator(chain)] = Field(
         (FILTERS["poselib"](),),
         min_length=1,  # without a filter no pair is ever verified
         description="Which matches are kept: a chain of filters; each gets what the previous one kept.",
     )
-    refine: _choice(REFINERS) = Field(  # type: ignore[valid-type]
+    refine: Annotated[Any, _OneOf("refine")] = Field(
         REFINERS["least-squares"](), description="How exactly the places of verified tie points are measured."
     )
     adjust: AdjustSettings = Field(AdjustSettings(), description="What the bundle adjustment may find of cameras.")
-    consistency: _choice(CONSISTENCIES) = Field(  # type: ignore[valid-type]
+    consistency: Annotated[Any, _OneOf("consistency")] = Field(
         CONSISTENCIES["block"](), description="What is done about verified matches that contradict the adjusted block."
     )
-    export: Annotated[tuple[_choice(EXPORTERS), ...], BeforeValidator(chain)] = Field(  # type: ignore[valid-type]
+    export: Annotated[tuple[Annotated[Any, _OneOf("export")], ...], BeforeValidator(chain)] = Field(
         (EXPORTERS["colmap"](),), description="Programs for which the result is written: a list."
     )
 
@@ -333,16 +362,8 @@ class Settings(_Section):
         return self
 
 
-FAMILIES: Mapping[str, Mapping[str, type[Strategy]]] = {
-    "orient": ORIENTERS,
-    "pairs": PAIRINGS,
-    "enhance": ENHANCERS,
-    "simulate": SIMULATORS,
-    "extract": EXTRACTORS,
-    "match": MATCHERS,
-    "cascade": STEPS,
-    "filter": FILTERS,
-    "refine": REFINERS,
-    "consistency": CONSISTENCIES,
-    "export": EXPORTERS,
-}
+def add_strategies(families: Mapping[str, Mapping[str, type[Strategy]]]) -> None:
+    """Let the settings of this process name further strategies: family -> name -> class."""
+    for family, table in families.items():
+        FAMILIES[family].update(table)
+    Settings.model_rebuild(force=True)

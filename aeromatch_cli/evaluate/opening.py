@@ -1,4 +1,4 @@
-"""Which truth a folder holds."""
+"""What every truth of a block can say, and the one of reference poses, opened from its folder."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Protocol
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.evaluate.reference import load_reference
-from aeromatch_cli.evaluate.rendered import RenderedTruth
+from aeromatch_cli.evaluate.reference import ReferenceTruth, load_reference
 from aeromatch_cli.evaluate.scores import Conditions, PairScore
 
 _REFERENCE_FILES = ("poses.csv", "block.json")
@@ -47,22 +46,19 @@ class BlockTruth(Protocol):
     ) -> PairScore: ...
 
 
-def open_truth(folder: Path) -> BlockTruth:
-    """The truth in a folder: a rendered block (truth.json), or reference poses (poses.csv and block.json, there or in
-    its subfolder reference). Raises InputError where it holds neither, or something damaged.
+def open_reference(folder: Path) -> ReferenceTruth:
+    """The reference poses in a folder: poses.csv and block.json, there or in its subfolder reference. Raises InputError
+    where it holds none, or something damaged.
     """
-    if (folder / "truth.json").is_file():
-        from aeromatch_cli.synthetic.truth import load_truth
-
-        return RenderedTruth(load_truth(folder), _existing(folder / "images"))
     for place in (folder, folder / "reference"):
         if all((place / name).is_file() for name in _REFERENCE_FILES):
-            return load_reference(place, _existing(folder / "images") or _existing(place.parent / "images"))
+            return load_reference(place, existing(folder / "images") or existing(place.parent / "images"))
     raise InputError(
         f"{folder} holds no truth: give the folder that synth wrote (truth.json), or one with reference poses "
         f"({' and '.join(_REFERENCE_FILES)})"
     )
 
 
-def _existing(folder: Path) -> Path | None:
+def existing(folder: Path) -> Path | None:
+    """The folder where it exists, else None."""
     return folder if folder.is_dir() else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray, Image
 from aeromatch_cli.errors import InputError
 from aeromatch_cli.evaluate.mapping import map_both
-from aeromatch_cli.evaluate.opening import BlockTruth, open_truth
+from aeromatch_cli.evaluate.opening import BlockTruth
 from aeromatch_cli.evaluate.totals import NOT_TRIED, PairRow
 from aeromatch_cli.executor import Progress, SilentProgress
 from aeromatch_cli.fingerprints import file_digest
@@ -55,12 +55,18 @@ class Evaluation:
 
 
 def evaluate_workspace(
-    work: Path, truth_folder: Path, *, mapping: bool = True, progress: Progress | None = None
+    work: Path,
+    truth_folder: Path,
+    open_truth: Callable[[Path], BlockTruth],
+    *,
+    mapping: bool = True,
+    progress: Progress | None = None,
 ) -> Evaluation:
     """Judge all pairs that are verified in a workspace, and all others that overlap by 20 % in truth, as found nothing.
 
-    mapping: also run pycolmap's mapping from the exported database. Raises InputError where workspace and truth do not
-    belong together, BrokenFileError where a file of the workspace is missing or damaged.
+    open_truth: what opens the folder; the laboratory's knows rendered blocks, too. mapping: also run pycolmap's mapping
+    from the exported database. Raises InputError where workspace and truth do not belong together, BrokenFileError
+    where a file of the workspace is missing or damaged.
     """
     started, progress = time.monotonic(), progress or SilentProgress()
     workspace = opened_workspace(work)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from aeromatch_cli.lab.strategies import add_arms
 from benchmarks.launcher import Table, launch
 
 TABLE: Table = {
@@ -29,10 +30,8 @@ TABLE: Table = {
     "polar": ("benchmarks.polar.command", "registration of texture-poor ground beside SIFT"),
     "keypoints": ("benchmarks.keypoints.command", "detectors, angles and descriptors of one place, by exact truth"),
     "lightglue": ("benchmarks.lightglue.command", "the network beside the ratio test, and its seconds"),
-    "extraction": ("benchmarks.extraction", "seconds of an image's features, by extractor"),
     "probability": ("benchmarks.probability", "how far the probability that a match is right can be relied on"),
     "evidence": ("benchmarks.evidence", "how many matches a step of auto is expected to bring, and how many it brings"),
-    "refine": ("benchmarks.refine", "errors of tie points with and without least-squares matching, by exact truth"),
     "filters": ("benchmarks.filters", "filters on the same matches, by exact truth"),
     "rectification": ("benchmarks.rectification", "scale and rotation that remain between views of oblique pairs"),
     "shadow": ("benchmarks.shadow", "masks of `enhance=shadow` against rendered truth and hand labels"),
@@ -41,7 +40,6 @@ TABLE: Table = {
     "growth": ("benchmarks.growth", "seconds and memory of every stage against the number of images"),
     "memory": ("benchmarks.memory", "peak memory of whole runs against --memory, on large images"),
     "device": ("benchmarks.device", "images and pairs a second of the networks on a CUDA device, beside its limit"),
-    "runtimes": ("benchmarks.runtimes", "the networks on a CPU by several runtimes, and how equal their answers are"),
     "pages": ("benchmarks.pages", "brings the first lines of docs/results up to date with the tables' stamps"),
     "same": ("benchmarks.same", "whether two workspaces hold the same verified matches, array by array"),
 }
@@ -53,4 +51,5 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
+    add_arms()  # which settings of benchmarks may name
     sys.exit(main(sys.argv[1:]))

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from aeromatch_cli.synthetic import PRESETS
-from aeromatch_cli.synthetic.write import sun_path
+from aeromatch_cli.lab.synthetic import PRESETS
+from aeromatch_cli.lab.synthetic.write import sun_path
 from benchmarks import options
 from benchmarks.scenes import render_once
 from benchmarks.stamps import REPOSITORY

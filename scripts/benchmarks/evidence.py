@@ -28,10 +28,10 @@ from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json, write_json
+from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.stages import cascade, pairs
 from aeromatch_cli.stages.evidence import columns, expected_number, fitted_weights, log_error
 from aeromatch_cli.strategies.steps import STEPS
-from aeromatch_cli.synthetic import PRESETS
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.pages import FOLDER

@@ -29,16 +29,16 @@ from aeromatch_cli.evaluate.metrics import thin
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.geometry.planes import plane_distances_px
 from aeromatch_cli.geometry.two_view import undistorted
+from aeromatch_cli.lab.strategies.homography import Homography
+from aeromatch_cli.lab.strategies.magsac import Magsac
+from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.stages import filter as filtering
 from aeromatch_cli.strategies.filters import apply_chain
 from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.colour import Colour
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
 from aeromatch_cli.strategies.filters.graph import Graph
-from aeromatch_cli.strategies.filters.homography import Homography
-from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.poselib import Poselib
-from aeromatch_cli.synthetic import PRESETS
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options
 from benchmarks.peers.ours import Preset

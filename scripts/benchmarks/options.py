@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.files import write_text
-from aeromatch_cli.synthetic import PRESETS
-from aeromatch_cli.synthetic.flight_plans import FLIGHTS
+from aeromatch_cli.lab.synthetic import PRESETS
+from aeromatch_cli.lab.synthetic.flight_plans import FLIGHTS
 from benchmarks.pages import FOLDER, PAGES, write_table
 from benchmarks.stamps import Version, make_stamp
 

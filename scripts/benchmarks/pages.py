@@ -37,7 +37,6 @@ PAGES: Mapping[str, str] = {
     "bench_presets_nothing": "auto.md",
     "bench_presets_positions": "auto.md",
     "bench_evidence": "auto.md",
-    "bench_refine": "auto.md",
     "bench_probability": "auto.md",
     "bench_auto_real": "auto.md",
     "bench_auto_unknown": "auto.md",
@@ -79,9 +78,6 @@ PAGES: Mapping[str, str] = {
     "bench_rectification": "oblique.md",
     "bench_detector": "extraction.md",
     "bench_descriptors": "extraction.md",
-    "bench_extraction": "extraction.md",
-    "bench_extraction_float32": "extraction.md",
-    "bench_runtimes": "extraction.md",
 }
 _TABLE = re.compile(r"<!-- table (\S+): start -->\n(.*?)<!-- table \1: end -->", re.DOTALL)
 _STAMP = re.compile(r"<!-- stamp (\{.*\}) -->\n")

@@ -18,15 +18,15 @@ import numpy as np
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.evaluate.rendered import RenderedTruth
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.rendered import RenderedTruth
+from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
 from aeromatch_cli.stages.run import execute
-from aeromatch_cli.synthetic import load_truth
 from aeromatch_cli.workspace import Workspace
 from benchmarks import options
 from benchmarks.peers.base import Options, Scene

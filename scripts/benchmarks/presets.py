@@ -30,7 +30,7 @@ from pathlib import Path
 from aeromatch_cli.config import load, parse_method, preset_names
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.lab.synthetic import PRESETS
 from benchmarks import options, stamps
 from benchmarks.methods.worker import measure
 from benchmarks.pages import FOLDER

@@ -23,17 +23,17 @@ from pathlib import Path
 import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, BoolArray, Camera, FloatArray, IntArray
-from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.evaluate.scores import CORRECT_PX
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.orientation.alone import placed_alone
 from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
 from aeromatch_cli.orientation.probability import WEIGHTS, columns, fitted_weights, stated, usual_off_px
 from aeromatch_cli.strategies.consistencies import BlockConsistency
-from aeromatch_cli.synthetic import PRESETS
 from aeromatch_cli.workspace import Workspace
 from benchmarks import options, stamps
 from benchmarks.pages import FOLDER

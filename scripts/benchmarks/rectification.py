@@ -29,14 +29,15 @@ import numpy as np
 
 from aeromatch_cli.config import load
 from aeromatch_cli.data import BoolArray, FloatArray, View
-from aeromatch_cli.evaluate import BlockTruth, open_truth
+from aeromatch_cli.evaluate import BlockTruth
 from aeromatch_cli.evaluate.overlap import sample_grid
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.fingerprints import stable_hash
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import Truth, load_truth
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.strategies.matchers.descriptors.search import Search
 from aeromatch_cli.strategies.matchers.descriptors.views import comparable
-from aeromatch_cli.synthetic import Truth, load_truth
 from benchmarks import options, stamps
 from benchmarks.peers.base import Options, Scene
 from benchmarks.peers.ours import Preset

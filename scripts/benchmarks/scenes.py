@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.evaluate import BlockTruth, Conditions, open_truth
+from aeromatch_cli.evaluate import BlockTruth, Conditions
 from aeromatch_cli.evaluate.scores import VIEW_ANGLE_CLASSES
 from aeromatch_cli.files import write_json
 from aeromatch_cli.fingerprints import fingerprint, stable_hash
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
 from aeromatch_cli.images.files import read_pixels
 from aeromatch_cli.images.scaling import shrink, shrink_camera
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import render_block
 from benchmarks.options import size_px
 from benchmarks.peers.base import Scene
 from benchmarks.sources import code_digest
@@ -72,7 +73,7 @@ class Judged:
 def render_once(folder: Path, preset: str, *, jobs: int = 2, **asked: Any) -> Path:
     """Folder of a rendered block below `folder`; made unless it is there. asked: as of `render_block`."""
     # The renderer's code counts, so that pictures of an older one are not taken for its own.
-    out = folder / f"{preset}-{fingerprint(preset, asked, code_digest('synthetic'))[:12]}"
+    out = folder / f"{preset}-{fingerprint(preset, asked, code_digest('lab/synthetic'))[:12]}"
     if not (out / "truth.json").is_file():
         render_block(out, preset, jobs=jobs, **asked)
     return out

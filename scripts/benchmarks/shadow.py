@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.files import write_json
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.strategies import ARMS
+from aeromatch_cli.lab.synthetic.write import depth_path, read_raster, sun_path
 from aeromatch_cli.strategies.enhancers import ENHANCERS
-from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path
 from benchmarks import options, stamps
 from benchmarks.processes import fresh_process, limit_threads, peak_mb
 from benchmarks.scenes import render_once
@@ -37,6 +38,7 @@ WITH_SHADOW, WITHOUT_SHADOW = 0.05, 0.005
 LABELS = stamps.REPOSITORY / "tests" / "ochota_shadow_labels.csv"
 LARGE_PX = (5164, 3873)
 TIMED = ("shadow", "clahe", "wallis")
+_ENHANCERS = {**ENHANCERS, **ARMS["enhance"]}
 
 
 def mask_of(pixels: NDArray[Any]) -> NDArray[np.bool_]:
@@ -106,7 +108,7 @@ def cost(name: str, picture: Path) -> Row:
     cv2.setNumThreads(1)
     small = read_pixels(picture, colour=True)
     pixels = cv2.resize(small, LARGE_PX, interpolation=cv2.INTER_CUBIC)
-    strategy = ENHANCERS[name]()
+    strategy = _ENHANCERS[name]()
     strategy(small[:100, :100], None)  # modules and weights are loaded once per process
     before_mb = peak_mb()
     wall, cpu = time.perf_counter(), time.process_time()
@@ -192,5 +194,5 @@ def main(arguments: Sequence[str]) -> None:
     options.publish(
         args, tables(results), args.out / "shadow.md", table="bench_shadow",
         command=options.command_line(parser, args),
-        versions=stamps.of_strategies("enhance", *(ENHANCERS[name]() for name in TIMED)),
+        versions=stamps.of_strategies("enhance", *(_ENHANCERS[name]() for name in TIMED)),
     )  # fmt: skip

@@ -12,7 +12,7 @@ from aeromatch_cli.fingerprints import file_digest, fingerprint
 PEER_CODE = ("geometry/cameras.py", "geometry/frames.py", "benchmarks/peers", "benchmarks/processes.py")
 OUR_CODE = (
     "blocks", "geometry", "nets", "orientation", "stages", "strategies", "data.py", "formats", "images",
-    "benchmarks/peers/ours.py",
+    "lab/strategies", "benchmarks/peers/ours.py",
 )  # fmt: skip
 # Peers on rectified views read what makes these, too.
 GROUND_CODE = (

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import FAMILIES, Settings, load
+from aeromatch_cli.lab.strategies import ARMS
 from aeromatch_cli.nets.files import SHIPPED_FOLDER, sha256_of_file
 from aeromatch_cli.nets.precision import has_bfloat16
 from aeromatch_cli.stages import adjust, consistency, orient
@@ -136,7 +137,8 @@ def of_networks(*names: str) -> dict[str, Version]:
 
 def present_versions() -> dict[str, Version]:
     """Every version that there is now."""
-    strategies = {f"{family}.{name}": one.version for family, table in FAMILIES.items() for name, one in table.items()}
+    tables = [*FAMILIES.items(), *ARMS.items()]
+    strategies = {f"{family}.{name}": one.version for family, table in tables for name, one in table.items()}
     networks = of_networks(*(path.stem for path in SHIPPED_FOLDER.glob("*.safetensors")))
     return {"pipeline": PIPELINE_VERSION, "filter.chain": CHAIN_VERSION, **_ORIENTATION, **strategies, **networks}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aeromatch_cli.synthetic import PRESETS, render_block
+from aeromatch_cli.lab.synthetic import PRESETS, render_block
 
 ORDER = (
     "city", "suburb", "city", "farmland", "city", "hills", "suburb", "city", "water-edge", "desert", "city", "grass",

@@ -9,14 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.enhancers.clahe import ClaheEnhancement
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
-from aeromatch_cli.strategies.enhancers.wallis import WallisEnhancement
 
 ENHANCERS: Mapping[str, type[Strategy]] = {
     "none": NoEnhancement,
     "shadow": ShadowEnhancement,
-    "clahe": ClaheEnhancement,
-    "wallis": WallisEnhancement,
 }

@@ -1,4 +1,4 @@
-"""Brightness of gray and colour pictures, and putting a changed one back without a change of hue below white."""
+"""Brightness of gray and colour pictures, and pictures times a factor."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-
-_STRIP_ROWS = 256
 
 
 def brightness(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -21,18 +19,6 @@ def brightness(pixels: NDArray[Any]) -> NDArray[Any]:
     if pixels.shape[2] != 3:
         return np.asarray(np.rint(pixels.mean(axis=2)).astype(pixels.dtype))
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
-
-
-def with_brightness(pixels: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[Any]:
-    """Pixels (H, W) or (H, W, C) scaled, all bands alike, so that their brightness `before` becomes `after`."""
-    if pixels.ndim == 2:
-        return after.astype(pixels.dtype)
-    out = np.empty_like(pixels)
-    for top in range(0, len(pixels), _STRIP_ROWS):
-        rows = slice(top, top + _STRIP_ROWS)
-        factor = after[rows].astype(np.float32) / np.maximum(before[rows].astype(np.float32), np.float32(1.0))
-        out[rows] = multiplied(pixels[rows], factor)
-    return out
 
 
 def multiplied(source: NDArray[Any], factor: FloatArray) -> NDArray[Any]:

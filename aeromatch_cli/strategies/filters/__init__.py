@@ -10,8 +10,6 @@ from aeromatch_cli.strategies.filters.clustered_ransac import ClusteredRansac
 from aeromatch_cli.strategies.filters.colour import Colour
 from aeromatch_cli.strategies.filters.epipolar import Epipolar
 from aeromatch_cli.strategies.filters.graph import Graph
-from aeromatch_cli.strategies.filters.homography import Homography
-from aeromatch_cli.strategies.filters.magsac import Magsac
 from aeromatch_cli.strategies.filters.pose import PoseBand
 from aeromatch_cli.strategies.filters.poselib import Poselib
 
@@ -22,6 +20,4 @@ FILTERS: Mapping[str, type[Strategy]] = {
     "graph": Graph,
     "clustered-ransac": ClusteredRansac,
     "epipolar": Epipolar,
-    "homography": Homography,
-    "magsac": Magsac,
 }

@@ -17,11 +17,9 @@ from aeromatch_cli.strategies.simulators.ground import GroundView
 from aeromatch_cli.strategies.simulators.neighbours import NeighbourViews
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 from aeromatch_cli.strategies.simulators.none import source_view as source_view
-from aeromatch_cli.strategies.simulators.tilts import Tilts
 
 SIMULATORS: Mapping[str, type[Strategy]] = {
     "none": SourceOnly,
     "ground": GroundView,
     "neighbours": NeighbourViews,
-    "tilts": Tilts,
 }

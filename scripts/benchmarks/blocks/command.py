@@ -38,7 +38,7 @@ from itertools import product
 from pathlib import Path
 
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.synthetic.presets import PRESETS
+from aeromatch_cli.lab.synthetic.presets import PRESETS
 from benchmarks import options, stamps
 from benchmarks.blocks import chains
 from benchmarks.blocks.cases import COLMAP, GIVEN, Case, answer, chosen_images, count_matches, cross_pairs

@@ -22,16 +22,16 @@ from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import BROWN, as_brown, focal_px, undistort
 from aeromatch_cli.geometry.rotations import to_omega_phi_kappa
 from aeromatch_cli.geometry.two_view import Sampling, estimate
+from aeromatch_cli.lab.synthetic.flights import Flight, gsd_m, plan_flight
+from aeromatch_cli.lab.synthetic.lenses import focal_35mm, real_lens
+from aeromatch_cli.lab.synthetic.presets import PRESETS
+from aeromatch_cli.lab.synthetic.raycast import RayCaster
+from aeromatch_cli.lab.synthetic.receivers import GPS_M, RTK_M, gps_errors_m, rtk_errors_m
+from aeromatch_cli.lab.synthetic.scene import build_scene
+from aeromatch_cli.lab.synthetic.terrain import Area
 from aeromatch_cli.orientation.mapping import Group, Mapper, Observed, map_block
 from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT
 from aeromatch_cli.strategies.exporters.contents import ExportContents, PairContents
-from aeromatch_cli.synthetic.flights import Flight, gsd_m, plan_flight
-from aeromatch_cli.synthetic.lenses import focal_35mm, real_lens
-from aeromatch_cli.synthetic.presets import PRESETS
-from aeromatch_cli.synthetic.raycast import RayCaster
-from aeromatch_cli.synthetic.receivers import GPS_M, RTK_M, gps_errors_m, rtk_errors_m
-from aeromatch_cli.synthetic.scene import build_scene
-from aeromatch_cli.synthetic.terrain import Area
 from benchmarks.calibration.tracks import Keypoints, Picture, Sight, chosen, look, measured, spread
 
 Positions = Literal["gps5m", "rtk2cm", "nothing"]

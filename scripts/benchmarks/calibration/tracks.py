@@ -9,7 +9,7 @@ import numpy as np
 
 from aeromatch_cli.data import BoolArray, Camera, FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.cameras import normalise, project
-from aeromatch_cli.synthetic.raycast import RayCaster
+from aeromatch_cli.lab.synthetic.raycast import RayCaster
 
 # A point counts as seen when nothing stands more than this in front of it.
 _TOLERANCE_M = 2e-3

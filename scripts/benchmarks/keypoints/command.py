@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.config import load
-from aeromatch_cli.evaluate import RenderedTruth
+from aeromatch_cli.lab.rendered import RenderedTruth
 from benchmarks import options, stamps
 from benchmarks.keypoints.correspondence import GROUND, SOURCE, Pictures
 from benchmarks.keypoints.descriptors import DESCRIBERS, descriptor_figures

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.evaluate import RenderedTruth
 from aeromatch_cli.images.depth import to_gray8
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.rendered import RenderedTruth
 from benchmarks.peers.base import Scene
 from benchmarks.peers.ground import GroundViews
 from benchmarks.views import ImageView, away_from_unseen, filled, inside

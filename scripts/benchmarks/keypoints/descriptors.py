@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
-from aeromatch_cli.evaluate import RenderedTruth
 from aeromatch_cli.fingerprints import stable_hash
+from aeromatch_cli.lab.rendered import RenderedTruth
 from aeromatch_cli.strategies.extractors.detection import Raw
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from benchmarks.keypoints.correspondence import (

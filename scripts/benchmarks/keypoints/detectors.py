@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.evaluate import RenderedTruth
+from aeromatch_cli.lab.rendered import RenderedTruth
 from benchmarks.keypoints.correspondence import Keypoints, Picture, Pictures, in_overlap, partners
 from benchmarks.keypoints.figures import Asked
 from benchmarks.peers.base import Options

@@ -57,7 +57,7 @@ def make(table: Mapping[str, Callable[..., Any]], method: Named, options: Option
 
 
 # What figures depend on; "ours" is made by more of the package than the others.
-_CODE = (*GROUND_CODE, "benchmarks/keypoints", "strategies/extractors/pyramid.py", "evaluate/surfaces.py")
+_CODE = (*GROUND_CODE, "benchmarks/keypoints", "strategies/extractors/pyramid.py", "lab/surfaces.py")
 _OWN = "ours"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.evaluate import RenderedTruth
+from aeromatch_cli.lab.rendered import RenderedTruth
 from aeromatch_cli.strategies.extractors.pyramid import cut_patches, levels_of
 from benchmarks.keypoints.correspondence import (
     Keypoints,

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from aeromatch_cli.config import FAMILIES
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.synthetic import PRESETS
+from aeromatch_cli.lab.synthetic import PRESETS
 from benchmarks import options, stamps
 from benchmarks.methods.goals import Comparison
 from benchmarks.methods.results import PARTS, make_row, tables

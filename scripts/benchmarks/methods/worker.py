@@ -16,6 +16,7 @@ import numpy as np
 from aeromatch_cli.config import load, parse_method
 from aeromatch_cli.files import write_atomically
 from aeromatch_cli.fingerprints import fingerprint
+from aeromatch_cli.lab.strategies import add_arms
 from benchmarks.peers.base import Found, Method, Options, Scene
 from benchmarks.peers.table import PEERS, method, reads_poses
 from benchmarks.processes import fresh_process, watched
@@ -104,8 +105,9 @@ _worker: Worker | None = None
 
 
 def start(name: str, scene: Scene, options: Options) -> None:
-    """Initialise this process."""
+    """Initialise this process, whose settings can name the laboratory's strategies as well."""
     global _worker
+    add_arms()
     _worker = Worker(name, scene, options)
 
 

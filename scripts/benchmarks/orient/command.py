@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Any
 
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.synthetic import render_block
+from aeromatch_cli.lab.synthetic import render_block
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images
 from benchmarks.orient.cases import CASES, worsened

@@ -16,8 +16,8 @@ from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
 from aeromatch_cli.formats.terrain import read_terrain
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
+from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.orientation.placing import similarity
-from aeromatch_cli.synthetic import load_truth
 from benchmarks.orient.cases import ANGLES
 from benchmarks.tables import Row, plain
 

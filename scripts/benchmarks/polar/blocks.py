@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray, Pair, PairGeometry
-from aeromatch_cli.evaluate import BlockTruth, open_truth
+from aeromatch_cli.evaluate import BlockTruth
 from aeromatch_cli.evaluate.scores import PairScore
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.opening import open_truth
 from aeromatch_cli.stages.context import Context
 from benchmarks.peers.base import prepared
 from benchmarks.polar.grounds import RENDERED, block

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.evaluate import open_truth
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.opening import open_truth
 from benchmarks.scenes import render_once
 
 RENDERED, REAL = ("grass", "desert", "farmland"), ("seneca", "caliterra")

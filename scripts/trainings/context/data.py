@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aeromatch_cli.evaluate import open_truth
+from aeromatch_cli.lab.opening import open_truth
+from aeromatch_cli.lab.synthetic import load_truth
 from aeromatch_cli.stages import simulate
 from aeromatch_cli.strategies.extractors.context import coarse_of
-from aeromatch_cli.synthetic import load_truth
 from trainings.lightglue.blocks import extracted, partnered
 from trainings.lightglue.data import save_arrays
 from trainings.lightglue.sides import Partners, Seen

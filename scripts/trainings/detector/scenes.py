@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from aeromatch_cli.data import Camera
 from aeromatch_cli.geometry.cameras import calibration_matrix
 from aeromatch_cli.geometry.warps import source_from_view
+from aeromatch_cli.lab.synthetic.truth import _camera, _read_poses
+from aeromatch_cli.lab.synthetic.write import depth_path, read_raster
 from aeromatch_cli.stages import simulate
-from aeromatch_cli.synthetic.truth import _camera, _read_poses
-from aeromatch_cli.synthetic.write import depth_path, read_raster
 from trainings.lightglue.blocks import prepared
 from trainings.lightglue.data import save_arrays
 

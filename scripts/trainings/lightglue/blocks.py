@@ -18,9 +18,9 @@ import numpy as np
 from aeromatch_cli.config import load
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.formats.features import read_features
+from aeromatch_cli.lab.synthetic import Truth, load_truth
 from aeromatch_cli.stages import extract, pairs
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.synthetic import Truth, load_truth
 from trainings.lightglue.sides import Partners, Seen, partners, seen
 
 RECIPES = ((), ("simulate=none", "extract.orientation=gradient"))

@@ -14,11 +14,11 @@ from aeromatch_cli.data import BoolArray, Camera, FloatArray, View
 from aeromatch_cli.executor import Executor
 from aeromatch_cli.geometry.frames import apply_homography, homography_jacobians
 from aeromatch_cli.images.files import read_pixels
+from aeromatch_cli.lab.synthetic import load_truth
+from aeromatch_cli.lab.synthetic.truth import Truth
 from aeromatch_cli.stages import pairs
 from aeromatch_cli.strategies import ViewPixels
 from aeromatch_cli.strategies.extractors.pyramid import SUPPORT
-from aeromatch_cli.synthetic import load_truth
-from aeromatch_cli.synthetic.truth import Truth
 from trainings.lightglue import homographies
 from trainings.lightglue.blocks import prepared
 from trainings.patches.sights import Picture, Sight, sights_of

@@ -30,10 +30,10 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from aeromatch_cli.lab.synthetic.light import Light
+from aeromatch_cli.lab.synthetic.write import depth_path, read_raster, sun_path
 from aeromatch_cli.strategies.enhancers.shadow_mask import Overview, network_inputs
 from aeromatch_cli.strategies.enhancers.tone import Tone
-from aeromatch_cli.synthetic.light import Light
-from aeromatch_cli.synthetic.write import depth_path, read_raster, sun_path
 from trainings.blocks import IMAGES, LEFT_OUT, render
 from trainings.runs import at_least_one, check_recipe, load_state, save_state
 
