@@ -31,7 +31,7 @@ from aeromatch_cli.lab.strategies import add_arms
 from aeromatch_cli.lab.synthetic import block, render_block, truth
 from aeromatch_cli.lab.synthetic.raycast import RayCaster
 from aeromatch_cli.lab.synthetic.scene import build_scene
-from aeromatch_cli.orientation import process
+from aeromatch_cli.sfm import process
 
 # Under load single examples take seconds; what is too slow shows in the durations.
 settings.register_profile("unhurried", deadline=None)

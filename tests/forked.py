@@ -33,7 +33,7 @@ if multiprocessing.current_process().name != "MainProcess" or sys.argv[:1] == ["
 
 
 def run(command: Sequence[str], *, env: Mapping[str, str], **_: object) -> subprocess.CompletedProcess[str]:
-    """Of `subprocess.run`, what `orientation.process` uses: a module by name, output as text."""
+    """Of `subprocess.run`, what `sfm.process` uses: a module by name, output as text."""
     python, dash_m, module, *arguments = command
     assert (python, dash_m) == (sys.executable, "-m")
     with tempfile.TemporaryDirectory() as folder:

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import BoolArray, FloatArray, IntArray
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.adjusting import Given
-from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.projection import project
+from aeromatch_cli.sfm.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
+from aeromatch_cli.sfm.bundle.projection import project
+from aeromatch_cli.sfm.model_adjustment import Given
 
 WIDTH_PX, HEIGHT_PX = 1200, 900
 SPEED_M_S = 10.0

@@ -26,7 +26,7 @@ from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, to_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.orientation.mapping import Group, Observed, refine_block
+from aeromatch_cli.sfm.mapping import Group, Observed, adjust_block
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.strategies.exporters import Colmap, ExportContents
 
@@ -72,7 +72,7 @@ def refined(
 ) -> tuple[AdjustedBlock, list[dict[str, Any]]]:
     positions = given_positions(truth, seed + 100, 0.1)
     groups = [Group("positions", images)]
-    return refine_block(disturbed(truth, seed), Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=fixed)
+    return adjust_block(disturbed(truth, seed), Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=fixed)
 
 
 def errors(truth: Truth, adjusted: AdjustedBlock) -> tuple[FloatArray, FloatArray]:
@@ -118,7 +118,7 @@ def test_standard_deviations_are_those_of_repeated_measurements(truth: Truth) ->
 def test_surveyed_poses_stay_and_get_points(truth: Truth) -> None:
     contents = replace(disturbed(truth, 0), block=truth.block)
     groups = [Group("given", IMAGE_IDS)]
-    adjusted, _ = refine_block(contents, Observed(truth.block.poses, FOCAL_SIGMAS, {}), groups, fixed=True)
+    adjusted, _ = adjust_block(contents, Observed(truth.block.poses, FOCAL_SIGMAS, {}), groups, fixed=True)
     off_m, off_deg = errors(truth, adjusted)
     assert np.abs(off_m).max() < 1e-9
     assert off_deg.max() < 1e-5
@@ -148,7 +148,7 @@ def test_groups_that_matches_tie_become_one(truth: Truth) -> None:
     apart = replace(contents, block=replace(contents.block, poses=poses))
     groups = [Group("positions", ("img0", "img1", "img3")), Group("level", ("img2", "img4", "img5"))]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
-    adjusted, figures = refine_block(apart, observed, groups, fixed=False)
+    adjusted, figures = adjust_block(apart, observed, groups, fixed=False)
     assert [(one.kind, one.images) for one in figures] == [("positions", 6)]
     off_m, off_deg = errors(truth, adjusted)
     assert np.abs(off_m).max() < 0.5
@@ -174,7 +174,7 @@ def test_every_group_ties_its_images_outside(truth: Truth) -> None:
     positions |= {ids[i]: pose for i, pose in given_positions(again, 101, 0.1).items()}
     groups = [Group("positions", IMAGE_IDS[:5]), Group("positions", tuple(ids[i] for i in IMAGE_IDS[:5]))]
     contents = ExportContents(block, keypoints.__getitem__, (*truth.pairs, *pairs))
-    adjusted, figures = refine_block(contents, Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=False)
+    adjusted, figures = adjust_block(contents, Observed(positions, FOCAL_SIGMAS, {}), groups, fixed=False)
     assert [one.registered for one in figures] == [["img5"], ["otherimg5"]]
     for image_id in ("img5", "otherimg5"):
         true = truth.block.poses["img5"]
@@ -195,7 +195,7 @@ def test_tilts_given_with_wrong_headings_level_no_block(truth: Truth, turned_deg
     }  # fmt: skip
     angles = {i: Angles("omega_phi_kappa", to_omega_phi_kappa(rotation), True) for i, rotation in leaning.items()}
     groups = [Group("positions", IMAGE_IDS)]
-    adjusted, _ = refine_block(disturbed(truth, 0), Observed(positions, FOCAL_SIGMAS, angles), groups, fixed=False)
+    adjusted, _ = adjust_block(disturbed(truth, 0), Observed(positions, FOCAL_SIGMAS, angles), groups, fixed=False)
     ups = [pose.rotation.T @ truth.block.poses[i].world_rotation[:, 2] for i, pose in adjusted.poses.items()]
     off_deg = float(np.rad2deg(np.arccos(np.mean(ups, axis=0)[2])))
     assert (off_deg > 2.5) is used
@@ -208,7 +208,7 @@ def test_two_groups_are_both_adjusted(truth: Truth) -> None:
     apart = [p for p in truth.pairs if sides[p.pair.image_id0] == sides[p.pair.image_id1]]
     groups = [Group("positions", ("img0", "img1", "img3", "img4")), Group("positions", ("img2", "img5"))]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
-    adjusted, figures = refine_block(replace(contents, pairs=apart), observed, groups, fixed=False)
+    adjusted, figures = adjust_block(replace(contents, pairs=apart), observed, groups, fixed=False)
     assert [one.images for one in figures] == [4, 2]
     assert sorted(adjusted.poses) == list(IMAGE_IDS)
     seen = np.concatenate([track[:, 1] for track in adjusted.tracks.values()])
@@ -219,7 +219,7 @@ def test_a_group_whose_images_share_no_point_is_left_out(truth: Truth) -> None:
     contents, groups = disturbed(truth, 0), [Group("positions", IMAGE_IDS[:4]), Group("positions", IMAGE_IDS[4:])]
     within = [p for p in truth.pairs if {p.pair.image_id0, p.pair.image_id1} <= set(IMAGE_IDS[:4])]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
-    adjusted, figures = refine_block(replace(contents, pairs=within), observed, groups, fixed=False)
+    adjusted, figures = adjust_block(replace(contents, pairs=within), observed, groups, fixed=False)
     assert [one.images for one in figures] == [4]
     assert sorted(adjusted.poses) == list(IMAGE_IDS[:4])
 
@@ -248,7 +248,7 @@ def test_groups_share_their_cameras(truth: Truth) -> None:
     ]
     doubled = ExportContents(both, keypoints.__getitem__, (*truth.pairs, *more))
     groups = [Group("positions", IMAGE_IDS), Group("positions", tuple(names.values()))]
-    adjusted, figures = refine_block(doubled, Observed(moved(given), FOCAL_SIGMAS, {}), groups, fixed=False)
+    adjusted, figures = adjust_block(doubled, Observed(moved(given), FOCAL_SIGMAS, {}), groups, fixed=False)
     assert [one.images for one in figures] == [6, 6]
     for group, figure in zip(groups, figures, strict=True):
         off_px = []
@@ -266,8 +266,8 @@ def test_positions_do_not_pull_a_group_in_a_frame_of_its_own(truth: Truth) -> No
         i: replace(p, center_m=p.center_m * [-1.0, 1.0, 1.0]) for i, p in given_positions(truth, 1, 0.1).items()
     }
     groups = [Group("level", IMAGE_IDS)]
-    adjusted, _ = refine_block(disturbed(truth, 0), Observed(mirrored, FOCAL_SIGMAS, {}), groups, fixed=False)
-    free, _ = refine_block(disturbed(truth, 0), Observed({}, FOCAL_SIGMAS, {}), groups, fixed=False)
+    adjusted, _ = adjust_block(disturbed(truth, 0), Observed(mirrored, FOCAL_SIGMAS, {}), groups, fixed=False)
+    free, _ = adjust_block(disturbed(truth, 0), Observed({}, FOCAL_SIGMAS, {}), groups, fixed=False)
     for image_id, pose in adjusted.poses.items():
         np.testing.assert_allclose(pose.center_m, free.poses[image_id].center_m, atol=1e-9)
         np.testing.assert_allclose(pose.sigmas_m, free.poses[image_id].sigmas_m, atol=1e-12)
@@ -277,7 +277,7 @@ def test_no_image_is_in_two_groups(truth: Truth) -> None:
     """The matches tie all images: the second group stays by itself, the image in neither is tied to the first."""
     groups = [Group("positions", IMAGE_IDS[:2]), Group("positions", IMAGE_IDS[2:5])]
     observed = Observed(given_positions(truth, 1, 0.1), FOCAL_SIGMAS, {})
-    adjusted, figures = refine_block(disturbed(truth, 0), observed, groups, fixed=False)
+    adjusted, figures = adjust_block(disturbed(truth, 0), observed, groups, fixed=False)
     assert sum(one.images for one in figures) == len(adjusted.poses) <= len(IMAGE_IDS)
     seen = np.bincount(np.concatenate([track[:, 1] for track in adjusted.tracks.values()]))
     assert (seen >= 2).all()
@@ -374,7 +374,7 @@ def test_matches_are_exported_where_the_adjustment_fails(done_site: Site, monkey
     def stops(*_: object, **__: object) -> None:
         raise InputError("pycolmap's bundle adjustment stopped with exit code -6: Check failed")
 
-    monkeypatch.setattr(adjust, "refine_block", stops)
+    monkeypatch.setattr(adjust, "adjust_block", stops)
     outcome = done_site("run", "--overwrite")
     assert outcome.code == 1
     assert done_site.failures() == [("adjust", "all images")]
@@ -412,7 +412,7 @@ def test_a_point_has_one_keypoint_in_each_image(truth: Truth) -> None:
     groups = [Group("positions", IMAGE_IDS)]
     observed = Observed(given_positions(truth, 4, 0.1), FOCAL_SIGMAS, {})
     twice = replace(contents, keypoints_px=keypoints.__getitem__, pairs=tuple(pairs))
-    adjusted, _ = refine_block(twice, observed, groups, fixed=False)
+    adjusted, _ = adjust_block(twice, observed, groups, fixed=False)
     track = adjusted.tracks["img0"]
     assert len(np.unique(track[:, 1])) == len(track) > 50
     for other in adjusted.tracks.values():

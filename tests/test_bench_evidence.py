@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from benchmarks.evidence import draw, main, table_of, with_expected
 
-from aeromatch_cli.stages.evidence import Evidence, columns
+from aeromatch_cli.stages.pair_statistics import PairStatistics, columns
 from aeromatch_cli.strategies.steps import LearnedFeatures
 
 
@@ -30,7 +30,7 @@ def test_gains_and_errors_are_of_sums_and_of_logarithms() -> None:
 
 
 def test_what_is_expected_is_what_the_step_expects() -> None:
-    pair = Evidence(300, 0.6, 0.9, 1500, 500, 20.0)
+    pair = PairStatistics(300, 0.6, 0.9, 1500, 500, 20.0)
     known = columns(pair, 1000)
     assert known is not None
     row = {"block": "x", "step": "learned", "columns": known.tolist(), "before": 300, "found": 700}

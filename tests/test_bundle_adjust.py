@@ -19,11 +19,11 @@ from make_networks import (
 )
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.orientation.bundle.adjust import Options, adjust
-from aeromatch_cli.orientation.bundle.covariance import pose_sigmas
-from aeromatch_cli.orientation.bundle.network import LENS, Network, Unknowns
-from aeromatch_cli.orientation.bundle.projection import project
-from aeromatch_cli.orientation.bundle.shared import lenses_if_freed
+from aeromatch_cli.sfm.bundle.adjust import Options, adjust
+from aeromatch_cli.sfm.bundle.covariance import pose_sigmas
+from aeromatch_cli.sfm.bundle.network import LENS, Network, Unknowns
+from aeromatch_cli.sfm.bundle.projection import project
+from aeromatch_cli.sfm.bundle.shared import lenses_if_freed
 
 FINAL, ROUGH = Options(1e-6, final=True), Options(1e-4, final=False)
 SEEDS = pytest.mark.parametrize("seed", range(3))

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.bundle import covariance as deviations
-from aeromatch_cli.orientation.bundle.covariance import _free_movements, covariance, lens_correlations, pose_sigmas
-from aeromatch_cli.orientation.bundle.network import LENS, Network, Unknowns
-from aeromatch_cli.orientation.bundle.normal_equations import equations, reduced
-from aeromatch_cli.orientation.bundle.projection import project
-from aeromatch_cli.orientation.bundle.solve import solve
+from aeromatch_cli.sfm.bundle import covariance as deviations
+from aeromatch_cli.sfm.bundle.covariance import _free_movements, covariance, lens_correlations, pose_sigmas
+from aeromatch_cli.sfm.bundle.network import LENS, Network, Unknowns
+from aeromatch_cli.sfm.bundle.normal_equations import equations, reduced
+from aeromatch_cli.sfm.bundle.projection import project
+from aeromatch_cli.sfm.bundle.solve import solve
 
 SIGMA_PX, REPEATED = 0.5, 40
 

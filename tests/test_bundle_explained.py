@@ -20,9 +20,9 @@ from make_networks import (
     with_positions,
 )
 
-from aeromatch_cli.orientation.bundle.adjust import Adjusted, Options, adjust
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.projection import project
+from aeromatch_cli.sfm.bundle.adjust import Adjusted, Options, adjust
+from aeromatch_cli.sfm.bundle.network import LENS, READOUT, Network, Unknowns
+from aeromatch_cli.sfm.bundle.projection import project
 
 RTK_M = 0.02
 FINAL = Options(1e-6, final=True)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.orientation.bundle.factors import Factors
+from aeromatch_cli.sfm.bundle.factors import Factors
 
 
 def coupled(places: FloatArray, last: int, reach: float, seed: int) -> FloatArray:

@@ -12,13 +12,13 @@ from make_networks import given_positions
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry.cameras import BROWN, FISHEYE, MODELS, colmap_camera, parameters
-from aeromatch_cli.orientation.adjusting import Given, Work, _network, intersect, state_errors
-from aeromatch_cli.orientation.bundle.adjust import Options
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT
-from aeromatch_cli.orientation.bundle.of_model import image_numbers, image_points, lens_of, set_lens, take, unknowns_of
-from aeromatch_cli.orientation.bundle.projection import project
-from aeromatch_cli.orientation.calibration import Calibration, LensPrior, camera_of, freed, held_by, lens_prior
-from aeromatch_cli.orientation.calibration import lens_of as lens_of_camera
+from aeromatch_cli.sfm.bundle.adjust import Options
+from aeromatch_cli.sfm.bundle.network import LENS, READOUT
+from aeromatch_cli.sfm.bundle.of_model import image_numbers, image_points, lens_of, set_lens, take, unknowns_of
+from aeromatch_cli.sfm.bundle.projection import project
+from aeromatch_cli.sfm.calibration import Calibration, LensPrior, camera_of, freed, held_by, lens_prior
+from aeromatch_cli.sfm.calibration import lens_of as lens_of_camera
+from aeromatch_cli.sfm.model_adjustment import Given, Work, _network, intersect, state_errors
 
 zlib.compress(b"")  # pycolmap aborts the process when it is imported before zlib was used
 import pycolmap  # noqa: E402

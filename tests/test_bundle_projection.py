@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import Camera, FloatArray
 from aeromatch_cli.geometry import cameras
-from aeromatch_cli.orientation.bundle.network import LENS, READOUT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.projection import project, project_with_derivatives
+from aeromatch_cli.sfm.bundle.network import LENS, READOUT, Network, Unknowns
+from aeromatch_cli.sfm.bundle.projection import project, project_with_derivatives
 
 BROWN = lens(f=980.0, cx=610.0, cy=430.0, k1=-0.1, k2=0.06, k3=-0.02, p1=0.002, p2=-0.001, b1=3.0, b2=-2.0)
 FISHEYE = lens(f=700.0, cx=590.0, cy=460.0, k1=0.04, k2=-0.02, k3=0.01, p1=-0.003, b1=-4.0)

@@ -24,8 +24,8 @@ from scipy import linalg, sparse
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg
-from aeromatch_cli.orientation.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
-from aeromatch_cli.orientation.bundle.normal_equations import (
+from aeromatch_cli.sfm.bundle.network import FLIGHT, LENS, MOUNT, Network, Unknowns
+from aeromatch_cli.sfm.bundle.normal_equations import (
     Equations,
     Layout,
     cost,
@@ -33,7 +33,7 @@ from aeromatch_cli.orientation.bundle.normal_equations import (
     reduced,
     residuals_in_sigmas,
 )
-from aeromatch_cli.orientation.bundle.solve import _solution, solve
+from aeromatch_cli.sfm.bundle.solve import _solution, solve
 
 EXACT = 1e-14
 

@@ -15,10 +15,10 @@ from aeromatch_cli.blocks.cameras import FOCAL_SIGMAS
 from aeromatch_cli.data import AdjustedBlock, Camera, ControlPoint, FloatArray
 from aeromatch_cli.geometry.cameras import focal_px, project
 from aeromatch_cli.lab.synthetic.lenses import real_lens
-from aeromatch_cli.orientation.calibration import lens_of
-from aeromatch_cli.orientation.mapping import Group, refine_block
-from aeromatch_cli.orientation.residuals import residuals_of
-from aeromatch_cli.orientation.shutter import at_once
+from aeromatch_cli.sfm.calibration import lens_of
+from aeromatch_cli.sfm.mapping import Group, adjust_block
+from aeromatch_cli.sfm.residuals import residuals_of
+from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
 pytestmark = pytest.mark.slow
@@ -32,7 +32,7 @@ Start = tuple[ExportContents, list[Group]]
 def adjusted(block: SimulatedBlock, start: Start | None = None, **given: Any) -> tuple[AdjustedBlock, dict[str, Any]]:
     """The block adjusted from a first pass of its own matches, unless one is given, and the facts of its one group."""
     contents, groups = start or mapped(block)
-    found, [facts] = refine_block(contents, replace(block.observed, **given), groups, fixed=False)
+    found, [facts] = adjust_block(contents, replace(block.observed, **given), groups, fixed=False)
     return found, facts
 
 

@@ -14,8 +14,8 @@ from aeromatch_cli.geometry.prediction import homogeneous
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
 from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
 from aeromatch_cli.geometry.warps import source_from_view, undistorted_from_ground, view_from_source
-from aeromatch_cli.orientation.focal import with_focal_length
-from aeromatch_cli.orientation.resection import _resection
+from aeromatch_cli.sfm.focal import with_focal_length
+from aeromatch_cli.sfm.resection import _resection
 
 # A skew of 60 px for each unit downwards is more than any lens has: left out, it would turn rays by degrees.
 LENSES = [

@@ -19,7 +19,7 @@ from aeromatch_cli.formats.rows import MatchEntry, VerifiedEntry, read_verified_
 from aeromatch_cli.geometry.coverage import CELLS, covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter  # noqa: A004
 from aeromatch_cli.stages.cascade import _tried, _untied, keypoints_of, strategies_of
-from aeromatch_cli.stages.evidence import Evidence
+from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.union import joined_keypoints, joined_matches
 from aeromatch_cli.strategies.extractors.described import Described
@@ -67,11 +67,12 @@ def test_without_attitudes_no_overlap_is_known() -> None:
 
 def test_an_image_that_nothing_ties_is_tried_with_three_partners() -> None:
     """x has no verified match: of its four pairs those with most candidates go on; a-b is tied, whatever its count."""
-    found = {("a", "b"): Evidence(5, 0.5, 0.1, MANY, 9)}
+    found = {("a", "b"): PairStatistics(5, 0.5, 0.1, MANY, 9)}
     found |= {
-        (name, "x"): Evidence(0, np.nan, np.nan, MANY, count) for name, count in zip("abcd", (8, 2, 9, 5), strict=True)
+        (name, "x"): PairStatistics(0, np.nan, np.nan, MANY, count)
+        for name, count in zip("abcd", (8, 2, 9, 5), strict=True)
     }
-    found[("c", "d")] = Evidence(700, 0.5, 0.9, MANY, 900)
+    found[("c", "d")] = PairStatistics(700, 0.5, 0.9, MANY, 900)
     left = {key: "few" for key in found if key != ("c", "d")}
     assert set(_tried(left, found)) == {("a", "b"), ("a", "x"), ("c", "x"), ("d", "x")}
 

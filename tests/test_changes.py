@@ -5,7 +5,7 @@ from __future__ import annotations
 from conftest import Site, invoke
 
 from aeromatch_cli.config import dump, load
-from aeromatch_cli.stages.changes import changed_words
+from aeromatch_cli.stages.settings_diff import changed_words
 
 
 def test_changed_settings_and_the_first_stage_that_reads_them_are_named(tmp_path) -> None:

@@ -8,8 +8,8 @@ import pytest
 from make_results import filled
 
 from aeromatch_cli.results.stages import BlockResults
-from aeromatch_cli.stages.closing import closing_lines
 from aeromatch_cli.stages.quality import quality_of
+from aeromatch_cli.stages.result_summary import closing_lines
 
 NAMES = {i: f"{i}.jpg" for i in "abcd"}
 # Of a group whose four positions are met as stated.

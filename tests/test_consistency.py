@@ -19,8 +19,8 @@ from aeromatch_cli.formats.dropped import read_dropped, write_dropped
 from aeromatch_cli.geometry.cameras import project, world_rays
 from aeromatch_cli.geometry.epipolar import essential, relative_pose, triangulate
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.alone import block_of_pair
-from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.sfm.two_view_poses import block_of_pair
 
 LIMITS = Limits(epipolar_px=1.5, medians=4.0, third_px=4.0)
 WRONG = 12

@@ -21,10 +21,10 @@ from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.orientation.control import control_figures
 from aeromatch_cli.results.adjustment import Control, ControlInGroup
+from aeromatch_cli.sfm.control import control_figures
 from aeromatch_cli.stages import adjust
-from aeromatch_cli.stages.lines import control_words
+from aeromatch_cli.stages.messages import control_words
 
 IMAGES = (Image("a_jpg", "sub/a.jpg", 100, 80, "1"), Image("b_jpg", "b.jpg", 100, 80, "1"))
 

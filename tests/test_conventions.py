@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from aeromatch_cli.geometry.angles import Angles
 from aeromatch_cli.geometry.rotations import angle_between_deg, rotation_z
-from aeromatch_cli.orientation.conventions import recognised
+from aeromatch_cli.sfm.conventions import recognised
 
 IMAGES = 24
 

@@ -9,7 +9,7 @@ import pytest
 
 from aeromatch_cli.data import FloatArray, IntArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
-from aeromatch_cli.orientation.dem import (
+from aeromatch_cli.sfm.dem import (
     GroundPoints,
     Terrain,
     _height_sigmas_m,
@@ -17,7 +17,7 @@ from aeromatch_cli.orientation.dem import (
     terrain_of,
     terrains_of,
 )
-from aeromatch_cli.orientation.judgement import PairPoints
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
 
 CAMERA = from_colmap("PINHOLE", 1000, 800, (900.0, 900.0, 500.0, 400.0))
 STRAIGHT_DOWN = np.diag([1.0, -1.0, -1.0])

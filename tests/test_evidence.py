@@ -9,42 +9,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeromatch_cli.stages.evidence import Evidence, columns, expected_number, fitted_weights, log_error
+from aeromatch_cli.stages.pair_statistics import PairStatistics, columns, expected_number, fitted_weights, log_error
 from aeromatch_cli.strategies.steps import GuidedSearch, LearnedFeatures, LiftedShadows
 
 MANY = 8000
 # A pair of a nadir block with enough matches.
-USUAL = Evidence(700, 0.6, 0.9, 4000, 1200, 20.0)
+USUAL = PairStatistics(700, 0.6, 0.9, 4000, 1200, 20.0)
 STEP = LearnedFeatures(below_matches=600, below_coverage=0.7)
 
 
 @pytest.mark.parametrize(
     ("evidence", "reason"),
     [
-        (Evidence(300, 0.5, 0.9, MANY), ""),
-        (Evidence(299, 0.5, 0.9, MANY), "299 verified matches of 300 that an overlap of 50 % promises"),
-        (Evidence(60, 0.2, 0.1, MANY), ""),
-        (Evidence(59, 0.2, 0.1, MANY), "59 verified matches of 60 that an overlap of 20 % promises"),
-        (Evidence(29, 0.01, 1.0, MANY), "29 verified matches of 30 that an overlap of 1 % promises"),
-        (Evidence(900, 0.5, 0.55, MANY), "verified matches in 55 % of the overlap"),
-        (Evidence(600, np.nan, np.nan, MANY), ""),
+        (PairStatistics(300, 0.5, 0.9, MANY), ""),
+        (PairStatistics(299, 0.5, 0.9, MANY), "299 verified matches of 300 that an overlap of 50 % promises"),
+        (PairStatistics(60, 0.2, 0.1, MANY), ""),
+        (PairStatistics(59, 0.2, 0.1, MANY), "59 verified matches of 60 that an overlap of 20 % promises"),
+        (PairStatistics(29, 0.01, 1.0, MANY), "29 verified matches of 30 that an overlap of 1 % promises"),
+        (PairStatistics(900, 0.5, 0.55, MANY), "verified matches in 55 % of the overlap"),
+        (PairStatistics(600, np.nan, np.nan, MANY), ""),
         (
-            Evidence(599, float("nan"), float("nan"), MANY),
+            PairStatistics(599, float("nan"), float("nan"), MANY),
             "599 verified matches of 600 that are enough, overlap unknown",
         ),
-        (Evidence(30, 0.0, np.nan, MANY), "30 verified matches of 600 that are enough, no overlap predicted"),
+        (PairStatistics(30, 0.0, np.nan, MANY), "30 verified matches of 600 that are enough, no overlap predicted"),
         # A quarter of 2000 keypoints, a quarter of the matches.
-        (Evidence(75, 0.5, 0.9, 500), ""),
-        (Evidence(74, 0.5, 0.9, 500), "74 verified matches of 75 that an overlap of 50 % promises"),
+        (PairStatistics(75, 0.5, 0.9, 500), ""),
+        (PairStatistics(74, 0.5, 0.9, 500), "74 verified matches of 75 that an overlap of 50 % promises"),
     ],
 )
-def test_a_pair_goes_on_where_it_falls_short_of_its_overlap(evidence: Evidence, reason: str) -> None:
+def test_a_pair_goes_on_where_it_falls_short_of_its_overlap(evidence: PairStatistics, reason: str) -> None:
     assert evidence.lacks(STEP) == reason
 
 
 @pytest.mark.parametrize(("keypoints", "nothing"), [(0, True), (29, True), (30, False)])
 def test_an_image_without_keypoints_shows_nothing(keypoints: int, nothing: bool) -> None:
-    assert Evidence(0, 0.5, 0.0, keypoints).shows_nothing == nothing
+    assert PairStatistics(0, 0.5, 0.0, keypoints).shows_nothing == nothing
 
 
 def test_nothing_is_expected_where_overlap_or_angle_are_unknown_or_the_step_has_no_weights() -> None:
@@ -59,7 +59,7 @@ def test_weights_of_an_exact_law_are_found_again() -> None:
     """After = 3 x (verified + 10)^0.5 x (keypoints in the overlap + 10)^0.25."""
     rng = np.random.default_rng(3)
     pairs = [
-        Evidence(int(n), float(s), 0.9, int(k), 0, float(a))
+        PairStatistics(int(n), float(s), 0.9, int(k), 0, float(a))
         for n, s, k, a in zip(
             rng.integers(0, 3000, 400), rng.uniform(0.1, 1, 400), rng.integers(100, 8000, 400),
             rng.uniform(0, 90, 400), strict=True,
@@ -75,7 +75,7 @@ def test_weights_of_an_exact_law_are_found_again() -> None:
 
 @given(st.integers(0, 5000), st.floats(0.05, 1.0), st.integers(30, MANY), st.floats(0.0, 90.0))
 def test_more_matches_promise_more_after_the_step(verified: int, overlap: float, keypoints: int, angle: float) -> None:
-    pair = Evidence(verified, overlap, 0.9, keypoints, 0, angle)
+    pair = PairStatistics(verified, overlap, 0.9, keypoints, 0, angle)
     for step in (GuidedSearch(), LearnedFeatures()):
         expected = pair.expected(step, 4000)
         assert 0.0 <= expected < replace(pair, verified=verified + 50).expected(step, 4000)

@@ -11,7 +11,7 @@ from test_soundness import model_of
 
 from aeromatch_cli.blocks.crs import grid_from_geographic, utm_crs
 from aeromatch_cli.data import Block, Pose
-from aeromatch_cli.stages.exchanged import exchanged_columns
+from aeromatch_cli.stages.swapped_axes import exchanged_columns
 
 TRUTH = flight()
 ZONE = "EPSG:32633"

@@ -11,11 +11,11 @@ import pytest
 from make_networks import given_positions
 
 from aeromatch_cli.data import Camera, FloatArray
-from aeromatch_cli.orientation.adjusting import Work, adjusted, state_errors
-from aeromatch_cli.orientation.bundle.adjust import Options
-from aeromatch_cli.orientation.bundle.of_model import image_numbers
-from aeromatch_cli.orientation.calibration import freed, lens_prior
-from aeromatch_cli.orientation.results import BEHIND_PX, centers_of, points_of
+from aeromatch_cli.sfm.bundle.adjust import Options
+from aeromatch_cli.sfm.bundle.of_model import image_numbers
+from aeromatch_cli.sfm.calibration import freed, lens_prior
+from aeromatch_cli.sfm.model_adjustment import Work, adjusted, state_errors
+from aeromatch_cli.sfm.model_arrays import BEHIND_PX, centers_of, points_of
 
 FOCAL_PX, HEIGHT_M, COLUMNS, ROWS = 200.0, 100.0, 6, 5
 CENTERS_M = np.array([[24.0 * column, -24.0 * row, HEIGHT_M] for row in range(ROWS) for column in range(COLUMNS)])

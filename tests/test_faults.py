@@ -10,7 +10,7 @@ import pytest
 from conftest import IMAGES, Site
 
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.orientation import process
+from aeromatch_cli.sfm import process
 from aeromatch_cli.stages import adjust, models
 
 FAULT = "stopped with exit code -11: segmentation fault"
@@ -41,7 +41,7 @@ def test_after_a_failed_adjustment_matches_are_judged_again(done_site: Site, mon
     assert done_site("adjust", *judged).code == 0
     dropped = (done_site.work / "orientation" / "dropped.npz").read_bytes()
     with monkeypatch.context() as faulty:
-        faulty.setattr(adjust, "refine_block", stops)
+        faulty.setattr(adjust, "adjust_block", stops)
         assert done_site("adjust", *judged, "--overwrite").code == 1
     assert (done_site.work / "orientation" / "dropped.npz").read_bytes() != dropped
     assert done_site("adjust", *judged).code == 0
@@ -59,6 +59,6 @@ def test_a_process_has_one_thread_whatever_ran_before(tmp_path: Path, monkeypatc
     monkeypatch.setattr(process.subprocess, "run", run)
     for threads in ("1", "8"):
         monkeypatch.setenv("OMP_NUM_THREADS", threads)
-        process.run_process("mapper", tmp_path, "result", "mapping")
+        process.run_process("mapping_process", tmp_path, "result", "mapping")
     assert [env["OMP_NUM_THREADS"] for env in seen] == ["1", "1"]
     assert seen[0]["PATH"] == os.environ["PATH"]

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.orientation.adjusting import Work, adjusted
-from aeromatch_cli.orientation.bundle.adjust import Options
-from aeromatch_cli.orientation.bundle.network import LENS
-from aeromatch_cli.orientation.flips import Upright, _Other, other_pose, turned_back
-from aeromatch_cli.orientation.placing import Placement
+from aeromatch_cli.sfm.bundle.adjust import Options
+from aeromatch_cli.sfm.bundle.network import LENS
+from aeromatch_cli.sfm.georeferencing import Placement
+from aeromatch_cli.sfm.model_adjustment import Work, adjusted
+from aeromatch_cli.sfm.planar_ambiguity import Upright, _Other, other_pose, turned_back
 
 # Straight down from 100 m; the last two, with a long lens, from 400 m away and 25 degrees off the vertical.
 NEAR_M = np.array([[-30, 0, 100], [0, 5, 105], [30, -5, 95], [-15, 20, 100], [15, -25, 102]], float)

@@ -10,8 +10,8 @@ from aeromatch_cli.blocks.exif import ExifFacts
 from aeromatch_cli.data import Camera, Pose
 from aeromatch_cli.geometry.cameras import focal_px, project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.focal import better_cameras, with_focal_length
-from aeromatch_cli.orientation.judgement import PairPoints
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
+from aeromatch_cli.sfm.focal import better_cameras, with_focal_length
 
 TRUE = Camera("SIMPLE_PINHOLE", 1000, 750, (900.0, 499.5, 374.5))
 

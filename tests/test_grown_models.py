@@ -11,10 +11,10 @@ from test_soundness import model_of
 
 from aeromatch_cli.data import Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
-from aeromatch_cli.orientation.growth import grown
-from aeromatch_cli.orientation.judgement import PairPoints
-from aeromatch_cli.orientation.mapping import Model
-from aeromatch_cli.orientation.soundness import sound_part
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
+from aeromatch_cli.sfm.mapping import Model
+from aeromatch_cli.sfm.model_extension import grown
+from aeromatch_cli.sfm.model_validation import sound_part
 
 TRUTH = flight()
 STRIP = {i: pose for i, pose in TRUTH.items() if i[1] == "2"}

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from aeromatch_cli.data import BoolArray, FloatArray
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.placing import height_steps_m
+from aeromatch_cli.sfm.georeferencing import height_steps_m
 
 STEP_M, SPACING_M = 15.0, 60.0
 MODEL_FROM_WORLD = from_omega_phi_kappa(40.0, -25.0, 110.0)

@@ -24,11 +24,11 @@ from aeromatch_cli.blocks.pose_files import read_pose_file
 from aeromatch_cli.blocks.read import GivenHeights
 from aeromatch_cli.data import Image, Pose
 from aeromatch_cli.errors import ConfigError
-from aeromatch_cli.orientation.dem import Terrain
-from aeromatch_cli.orientation.heights import shift_of_points_m, shift_to_control_m
-from aeromatch_cli.orientation.quality import Evidence, judged
 from aeromatch_cli.results.adjustment import GroupResult
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
+from aeromatch_cli.sfm.dem import Terrain
+from aeromatch_cli.sfm.heights import shift_of_points_m, shift_to_control_m
+from aeromatch_cli.sfm.quality import QualityInput, judged
 from aeromatch_cli.stages.adjust import height_remarks
 from aeromatch_cli.stages.ground import judged_ground
 
@@ -269,7 +269,7 @@ def test_the_offset_of_positions_to_control_is_told() -> None:
 
 def test_an_offset_that_control_points_explain_is_no_doubt() -> None:
     def level(one: dict[str, Any]) -> list[str]:
-        found = judged(Evidence(images=24, adjust=AdjustResult(images=24, positions_given=24, groups=[one])))
+        found = judged(QualityInput(images=24, adjust=AdjustResult(images=24, positions_given=24, groups=[one])))
         return [finding.level for finding in found.findings if finding.what == "shift of a flight"]
 
     assert level(group((0.01, -0.03, 45.3))) == ["good"]
@@ -292,7 +292,7 @@ def test_the_offset_of_check_points_is_told_and_named() -> None:
     }  # fmt: skip
     groups = [{"kind": "positions", "images": 12, "control": inside}]
     adjusted = {"images": 12, "positions_given": 12, "groups": groups}
-    found = judged(filled(Evidence, images=12, adjust=adjusted | {"control": control}))
+    found = judged(filled(QualityInput, images=12, adjust=adjusted | {"control": control}))
     (named,) = [finding for finding in found.findings if finding.what == "heights of surveyed points"]
     assert named.level == "doubtful"
     assert (
@@ -302,5 +302,5 @@ def test_the_offset_of_check_points_is_told_and_named() -> None:
     (points,) = [finding for finding in found.findings if finding.what == "check points"]
     assert points.level == "good"  # but for the offset they are met to 0.06 m
     control = {**control, "residuals": {name: [0.0, 0.0, 7.0 * n] for n, name in enumerate(errors_m)}}
-    found = judged(filled(Evidence, images=12, adjust=adjusted | {"control": control}))
+    found = judged(filled(QualityInput, images=12, adjust=adjusted | {"control": control}))
     assert next(finding for finding in found.findings if finding.what == "check points").level == "bad"

@@ -7,7 +7,7 @@ import pytest
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa
-from aeromatch_cli.orientation.joining import Part, common_similarity, joined
+from aeromatch_cli.sfm.group_merging import Part, common_similarity, joined
 
 POINTS = 200
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from aeromatch_cli.data import FloatArray, Pose
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z, tilt_deg
-from aeromatch_cli.orientation.judgement import PairPoints, explained_images, explained_share, grouped_images
-from aeromatch_cli.orientation.placing import _COMMON, LOCAL_FLYING_HEIGHT, _common, place, similarity
-from aeromatch_cli.orientation.resection import resected
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints, explained_images, explained_share, grouped_images
+from aeromatch_cli.sfm.georeferencing import _COMMON, LOCAL_FLYING_HEIGHT, _common, place, similarity
+from aeromatch_cli.sfm.resection import resected
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, -0.03))
 ROWS, COLUMNS = 3, 4

@@ -11,8 +11,7 @@ from test_flips import built, centers_of
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.rotations import angle_between_deg, from_omega_phi_kappa, rotation_z
-from aeromatch_cli.orientation.adjusting import believed_tilts
-from aeromatch_cli.orientation.placing import (
+from aeromatch_cli.sfm.georeferencing import (
     Placement,
     _levelled,
     _Measured,
@@ -24,6 +23,7 @@ from aeromatch_cli.orientation.placing import (
     place,
     similarity,
 )
+from aeromatch_cli.sfm.model_adjustment import believed_tilts
 
 # Three images in a row, 200 m above the ground.
 CENTERS_M = np.array([[-46.0, -11.0, 200.0], [0.0, -2.0, 201.0], [47.0, 10.0, 198.0]])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.data import FloatArray
-from aeromatch_cli.orientation.probability import (
+from aeromatch_cli.sfm.probability import (
     WEIGHTS,
     MatchEvidence,
     columns,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from make_results import filled
 
-from aeromatch_cli.orientation.quality import Evidence, Finding, Quality, judged, plain
+from aeromatch_cli.sfm.quality import Finding, Quality, QualityInput, judged, plain
 
 CALIBRATED = {"images": 12, "correlations": [], "parameters": {
     "f": [3010.0, 1.0, 3000.0, 30.0], "cx": [2005.0, 0.4, 1999.5, 80.0], "k1": [-0.01, 0.001, 0.0, 0.05],
@@ -30,11 +30,13 @@ ADJUSTED: dict[str, Any] = {
 
 
 def judged_with(group: dict[str, Any] | None = None, **evidence: Any) -> Quality:
-    """The sound block with changes. group: of its only group, evidence: `adjust` and fields of `Evidence`."""
+    """The sound block with changes. group: of its only group, evidence: `adjust` and fields of `QualityInput`."""
     adjusted = deepcopy(ADJUSTED) | evidence.pop("adjust", {})
     if group is not None:
         adjusted["groups"] = [deepcopy(GROUP) | group]
-    return judged(filled(Evidence, {"images": 12, "adjust": adjusted, "components": [12], "refined": True, **evidence}))
+    return judged(
+        filled(QualityInput, {"images": 12, "adjust": adjusted, "components": [12], "refined": True, **evidence})
+    )
 
 
 def found(quality: Quality, what: str) -> Finding:

@@ -25,7 +25,7 @@ from aeromatch_cli.geometry.level import level_affinities
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.images.source import Source
 from aeromatch_cli.lab.opening import open_truth
-from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
+from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages import measuring
 from aeromatch_cli.stages.measuring import _far_inside
 from aeromatch_cli.strategies.refiners.least_squares import PATCH_HALF_PX, LeastSquares, Patches

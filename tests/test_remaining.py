@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aeromatch_cli.data import AdjustedBlock
-from aeromatch_cli.orientation.remaining import JudgedPair, without_dropped
+from aeromatch_cli.sfm.track_pruning import JudgedPair, without_dropped
 
 
 def block(**tracks: list[tuple[int, int]]) -> AdjustedBlock:

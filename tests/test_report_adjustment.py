@@ -8,9 +8,9 @@ from make_results import filled
 from test_report import full, page_of  # noqa: F401
 
 from aeromatch_cli.data import AdjustedBlock, Camera
-from aeromatch_cli.orientation.block_figures import block_figures
 from aeromatch_cli.report.adjustment import Adjustment, adjustment_notices, adjustment_rows
 from aeromatch_cli.results.stages import AdjustResult, OrientResult
+from aeromatch_cli.sfm.block_figures import block_figures
 from aeromatch_cli.stages.stage_report import StageReport
 
 

@@ -13,7 +13,7 @@ from aeromatch_cli.errors import BrokenFileError
 from aeromatch_cli.formats.residuals import read_residuals, residuals_text
 from aeromatch_cli.geometry.cameras import from_colmap, project
 from aeromatch_cli.geometry.rotations import rotation_z
-from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
+from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 
 CAMERA = from_colmap("SIMPLE_RADIAL", 1600, 1200, (1500.0, 800.0, 600.0, -0.03))
 STRAIGHT_DOWN = np.diag([1.0, -1.0, -1.0])

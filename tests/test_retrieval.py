@@ -15,7 +15,7 @@ from make_features import described
 
 from aeromatch_cli.formats.features import write_features
 from aeromatch_cli.formats.tables import read_pairs
-from aeromatch_cli.orientation.retrieval import best_pairs, similar_pairs
+from aeromatch_cli.sfm.retrieval import best_pairs, similar_pairs
 
 
 @given(hnp.arrays(np.int64, (7, 5), elements=st.integers(-1, 6)), st.integers(0, 40))

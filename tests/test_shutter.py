@@ -10,7 +10,7 @@ import pytest
 from aeromatch_cli.data import AdjustedBlock, AdjustedPose, Camera, FloatArray
 from aeromatch_cli.geometry.cameras import project
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
-from aeromatch_cli.orientation.shutter import at_once
+from aeromatch_cli.sfm.shutter import at_once
 
 CAMERA = Camera("BROWN", 1200, 900, (1000.0, 610.0, 440.0, -0.05, 0.01, 0.0, 1e-4, -2e-4, 0.5, 0.0))
 # 30 ms at 12 m/s, obliquely over the picture: 3.6 pixels from 100 m.

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from test_orientation import CAMERA, flight, limits, matches
 
 from aeromatch_cli.data import Pose
-from aeromatch_cli.orientation.arrangement import Before, arranged
-from aeromatch_cli.orientation.consistency import consistent_images
-from aeromatch_cli.orientation.judgement import PairPoints
-from aeromatch_cli.orientation.mapping import Model
-from aeromatch_cli.orientation.soundness import rigid_groups, sound_part
 from aeromatch_cli.results.stages import MappedModel
+from aeromatch_cli.sfm.earlier_datum import Before, arranged
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
+from aeromatch_cli.sfm.mapping import Model
+from aeromatch_cli.sfm.model_validation import rigid_groups, sound_part
+from aeromatch_cli.sfm.pose_prior_check import consistent_images
 
 
 def model_of(poses: dict[str, Pose], kind: str = "level") -> Model:

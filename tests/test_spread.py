@@ -9,11 +9,11 @@ import pycolmap
 import pytest
 from make_networks import given_positions, values_of
 
-from aeromatch_cli.orientation.adjusting import Work, adjust_in_place
-from aeromatch_cli.orientation.bundle.adjust import Options
-from aeromatch_cli.orientation.bundle.network import LENS
-from aeromatch_cli.orientation.bundle.of_model import image_numbers, lens_of
-from aeromatch_cli.orientation.spread import chosen_points, take_poses, thinned
+from aeromatch_cli.sfm.bundle.adjust import Options
+from aeromatch_cli.sfm.bundle.network import LENS
+from aeromatch_cli.sfm.bundle.of_model import image_numbers, lens_of
+from aeromatch_cli.sfm.model_adjustment import Work, adjust_in_place
+from aeromatch_cli.sfm.thinning import chosen_points, take_poses, thinned
 
 POINTS, IMAGES = 6000, 6
 

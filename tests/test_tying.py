@@ -10,8 +10,8 @@ from test_orientation import CAMERA, flight, limits, matches
 
 from aeromatch_cli.data import Pose
 from aeromatch_cli.geometry.rotations import angle_between_deg
-from aeromatch_cli.orientation.judgement import PairPoints
-from aeromatch_cli.orientation.tying import tied_by_pairs
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
+from aeromatch_cli.sfm.pair_registration import tied_by_pairs
 
 LAST = "i23"
 

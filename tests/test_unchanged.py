@@ -13,7 +13,7 @@ from conftest import PAGE, UNORIENTED, Site, invoke
 
 from aeromatch_cli.errors import ItemError
 from aeromatch_cli.files import read_json
-from aeromatch_cli.stages import export, pairs, unchanged
+from aeromatch_cli.stages import export, pairs, up_to_date
 
 SETTINGS = UNORIENTED
 
@@ -111,7 +111,7 @@ def test_other_commands_take_the_long_way(no_long_way: NoLongWay, more: tuple[st
 
 
 def test_a_version_of_a_library_takes_the_long_way(no_long_way: NoLongWay, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unchanged, "library_version", lambda name: f"another {name}")
+    monkeypatch.setattr(up_to_date, "library_version", lambda name: f"another {name}")
     no_long_way.takes_it()
 
 

@@ -10,13 +10,13 @@ from aeromatch_cli.data import AdjustedBlock, Camera, PoseResidual
 from aeromatch_cli.formats.adjusted import read_adjusted
 from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.geometry.cameras import corner_params, from_colmap
-from aeromatch_cli.orientation.control import offset_words
 from aeromatch_cli.report.rows import ImageRow
 from aeromatch_cli.results.adjustment import Control
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, OrientResult
+from aeromatch_cli.sfm.control import offset_words
 from aeromatch_cli.stages import adjust
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.lines import control_of, control_words
+from aeromatch_cli.stages.messages import control_of, control_words
 from aeromatch_cli.stages.stage_report import result_on_file
 
 # Where cx and cy of cameras count from, on the page and in files.

@@ -11,8 +11,6 @@ import numpy as np
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray, Image
 from aeromatch_cli.geometry.cameras import normalise, project
 from aeromatch_cli.geometry.frames import COLMAP_OFFSET_PX
-from aeromatch_cli.orientation.bundle.network import LENS
-from aeromatch_cli.orientation.calibration import camera_of
 from aeromatch_cli.report.figures import (
     COLOURS,
     PlanSize,
@@ -24,6 +22,8 @@ from aeromatch_cli.report.figures import (
 )
 from aeromatch_cli.results.adjustment import Calibration, Parameter
 from aeromatch_cli.results.stages import AdjustResult
+from aeromatch_cli.sfm.bundle.network import LENS
+from aeromatch_cli.sfm.calibration import camera_of
 
 # Cells along the longer side of a picture; a mean of fewer residuals shows their noise.
 _CELLS, _FEWEST = 16, 5

@@ -18,9 +18,9 @@ from aeromatch_cli.formats.tables import read_csv, read_images, read_pairs
 from aeromatch_cli.report.better import Standing, as_facts, criteria, verdict_lines
 from aeromatch_cli.report.rows import seconds_by_stage
 from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult
-from aeromatch_cli.stages.changes import said_value
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.quality import quality_on_file
+from aeromatch_cli.stages.settings_diff import said_value
 from aeromatch_cli.stages.stage_report import result_on_file
 from aeromatch_cli.workspace import Workspace, opened_workspace
 

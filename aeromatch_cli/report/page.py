@@ -20,8 +20,6 @@ from aeromatch_cli.files import write_record, write_text
 from aeromatch_cli.fingerprints import file_digest, fingerprint
 from aeromatch_cli.formats.refined import read_final_keypoints
 from aeromatch_cli.geometry.footprints import block_footprints
-from aeromatch_cli.orientation.quality import Finding, Quality, plain
-from aeromatch_cli.orientation.shutter import at_once
 from aeromatch_cli.report.adjustment import (
     PRINCIPAL_POINT,
     Adjustment,
@@ -54,9 +52,11 @@ from aeromatch_cli.report.rows import (
 from aeromatch_cli.report.sketch import ground_sketch
 from aeromatch_cli.report.thumbnails import thumbnails
 from aeromatch_cli.results.stages import FilterResult, MatchResult, OrientResult, PairsResult, ReportResult
+from aeromatch_cli.sfm.quality import Finding, Quality, plain
+from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import WEAK_MATCHES, connection
-from aeromatch_cli.stages.lines import settled_words
+from aeromatch_cli.stages.messages import settled_words
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace

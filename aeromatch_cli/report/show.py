@@ -35,7 +35,7 @@ from aeromatch_cli.results.stages import AdjustResult, ConsistencyResult, Export
 from aeromatch_cli.stages.cascade import makers
 from aeromatch_cli.stages.consistency import FinalEntries
 from aeromatch_cli.stages.filter import match_points
-from aeromatch_cli.stages.look import steps_of_image
+from aeromatch_cli.stages.inspect_image import steps_of_image
 from aeromatch_cli.stages.quality import quality_on_file
 from aeromatch_cli.stages.rows import check_features, features_on_file, stale_image
 from aeromatch_cli.stages.stage_report import result_on_file

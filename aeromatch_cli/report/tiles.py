@@ -16,7 +16,7 @@ from aeromatch_cli.data import FloatArray
 from aeromatch_cli.files import write_atomically, write_text
 from aeromatch_cli.report.pictures import small, write_picture
 from aeromatch_cli.report.previews import jpeg_uri
-from aeromatch_cli.stages.look import ImageSteps
+from aeromatch_cli.stages.inspect_image import ImageSteps
 
 SUFFIXES = (".png", ".html", ".gif")
 # Longest side of a tile of a sheet, pixels; tiles in a row.

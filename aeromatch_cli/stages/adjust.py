@@ -22,14 +22,14 @@ from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.residuals import residuals_text
 from aeromatch_cli.geometry.cameras import BROWN, MODELS, focal_px
 from aeromatch_cli.images.scaling import scale_within
-from aeromatch_cli.orientation.block_figures import block_figures
-from aeromatch_cli.orientation.calibration import held_by
-from aeromatch_cli.orientation.control import control_figures
-from aeromatch_cli.orientation.heights import shift_to_control_m, zeros_words
-from aeromatch_cli.orientation.mapping import Group, refine_block
-from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.results.adjustment import Control, GroupResult
 from aeromatch_cli.results.stages import AdjustResult
+from aeromatch_cli.sfm.block_figures import block_figures
+from aeromatch_cli.sfm.calibration import held_by
+from aeromatch_cli.sfm.control import control_figures
+from aeromatch_cli.sfm.heights import shift_to_control_m, zeros_words
+from aeromatch_cli.sfm.mapping import Group, adjust_block
+from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.stages import orient, refine
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context
@@ -71,7 +71,7 @@ def run(context: Context) -> StageReport:
     try:
         with context.executor.step("adjust"):
             fixed = isinstance(recipe, FirstPass) and not recipe.replaces
-            adjusted, found = refine_block(contents_of(context, raw=False), context.observed, groups, fixed=fixed)
+            adjusted, found = adjust_block(contents_of(context, raw=False), context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
         report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment

@@ -24,7 +24,7 @@ from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import covered_share, shared_cells
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.evidence import Evidence
+from aeromatch_cli.stages.pair_statistics import PairStatistics
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.strategies import Strategy
 from aeromatch_cli.strategies.enhancers.shadow import ShadowEnhancement
@@ -175,7 +175,7 @@ def _steps(context: Context) -> Iterator[StepContext]:
         yield steps[-1]
 
 
-def _tried(left: Mapping[Key, str], found: Mapping[Key, Evidence]) -> dict[Key, str]:
+def _tried(left: Mapping[Key, str], found: Mapping[Key, PairStatistics]) -> dict[Key, str]:
     """The pairs left without most of those of images that no step has tied to another."""
     tied = {image_id for key, evidence in found.items() if evidence.verified for image_id in key}
     pairs_of: dict[str, list[Key]] = {}
@@ -236,7 +236,7 @@ def _step(context: Context, name: str, features_of: str, settings: Settings, rea
     return StepContext(name, features_of, own, reasons)
 
 
-def evidence_of(steps: Sequence[StepContext]) -> dict[Key, Evidence]:
+def evidence_of(steps: Sequence[StepContext]) -> dict[Key, PairStatistics]:
     """What the steps have found together of those of the pairs that the last of their steps has judged."""
     judged = [_InOrder(filter.verified_pairs(step.context)) for step in steps]
     readers = [_keypoint_reader(step) for step in steps]
@@ -283,7 +283,7 @@ def _keypoint_reader(step: StepContext) -> Callable[[str], FloatArray]:
 
 def _evidence(
     context: Context, pair: Pair, found: Sequence[tuple[FloatArray, FloatArray]], *, keypoints: int, candidates: int
-) -> Evidence:
+) -> PairStatistics:
     """found: verified places of either image, by step."""
     geometry = context.geometry(pair)
     points0, points1 = (np.concatenate([one[side] for one in found]) for side in range(2))
@@ -300,7 +300,7 @@ def _evidence(
             coverage = covered_share(shared.cells1, geometry.camera1, points1)
     pixels = min(camera.width_px * camera.height_px for camera in (geometry.camera0, geometry.camera1))
     sought = getattr(context.settings.extract, "keypoints", 0)
-    return Evidence(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg, pixels, sought)
+    return PairStatistics(len(points0), overlap, coverage, keypoints, candidates, pair.view_angle_deg, pixels, sought)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from aeromatch_cli.blocks.ground import ConstantGround
 from aeromatch_cli.data import Features, FloatArray, Pair, Pose
 from aeromatch_cli.images.source import Source, read_source
-from aeromatch_cli.orientation.judgement import EXPLAINED_SHARE, MIN_MATCHES, PairPoints, explained_share
+from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, MIN_MATCHES, PairPoints, explained_share
 from aeromatch_cli.stages import cascade, extract, first_pass, simulate
 from aeromatch_cli.stages.block import with_gsd
 from aeromatch_cli.stages.context import Context

@@ -19,10 +19,10 @@ from aeromatch_cli.formats.archives import load_checked
 from aeromatch_cli.formats.dropped import Dropped, read_dropped, write_dropped
 from aeromatch_cli.formats.rows import VerifiedEntry
 from aeromatch_cli.geometry.coverage import CELLS, cells_of, shared_cells, shown_ninths
-from aeromatch_cli.orientation.alone import placed_alone
-from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, contradicting
-from aeromatch_cli.orientation.remaining import without_dropped
 from aeromatch_cli.results.stages import ConsistencyResult, FilterResult, Ninths
+from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.sfm.track_pruning import without_dropped
+from aeromatch_cli.sfm.two_view_poses import placed_alone
 from aeromatch_cli.stages import adjust, orient
 from aeromatch_cli.stages.contents import contents_of, with_current_pairs
 from aeromatch_cli.stages.context import Context

@@ -16,7 +16,7 @@ from aeromatch_cli.formats.residuals import read_residuals
 from aeromatch_cli.formats.rows import MatchEntry, read_match_row
 from aeromatch_cli.images.depth import sample_colours
 from aeromatch_cli.images.files import read_pixels
-from aeromatch_cli.orientation.shutter import at_once
+from aeromatch_cli.sfm.shutter import at_once
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, outdated_pairs, verified_pairs
 from aeromatch_cli.stages.tracks import MatchedPair, Tracks, tracks_of

@@ -20,8 +20,8 @@ from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.footprints import block_footprints, degenerate_words
 from aeromatch_cli.images.remote import RemoteFile, on_disk
 from aeromatch_cli.images.scaling import scale_within, shrink_camera
-from aeromatch_cli.orientation.focal import with_focal_length
-from aeromatch_cli.orientation.mapping import Observed
+from aeromatch_cli.sfm.focal import with_focal_length
+from aeromatch_cli.sfm.mapping import Observed
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.strategies import Matcher
 from aeromatch_cli.workspace import Workspace
@@ -45,7 +45,7 @@ class Context:
     given: the block before it was oriented. focal_sigmas: camera_id -> standard deviation of its focal length, as a
     share of it, as it was stated. calibrated: cameras that the first pass has found. likely_focals: camera_id -> focal
     length in pixels that EXIF speaks for, where it contradicts the given one. angles: image_id -> attitude as it was
-    given. flights, velocities: as in `orientation.mapping.Observed`. control: surveyed points.
+    given. flights, velocities: as in `sfm.mapping.Observed`. control: surveyed points.
     """
 
     settings: Settings

@@ -13,9 +13,9 @@ import numpy as np
 
 from aeromatch_cli.data import Block, Pair
 from aeromatch_cli.formats.features import read_keypoints
-from aeromatch_cli.orientation.judgement import PairPoints
-from aeromatch_cli.orientation.mapper import LARGE_BLOCK
-from aeromatch_cli.orientation.retrieval import similar_pairs
+from aeromatch_cli.sfm.epipolar_agreement import PairPoints
+from aeromatch_cli.sfm.mapping_process import LARGE_BLOCK
+from aeromatch_cli.sfm.retrieval import similar_pairs
 from aeromatch_cli.stages import extract, filter, match  # noqa: A004
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.enhancers.none import NoEnhancement

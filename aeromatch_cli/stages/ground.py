@@ -13,10 +13,10 @@ from aeromatch_cli.config import Settings
 from aeromatch_cli.data import Block, FloatArray, Ground
 from aeromatch_cli.errors import ConfigError
 from aeromatch_cli.fingerprints import image_fingerprint
-from aeromatch_cli.orientation.dem import Terrain
-from aeromatch_cli.orientation.heights import height_remedy, zeros_words
-from aeromatch_cli.orientation.judgement import heights_above_m
 from aeromatch_cli.results.stages import OrientResult
+from aeromatch_cli.sfm.dem import Terrain
+from aeromatch_cli.sfm.epipolar_agreement import heights_above_m
+from aeromatch_cli.sfm.heights import height_remedy, zeros_words
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.strategies.orienters import GivenPoses
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aeromatch_cli.errors import InputError
-from aeromatch_cli.orientation.growth import grown
-from aeromatch_cli.orientation.mapping import MAPPERS, Mapper, Model, map_block
-from aeromatch_cli.orientation.solution import Evidence
-from aeromatch_cli.orientation.soundness import FEWEST_IMAGES, only, sound_part
 from aeromatch_cli.results.stages import FurtherFirstPass
+from aeromatch_cli.sfm.mapping import MAPPERS, Mapper, Model, map_block
+from aeromatch_cli.sfm.model_extension import grown
+from aeromatch_cli.sfm.model_validation import FEWEST_IMAGES, only, sound_part
+from aeromatch_cli.sfm.solution import FirstPassMatches
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.contents import contents_of
 from aeromatch_cli.stages.context import Context
@@ -38,7 +38,7 @@ class Mapped:
 
     recipe: FirstPass
     first: Context
-    evidence: Evidence
+    evidence: FirstPassMatches
     models: tuple[Model, ...]
     stopped: str = ""
 
@@ -58,7 +58,7 @@ class Mapped:
 
 
 def best_mapped(
-    context: Context, recipe: FirstPass, first: Context, evidence: Evidence
+    context: Context, recipe: FirstPass, first: Context, evidence: FirstPassMatches
 ) -> tuple[Mapped, list[FurtherFirstPass]]:
     """Models of a first pass, or of a further one where that has better ones, and what further ones were tried."""
     best = _mapped(context, recipe, first, evidence)
@@ -77,7 +77,7 @@ def best_mapped(
     return best, tried
 
 
-def _mapped(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> Mapped:
+def _mapped(context: Context, recipe: FirstPass, first: Context, evidence: FirstPassMatches) -> Mapped:
     try:
         return Mapped(recipe, first, evidence, _sound_models(context, recipe, first, evidence))
     except InputError as error:  # matches are found without orientation, too
@@ -103,7 +103,7 @@ def _without_positions(context: Context, best: Mapped) -> Mapped | None:
     return _mapped(context, best.recipe, first, evidence)
 
 
-def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: Evidence) -> tuple[Model, ...]:
+def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence: FirstPassMatches) -> tuple[Model, ...]:
     """Models that explain their matches, the largest first. What is left after one is mapped again by itself.
 
     Raises InputError where no mapper finds one and the last to try stopped on a fault.
@@ -127,7 +127,7 @@ def _sound_models(context: Context, recipe: FirstPass, first: Context, evidence:
 
 
 def _one_round(
-    context: Context, recipe: FirstPass, first: Context, evidence: Evidence, image_ids: set[str]
+    context: Context, recipe: FirstPass, first: Context, evidence: FirstPassMatches, image_ids: set[str]
 ) -> list[Model]:
     """Sound models of some images; by the other mapper where that finds more of them.
 
@@ -155,7 +155,7 @@ def _one_round(
     return best
 
 
-def _sound_parts(context: Context, evidence: Evidence, models: Sequence[Model]) -> list[Model]:
+def _sound_parts(context: Context, evidence: FirstPassMatches, models: Sequence[Model]) -> list[Model]:
     """The models as far as they explain their matches, each image in the largest that has it."""
     found: list[Model] = []
     taken: set[str] = set()
@@ -167,7 +167,7 @@ def _sound_parts(context: Context, evidence: Evidence, models: Sequence[Model]) 
     return found
 
 
-def _sound(context: Context, evidence: Evidence, model: Model) -> Model | None:
+def _sound(context: Context, evidence: FirstPassMatches, model: Model) -> Model | None:
     cameras = {**context.block.cameras, **model.cameras}
     of_images = {image.image_id: cameras[image.camera_id] for image in context.block.images}
     return sound_part(model, evidence.pairs, of_images, evidence.thresholds_px, context.block.poses)
@@ -192,13 +192,13 @@ def _largest(models: Sequence[Model]) -> int:
 
 def evidence_of(
     context: Context, recipe: FirstPass, *, by_position: bool = True, look: bool = False
-) -> tuple[Context, Evidence]:
+) -> tuple[Context, FirstPassMatches]:
     """The context of a first pass that has been run, and its verified matches. look: whether it is a look at given
     poses, which another pass may follow."""
     prepared = first_pass.prepared(context, recipe, "first look" if look else "first pass")
     first, failed = first_pass.run(prepared, recipe, by_position=by_position)
     pairs = list(first_pass.verified_points(first)) if first.pairs else []
-    return first, Evidence(context.block, pairs, thresholds_px(first), context.given.cameras, failed)
+    return first, FirstPassMatches(context.block, pairs, thresholds_px(first), context.given.cameras, failed)
 
 
 def thresholds_px(first: Context) -> dict[str, float]:

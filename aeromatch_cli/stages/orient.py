@@ -18,12 +18,13 @@ from aeromatch_cli.fingerprints import fingerprint, mask_fingerprint
 from aeromatch_cli.formats.tables import cameras_text, poses_text, read_cameras, read_poses
 from aeromatch_cli.formats.terrain import read_terrain, terrain_bytes
 from aeromatch_cli.images.masks import mask_path
-from aeromatch_cli.orientation.arrangement import Before
-from aeromatch_cli.orientation.dem import Terrain, continued
-from aeromatch_cli.orientation.focal import better_cameras
-from aeromatch_cli.orientation.mapping import Group
-from aeromatch_cli.orientation.solution import (
-    Evidence,
+from aeromatch_cli.results.stages import FurtherFirstPass, OrientResult
+from aeromatch_cli.sfm.dem import Terrain, continued
+from aeromatch_cli.sfm.earlier_datum import Before
+from aeromatch_cli.sfm.focal import better_cameras
+from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.sfm.solution import (
+    FirstPassMatches,
     Solution,
     from_given,
     from_models,
@@ -31,14 +32,13 @@ from aeromatch_cli.orientation.solution import (
     suffices,
     unoriented_remark,
 )
-from aeromatch_cli.results.stages import FurtherFirstPass, OrientResult
 from aeromatch_cli.stages import first_pass
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.exchanged import exchanged_columns
 from aeromatch_cli.stages.ground import judged_altitudes, judged_ground
-from aeromatch_cli.stages.lines import frame_remarks
+from aeromatch_cli.stages.messages import frame_remarks
 from aeromatch_cli.stages.models import best_mapped, evidence_of
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
+from aeromatch_cli.stages.swapped_axes import exchanged_columns
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.similar import Similar
@@ -180,7 +180,9 @@ def _solution(
     return replace(solution, terrains=terrains, result=result), seen
 
 
-def _with_better_cameras(context: Context, first: Context, evidence: Evidence) -> tuple[Context, Context, Evidence]:
+def _with_better_cameras(
+    context: Context, first: Context, evidence: FirstPassMatches
+) -> tuple[Context, Context, FirstPassMatches]:
     """All three with other focal lengths, where those given cannot be right."""
     block = evidence.block
     camera_ids = {image.image_id: image.camera_id for image in block.images}

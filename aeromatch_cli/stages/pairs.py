@@ -20,8 +20,8 @@ from aeromatch_cli.results.stages import OrientResult, PairsResult
 from aeromatch_cli.stages import orient, picture_quality
 from aeromatch_cli.stages.block import BlockRead, block_record, read_block, with_gsd
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.lines import orientation_lines
 from aeromatch_cli.stages.memory import budget_mb, jobs_within, runs_network
+from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from aeromatch_cli import graph
-from aeromatch_cli.orientation.quality import Evidence, Quality, judged
 from aeromatch_cli.results.stages import BlockResults, ConsistencyResult
+from aeromatch_cli.sfm.quality import Quality, QualityInput, judged
 from aeromatch_cli.stages.stage_report import StageReport, result_on_file
 from aeromatch_cli.workspace import Workspace
 
@@ -21,7 +21,7 @@ def quality_of(results: BlockResults, names: Mapping[str, str]) -> Quality | Non
         return None
     consistency = results.consistency
     return judged(
-        Evidence(
+        QualityInput(
             images=len(names),
             adjust=adjust,
             orient=results.orient,

@@ -22,8 +22,8 @@ from aeromatch_cli.fingerprints import fingerprint
 from aeromatch_cli.formats.features import known_fingerprint, read_keypoints
 from aeromatch_cli.formats.refined import write_refined
 from aeromatch_cli.images.source import Source, read_source
-from aeromatch_cli.orientation.trees import Trees, shifts_through, trees_of
 from aeromatch_cli.results.stages import RefineResult
+from aeromatch_cli.sfm.spanning_trees import Trees, shifts_through, trees_of
 from aeromatch_cli.stages.contents import with_current_pairs
 from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.enhance import source_of

@@ -19,8 +19,8 @@ from aeromatch_cli.files import read_json, remove_stale_temporaries, translated_
 from aeromatch_cli.formats.features import read_keypoints
 from aeromatch_cli.formats.tables import read_images
 from aeromatch_cli.images.remote import is_remote
-from aeromatch_cli.orientation.quality import Level
 from aeromatch_cli.results.stages import ExportResult, FilterResult, PairsResult, ReportResult
+from aeromatch_cli.sfm.quality import Level
 from aeromatch_cli.stages import (
     adjust,
     cascade,
@@ -35,16 +35,16 @@ from aeromatch_cli.stages import (
     picture_quality,
     refine,
     simulate,
-    unchanged,
     union,
+    up_to_date,
 )
-from aeromatch_cli.stages.changes import changed_words
-from aeromatch_cli.stages.closing import closing_lines, verdict_lines
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.stages.lines import stage_lines
 from aeromatch_cli.stages.lost import Lost, lost_images, lost_lines, write_lost
+from aeromatch_cli.stages.messages import stage_lines
 from aeromatch_cli.stages.naming import item_named, names_on_file, with_names
 from aeromatch_cli.stages.quality import quality_of, results_of
+from aeromatch_cli.stages.result_summary import closing_lines, verdict_lines
+from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
 from aeromatch_cli.strategies.orienters import FirstPass
@@ -104,15 +104,15 @@ def execute(
             stack.enter_context(locked(Workspace(Path(settings.workspace)), command, shared=part is not None))
         try:
             whole = command == "run" and part is None
-            inputs = unchanged.state_of_inputs(settings) if whole else {}
-            before = None if overwrite else unchanged.unchanged_reports(Workspace(root), inputs)
+            inputs = up_to_date.state_of_inputs(settings) if whole else {}
+            before = None if overwrite else up_to_date.unchanged_reports(Workspace(root), inputs)
             if before is not None:
                 return _named(_unchanged(settings, before, _Said(say)), root)
             run = settings.run
             with Executor(run.executor, run.jobs, progress, run.scheduler) as executor:
                 result = _repairing(command, settings, executor, part, overwrite, _Said(say))
             if whole and not result.failures:
-                unchanged.remember(Workspace(root), inputs, result.reports)
+                up_to_date.remember(Workspace(root), inputs, result.reports)
             return _named(result, root)
         except BaseException as error:
             # Workers are stopped in the middle of what they write.

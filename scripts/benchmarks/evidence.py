@@ -1,9 +1,9 @@
 """How many verified matches a pair can be expected to have after a step of `auto`, and how many it has.
 
 Every block is one `aeromatch run auto` whose pairs all take every step; rendered blocks with their noisy poses, real
-ones (--data, every k-th image) with their reference poses. Before each step, `aeromatch_cli.stages.evidence` says of
-every pair with known overlap what it is expected to have after it. The number behind a block's name: SIFT descriptors
-per image. Found: verified matches of all steps together, those that two steps have found counted once. Error: root mean
+ones (--data, every k-th image) with their reference poses. Before each step, `stages.pair_statistics` says of every
+pair with known overlap what it is expected to have after it. The number behind a block's name: SIFT descriptors per
+image. Found: verified matches of all steps together, those that two steps have found counted once. Error: root mean
 square of the difference of logarithms, as a factor. Gain: matches after over before.
 
 --fit SEEDS renders other blocks of the same scenes and flights, with other numbers of descriptors for each scene, finds
@@ -30,7 +30,7 @@ from aeromatch_cli.executor import Executor
 from aeromatch_cli.files import read_json, write_json
 from aeromatch_cli.lab.synthetic import PRESETS
 from aeromatch_cli.stages import cascade, pairs
-from aeromatch_cli.stages.evidence import columns, expected_number, fitted_weights, log_error
+from aeromatch_cli.stages.pair_statistics import columns, expected_number, fitted_weights, log_error
 from aeromatch_cli.strategies.steps import STEPS
 from benchmarks import options, stamps
 from benchmarks.blocks.cases import chosen_images

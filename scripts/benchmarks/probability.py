@@ -2,7 +2,7 @@
 
 Every block is one `aeromatch run auto` with its noisy poses. Of the verified matches, before any is dropped, that do
 not contradict the adjusted block (or, of images that it lacks, the geometry of their pair),
-`aeromatch_cli.orientation.probability` says how likely each is to be right:
+`aeromatch_cli.sfm.probability` says how likely each is to be right:
 within 3 px of the exact place, which both images see. Stated: the mean of what it says; right: the share that is.
 Left: of the right ones, those that are stated to be at least as likely as asked (--least), and the share of right ones
 among all that are left.
@@ -30,9 +30,9 @@ from aeromatch_cli.formats.rows import read_verified_row
 from aeromatch_cli.formats.tables import read_cameras, read_images, read_poses
 from aeromatch_cli.lab.opening import open_truth
 from aeromatch_cli.lab.synthetic import PRESETS
-from aeromatch_cli.orientation.alone import placed_alone
-from aeromatch_cli.orientation.contradictions import Limits, MatchedKeypoints, Settled
-from aeromatch_cli.orientation.probability import WEIGHTS, columns, fitted_weights, stated, usual_off_px
+from aeromatch_cli.sfm.outlier_rejection import Limits, MatchedKeypoints, Settled
+from aeromatch_cli.sfm.probability import WEIGHTS, columns, fitted_weights, stated, usual_off_px
+from aeromatch_cli.sfm.two_view_poses import placed_alone
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace
 from benchmarks import options, stamps

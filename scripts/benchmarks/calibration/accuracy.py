@@ -12,7 +12,7 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera, FloatArray
 from aeromatch_cli.geometry.cameras import calibration_matrix, focal_px, world_rays
-from aeromatch_cli.orientation.placing import similarity
+from aeromatch_cli.sfm.georeferencing import similarity
 from benchmarks.calibration.simulate import SimulatedBlock
 from benchmarks.tables import Row, plain
 

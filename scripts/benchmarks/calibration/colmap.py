@@ -21,9 +21,9 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.cameras import from_colmap
-from aeromatch_cli.orientation.placing import similarity
-from aeromatch_cli.orientation.process import quiet_pycolmap
-from aeromatch_cli.orientation.results import centers_of, image_numbers
+from aeromatch_cli.sfm.georeferencing import similarity
+from aeromatch_cli.sfm.model_arrays import centers_of, image_numbers
+from aeromatch_cli.sfm.process import quiet_pycolmap
 from aeromatch_cli.strategies.exporters.colmap import Colmap
 from benchmarks.calibration.accuracy import Found
 from benchmarks.calibration.simulate import SimulatedBlock

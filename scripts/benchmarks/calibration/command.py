@@ -34,9 +34,9 @@ import numpy as np
 
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.orientation.mapping import refine_block
-from aeromatch_cli.orientation.quality import LEVELS
-from aeromatch_cli.orientation.quality import judged as verdict
+from aeromatch_cli.sfm.mapping import adjust_block
+from aeromatch_cli.sfm.quality import LEVELS
+from aeromatch_cli.sfm.quality import judged as verdict
 from aeromatch_cli.stages import adjust, orient
 from benchmarks import options, stamps
 from benchmarks.calibration.accuracy import Found, judged
@@ -77,7 +77,7 @@ def _run(case: Case, method: str, path: Path) -> None:
     try:
         if method == _OURS:
             contents, groups = perturbed(block) if case.start == "perturbed" else mapped(block)
-            adjusted, facts = refine_block(contents, block.observed, groups, fixed=False)
+            adjusted, facts = adjust_block(contents, block.observed, groups, fixed=False)
             found: Found | None = Found.of(adjusted)
             evidence = of_adjusted(contents, block.observed, adjusted, facts, metric=case.positions != "nothing")
             row["verdict"] = verdict(evidence).verdict

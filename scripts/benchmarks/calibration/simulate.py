@@ -1,6 +1,6 @@
 """Tie points without pictures: a rendered scene's surfaces, a flight, real lenses, and what a matcher would measure.
 
-What is simulated goes to `mapping.refine_block` as verified pairs do; what is true stays beside it.
+What is simulated goes to `mapping.adjust_block` as verified pairs do; what is true stays beside it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from aeromatch_cli.lab.synthetic.raycast import RayCaster
 from aeromatch_cli.lab.synthetic.receivers import GPS_M, RTK_M, gps_errors_m, rtk_errors_m
 from aeromatch_cli.lab.synthetic.scene import build_scene
 from aeromatch_cli.lab.synthetic.terrain import Area
-from aeromatch_cli.orientation.mapping import Group, Mapper, Observed, map_block
-from aeromatch_cli.orientation.placing import LOCAL_FLYING_HEIGHT
+from aeromatch_cli.sfm.georeferencing import LOCAL_FLYING_HEIGHT
+from aeromatch_cli.sfm.mapping import Group, Mapper, Observed, map_block
 from aeromatch_cli.strategies.exporters.contents import ExportContents, PairContents
 from benchmarks.calibration.tracks import Keypoints, Picture, Sight, chosen, look, measured, spread
 

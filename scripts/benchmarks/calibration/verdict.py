@@ -8,14 +8,14 @@ import numpy as np
 
 from aeromatch_cli.data import AdjustedBlock, Camera
 from aeromatch_cli.geometry.components import connected_groups
-from aeromatch_cli.orientation.block_figures import block_figures
-from aeromatch_cli.orientation.contradictions import Contradictions, Limits, MatchedKeypoints, contradicting
-from aeromatch_cli.orientation.control import control_figures
-from aeromatch_cli.orientation.mapping import Observed
-from aeromatch_cli.orientation.quality import Evidence
-from aeromatch_cli.orientation.residuals import residual_figures, residuals_of
 from aeromatch_cli.results.adjustment import GroupResult
 from aeromatch_cli.results.stages import AdjustResult
+from aeromatch_cli.sfm.block_figures import block_figures
+from aeromatch_cli.sfm.control import control_figures
+from aeromatch_cli.sfm.mapping import Observed
+from aeromatch_cli.sfm.outlier_rejection import Contradictions, Limits, MatchedKeypoints, contradicting
+from aeromatch_cli.sfm.quality import QualityInput
+from aeromatch_cli.sfm.residuals import residual_figures, residuals_of
 from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.strategies.exporters.contents import ExportContents
 
@@ -27,8 +27,8 @@ def of_adjusted(
     groups: Sequence[GroupResult],
     *,
     metric: bool,
-) -> Evidence:
-    """groups: results of `refine_block`. metric: whether the world frame's lengths are metres."""
+) -> QualityInput:
+    """groups: results of `adjust_block`. metric: whether the world frame's lengths are metres."""
     images = contents.block.images
     tied = connected_groups([(p.pair.image_id0, p.pair.image_id1) for p in contents.pairs])
     alone = len(images) - sum(map(len, tied))
@@ -44,7 +44,7 @@ def of_adjusted(
         remarks=[] if adjusted.poses else ["no image could be oriented"],
     )
     components = (*map(len, tied), *[1] * alone)
-    evidence = Evidence(images=len(images), adjust=result, components=components, refined=True)
+    evidence = QualityInput(images=len(images), adjust=result, components=components, refined=True)
     if not adjusted.poses or not contents.pairs:
         return evidence
     found = _contradictions(contents, adjusted, cameras)

@@ -17,7 +17,7 @@ from aeromatch_cli.formats.terrain import read_terrain
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.rotations import from_omega_phi_kappa
 from aeromatch_cli.lab.synthetic import load_truth
-from aeromatch_cli.orientation.placing import similarity
+from aeromatch_cli.sfm.georeferencing import similarity
 from benchmarks.orient.cases import ANGLES
 from benchmarks.tables import Row, plain
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from aeromatch_cli.data import BoolArray, Camera, ControlPoint, FloatArray, Pose
 from aeromatch_cli.geometry.cameras import focal_px
 from aeromatch_cli.geometry.rotations import rotation_x
-from aeromatch_cli.orientation.mapping import Group, Observed
+from aeromatch_cli.sfm.mapping import Group, Observed
 from aeromatch_cli.strategies.exporters.contents import ExportContents, PairContents
 from benchmarks.calibration.simulate import Positions, SimulatedBlock, perturbed, simulate
 

@@ -22,9 +22,9 @@ from typing import Any
 
 from aeromatch_cli.errors import AeromatchError
 from aeromatch_cli.files import read_json, write_json
-from aeromatch_cli.orientation.mapping import refine_block
-from aeromatch_cli.orientation.quality import Evidence, judged
 from aeromatch_cli.results.stages import AdjustResult
+from aeromatch_cli.sfm.mapping import adjust_block
+from aeromatch_cli.sfm.quality import QualityInput, judged
 from aeromatch_cli.stages import adjust
 from benchmarks import options
 from benchmarks.calibration.accuracy import Found
@@ -39,13 +39,13 @@ _MOST_FINDINGS = 3
 _TOGETHER = 9
 
 
-def evidence_of(task: Task) -> tuple[Evidence, Row]:
+def evidence_of(task: Task) -> tuple[QualityInput, Row]:
     """What the adjustment makes of a task, and errors of that by truth."""
     try:
-        adjusted, groups = refine_block(task.contents, task.observed, task.groups, fixed=task.fixed)
+        adjusted, groups = adjust_block(task.contents, task.observed, task.groups, fixed=task.fixed)
     except AeromatchError as error:
         nothing = AdjustResult(images=0, remarks=[str(error)])
-        return Evidence(images=len(task.contents.block.images), adjust=nothing, refined=True), {}
+        return QualityInput(images=len(task.contents.block.images), adjust=nothing, refined=True), {}
     one = next(iter(adjusted.cameras.values()))  # of all, where several were taken as one
     whole = {camera_id: adjusted.cameras.get(camera_id, one) for camera_id in task.block.cameras}
     errors = by_truth(task.block, Found.of(replace(adjusted, cameras=whole)))
@@ -62,7 +62,7 @@ def _run(name: str, expected: str, path: Path, tie_points: int) -> None:
 
 def _judged(row: Row) -> Row:
     """A row of what was found with the present verdict on it."""
-    quality = judged(Evidence(**row["evidence"]))
+    quality = judged(QualityInput(**row["evidence"]))
     faults = [[one.what, one.value, one.level, one.sentence] for one in quality.faults]
     shown = {key: row[key] for key in ("block", "expected", "height_px")}
     return {**shown, "verdict": quality.verdict, "findings": faults, "unchecked": list(quality.unchecked)}

@@ -29,7 +29,7 @@ _ALIKE, _ALIKE_PX, _ALIKE_APART_PX = 24, (5.0, 30.0), 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class RegistrationQuality:
     """cells: number judged. agreeing: which correlate best as registered. by_chance: expected to, were it wrong.
     correlations: (rows, columns) of every cell of side 0, of locally normalised pictures; NaN where not judged.
     """
@@ -44,7 +44,7 @@ class Evidence:
         """The median."""
         return float(np.nanmedian(self.correlations)) if self.cells else 0.0
 
-    def preferred_to(self, other: Evidence) -> float:
+    def preferred_to(self, other: RegistrationQuality) -> float:
         """Share of the cells that both judge, which correlate better here than there; 1 where none."""
         with np.errstate(invalid="ignore"):
             better = self.correlations > other.correlations
@@ -56,7 +56,7 @@ class Evidence:
         return self.agreeing / self.cells if self.cells else 0.0
 
 
-def evidence(level0: Level, level1: Level, matrix: FloatArray, cell_px: int) -> Evidence:
+def evidence(level0: Level, level1: Level, matrix: FloatArray, cell_px: int) -> RegistrationQuality:
     """Of a homography (3, 3), level px1 from px0."""
     import cv2
 
@@ -80,7 +80,7 @@ def evidence(level0: Level, level1: Level, matrix: FloatArray, cell_px: int) -> 
     of_cells = np.full(both.shape, np.nan)
     of_cells[judged] = correlations[0]
     count = int(judged.sum())
-    return Evidence(count, int(agreeing.sum()), count / len(shifts), of_cells)
+    return RegistrationQuality(count, int(agreeing.sum()), count / len(shifts), of_cells)
 
 
 def _around() -> list[tuple[int, int]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from aeromatch_cli.data import FloatArray
 from aeromatch_cli.geometry.frames import apply_homography, closest_similarity, homography_jacobians
-from aeromatch_cli.strategies.matchers.polar.evidence import Evidence, cell_size_px, evidence
+from aeromatch_cli.strategies.matchers.polar.evidence import RegistrationQuality, cell_size_px, evidence
 from aeromatch_cli.strategies.matchers.polar.fit import Fit, fit, shared_places
 from aeromatch_cli.strategies.matchers.polar.level import Level
 from aeromatch_cli.strategies.matchers.polar.pyramid import FINEST_PX, Pyramid, rescaled
@@ -70,7 +70,7 @@ class Registration:
     matrix: FloatArray
     warp: FloatArray
     fit: Fit | None
-    evidence: Evidence | None
+    evidence: RegistrationQuality | None
     scale: float
     reason: str
     preferred: float = 1.0
@@ -172,7 +172,7 @@ def _refined(levels: Pyramid, ranked: Sequence[FloatArray], prior: Prior | None)
     return _finished(levels, best, scale, proof, preferred)
 
 
-def _finished(levels: Pyramid, best: Fit, scale: float, proof: Evidence, preferred: float) -> Registration:
+def _finished(levels: Pyramid, best: Fit, scale: float, proof: RegistrationQuality, preferred: float) -> Registration:
     """The best fit of pictures at `scale` on the finest level, unless there is a doubt already."""
     warp = rescaled(best.matrix, scale, 1.0)
     similar = _similar(warp, best.middle_px / scale)
@@ -295,7 +295,7 @@ def _factor(warp: FloatArray, middle_px: FloatArray) -> complex:
     return complex(linear[0, 0] + linear[1, 1], linear[1, 0] - linear[0, 1]) / 2.0
 
 
-def _doubt(found: Fit, proof: Evidence, preferred: float) -> str:
+def _doubt(found: Fit, proof: RegistrationQuality, preferred: float) -> str:
     """Why not to believe it, "" for nothing."""
     if not found.converged:
         return f"least squares did not converge: still moving {found.moved_px:.2g} px"

@@ -1,0 +1,123 @@
+"""Images that hang on an oriented block by pairs without common keypoints, placed by those pairs and their positions.
+
+A pair tells the attitude of the second image and the direction to it, not the distance: mappers put such images
+anywhere along that direction. The given position tells the distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from aeromatch_cli.data import Camera, FloatArray, Pair, PairGeometry, Pose
+from aeromatch_cli.geometry.two_view import Sampling, estimate, undistorted
+from aeromatch_cli.sfm.epipolar_agreement import EXPLAINED_SHARE, PairPoints, explained_share
+
+# Fewer matches do not tell an attitude.
+_LEAST_MATCHES = 30
+# A position lies beside the direction that the pair tells by at most so many standard deviations.
+_SIGMAS = 3.0
+# Where positions are as near to each other as they are exact, the images are this many standard deviations apart.
+_NEAREST = 0.5
+# Errors of exact matches, times this: the pose comes from one pair.
+_SLACK = 3.0
+# Standard deviation of the attitude, degrees.
+_SIGMA_DEG = 1.0
+
+
+def tied_by_pairs(
+    pairs: Sequence[PairPoints],
+    known: Mapping[str, Pose],
+    given: Mapping[str, Pose],
+    cameras: Mapping[str, Camera],
+    thresholds_px: Mapping[str, float],
+) -> dict[str, tuple[Pose, str]]:
+    """Poses of further images, and the image that each was tied to.
+
+    known: oriented images, in the frame of the given positions. given: image_id -> pose whose position counts.
+    thresholds_px: by image_id, errors of exact matches in stored pixels. The pair with most matches comes first; what
+    it ties is known from then on.
+    """
+    poses = dict(known)
+    found: dict[str, tuple[Pose, str]] = {}
+    left = [p for p in pairs if len(p.indices) >= _LEAST_MATCHES and not {p.image_id0, p.image_id1} <= poses.keys()]
+    left.sort(key=lambda p: -len(p.indices))
+    while True:
+        best = _best_tie(left, poses, given)
+        if best is None:
+            return found
+        left = [p for p in left if {p.image_id0, p.image_id1} != {best.image_id0, best.image_id1}]
+        pose = _tied(best, poses[best.image_id0], given[best.image_id1], cameras, thresholds_px)
+        if pose is not None:
+            poses[best.image_id1] = pose
+            found[best.image_id1] = pose, best.image_id0
+
+
+def _best_tie(pairs: Sequence[PairPoints], poses: Mapping[str, Pose], given: Mapping[str, Pose]) -> PairPoints | None:
+    """Of pairs with most matches first: the first of a known and another image, the last by name of several alike."""
+    best: PairPoints | None = None
+    for pair in pairs:
+        if best is not None and len(pair.indices) < len(best.indices):
+            break
+        if (pair.image_id0 in poses) == (pair.image_id1 in poses):
+            continue
+        tie = _from_known(pair, poses)
+        later = best is None or (tie.image_id0, tie.image_id1) > (best.image_id0, best.image_id1)
+        if tie.image_id1 in given and later:
+            best = tie
+    return best
+
+
+def _from_known(pair: PairPoints, poses: Mapping[str, Pose]) -> PairPoints:
+    """The pair with the known image first."""
+    if pair.image_id0 in poses:
+        return pair
+    return PairPoints(pair.image_id1, pair.image_id0, pair.points1_px, pair.points0_px, pair.indices[:, ::-1])
+
+
+def _tied(
+    pair: PairPoints, known: Pose, given: Pose, cameras: Mapping[str, Camera], thresholds_px: Mapping[str, float]
+) -> Pose | None:
+    """Pose of the second image, None where its position or the matches contradict it."""
+    assert known.world_rotation is not None
+    ends = pair.image_id0, pair.image_id1
+    pair_of_ids = Pair(*ends, np.nan, np.nan, "")
+    geometry = PairGeometry(pair_of_ids, cameras[ends[0]], cameras[ends[1]], None, None, None)
+    points0, points1, _ = undistorted(pair.points0_px, pair.points1_px, geometry)
+    if len(points0) < _LEAST_MATCHES:
+        return None
+    sampling = Sampling(min(thresholds_px[i] for i in ends))
+    view = estimate(points0, points1, geometry, "relative_pose", sampling, 0)
+    if view.rotation is None or view.inliers.sum() < EXPLAINED_SHARE * len(points0):
+        return None
+    rotation = view.rotation @ known.world_rotation
+    limits_px = {i: _SLACK * thresholds_px[i] for i in ends}
+    for direction in _directions(view.model, view.rotation, known.world_rotation):
+        center_m = _along(known, given, direction)
+        if center_m is None:
+            continue
+        pose = replace(given, center_m=center_m, world_rotation=rotation, sigma_angle_deg=_SIGMA_DEG)
+        both = {ends[0]: known, ends[1]: pose}
+        if explained_share(pair, both, cameras, limits_px) >= EXPLAINED_SHARE:
+            return pose
+    return None
+
+
+def _directions(model: FloatArray, rotation: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors in the world, one of them from the known centre to the other, of an essential matrix [t]x R."""
+    crossed = model @ rotation.T
+    t = np.array([crossed[2, 1], crossed[0, 2], crossed[1, 0]])
+    way = -known.T @ rotation.T @ (t / np.linalg.norm(t))
+    return way, -way
+
+
+def _along(known: Pose, given: Pose, direction: FloatArray) -> FloatArray | None:
+    """The place on a ray from the known centre that is nearest to the given position, None where that lies beside."""
+    ahead = given.center_m - known.center_m
+    distance_m = float(ahead @ direction)
+    limit_m = _SIGMAS * given.sigma_position_m
+    if distance_m < -limit_m or float(np.linalg.norm(ahead - distance_m * direction)) > limit_m:
+        return None
+    return np.asarray(known.center_m + max(distance_m, _NEAREST * given.sigma_position_m) * direction)

@@ -1,0 +1,195 @@
+"""Images of a model that are turned over: seen from afar, ground that is about level shows nearly the same from one
+side as, tilted as much, from the opposite one.
+
+A mapper takes either: what it knows of an image is some dozen of points, and the wrong pose fits them to a few pixels.
+The given positions tell which one it is, else the errors that are left once all poses are adjusted to each.
+Source: of planar points an image has two poses with a small error each (Schweighofer and Pinz, Robust pose estimation
+from a planar target, PAMI 2006); under weak perspective both fit alike.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from aeromatch_cli.data import FloatArray
+from aeromatch_cli.geometry.rotations import angle_between_deg
+from aeromatch_cli.sfm.bundle.of_model import image_numbers
+from aeromatch_cli.sfm.georeferencing import Placement
+from aeromatch_cli.sfm.model_adjustment import MIN_OBSERVATIONS
+from aeromatch_cli.sfm.model_arrays import BEHIND_PX
+
+# An image farther than so many standard deviations from its position is tried with its other pose, and turned back if
+# that brings it nearer than this share of the distance.
+_FAR_SIGMAS, _NEARER = 5.0, 0.5
+# The other pose leaves at most so many times the median error of the present one, to which points and poses are
+# adjusted; once they are adjusted to the other one, at most so many times.
+_FITS, _WORSE = 10.0, 1.2
+# Images whose position does not tell are tried if the other pose leaves at most so many times the error, so many images
+# at most, those first that fit worst; they are turned back if this share of the error is left after an adjustment.
+_ALIKE, _MOST_TRIED, _BETTER = 2.0, 10, 0.8
+# Poses nearer to each other are one and the same.
+_DIFFERENT_DEG = 10.0
+
+Adjust = Callable[[Any], Placement]
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """A model with its placement, and the numbers of the images that were turned back."""
+
+    model: Any
+    placement: Placement
+    turned: tuple[int, ...] = ()
+
+
+def turned_back(
+    pycolmap: ModuleType,
+    model: Any,
+    placement: Placement,
+    positions_m: FloatArray,
+    sigmas_m: FloatArray,
+    adjust: Adjust,
+) -> Upright:
+    """The model with images turned back that are turned over, by their positions or by their errors.
+
+    positions_m (N, 3), sigmas_m (N,): one row per image number, NaN where there is none. adjust: adjusts and places a
+    model.
+    """
+    found, ids = Upright(model, placement), image_numbers(model)
+    if placement.kind == "level":
+        return _by_errors(pycolmap, found, ids, adjust)
+    off = {i: _off_m(model, i, positions_m) / sigmas_m[i - 1] for i in ids}
+    found = _by_positions(pycolmap, found, [i for i in ids if off[i] > _FAR_SIGMAS], positions_m, adjust)
+    open_ = [i for i in ids if not off[i] <= _FAR_SIGMAS and i not in found.turned]
+    return _by_errors(pycolmap, found, open_, adjust)
+
+
+def _by_positions(
+    pycolmap: ModuleType, before: Upright, far: Collection[int], positions_m: FloatArray, adjust: Adjust
+) -> Upright:
+    """far: images far from their positions. Once more without those for which that was no good, if others are left."""
+    for _ in range(2):
+        if not far:
+            return before
+        trial, turned = copy.deepcopy(before.model), []
+        for number in far:
+            other = _Other.of(pycolmap, trial, number)
+            nearer_m = _NEARER * _off_m(trial, number, positions_m)
+            if other is None or other.error_px > _FITS * other.present_px:
+                continue
+            if float(np.linalg.norm(other.center_m - positions_m[number - 1])) < nearer_m:
+                other.take(trial)
+                turned.append(number)
+        if not turned:
+            return before
+        placement = adjust(trial)
+        far = [
+            i
+            for i in turned
+            if _off_m(trial, i, positions_m) < _NEARER * _off_m(before.model, i, positions_m)
+            and _error_px(trial, i) <= _WORSE * _error_px(before.model, i)
+        ]
+        if far == turned and placement.kind == before.placement.kind:
+            return Upright(trial, placement, tuple(turned))
+    return before
+
+
+def _by_errors(pycolmap: ModuleType, found: Upright, ids: Collection[int], adjust: Adjust) -> Upright:
+    others = [_Other.of(pycolmap, found.model, number) for number in ids]
+    doubtful = [other for other in others if other is not None and other.error_px < _ALIKE * other.present_px]
+    for other in sorted(doubtful, key=lambda other: -other.present_px)[:_MOST_TRIED]:
+        trial, number = copy.deepcopy(found.model), other.number
+        # Where another image was turned back since, poses and points are others.
+        now = _Other.of(pycolmap, trial, number) if found.turned else other
+        if now is None:
+            continue
+        now.take(trial)
+        placement = adjust(trial)
+        better = _error_px(trial, number) < _BETTER * _error_px(found.model, number)
+        if better and placement.kind == found.placement.kind:
+            found = Upright(trial, placement, (*found.turned, number))
+    return found
+
+
+def _off_m(model: Any, number: int, positions_m: FloatArray) -> float:
+    return float(np.linalg.norm(model.images[number].projection_center() - positions_m[number - 1]))
+
+
+def _observed(model: Any, number: int) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of an image's keypoints that see points, and these points (N, 3)."""
+    seen = model.images[number].get_observation_points2D()
+    points_m = [model.points3D[point.point3D_id].xyz for point in seen]
+    return np.array([point.xy for point in seen]).reshape(-1, 2), np.array(points_m).reshape(-1, 3)
+
+
+def _error_px(model: Any, number: int) -> float:
+    """Median error of an image's own keypoints."""
+    image = model.images[number]
+    return _median_px(model.cameras[image.camera_id], image.cam_from_world(), *_observed(model, number))
+
+
+def _median_px(camera: Any, pose: Any, pixels: FloatArray, points_m: FloatArray) -> float:
+    """Median error of keypoints; a point behind the camera has no place, and is as far off as can be."""
+    off_px = np.linalg.norm(camera.img_from_cam(pose * points_m) - pixels, axis=1)
+    return float(np.median(np.nan_to_num(off_px, nan=BEHIND_PX))) if len(off_px) else BEHIND_PX
+
+
+@dataclass(frozen=True, eq=False)
+class _Other:
+    """The other pose of an image, and the median errors of its keypoints by that and by the present one."""
+
+    number: int
+    pose: Any
+    error_px: float
+    present_px: float
+
+    @classmethod
+    def of(cls, pycolmap: ModuleType, model: Any, number: int) -> _Other | None:
+        """None where an image has no other pose that its points lead to."""
+        image, (pixels, points_m) = model.images[number], _observed(model, number)
+        if len(pixels) < MIN_OBSERVATIONS:  # weak images leave the model in any case
+            return None
+        camera, present = model.cameras[image.camera_id], image.cam_from_world()
+        start = pycolmap.Rigid3d(other_pose(present.matrix(), points_m))
+        if _apart_deg(start, present) < _DIFFERENT_DEG:  # it looks straight down
+            return None
+        found = pycolmap.refine_absolute_pose(start, pixels, points_m, np.ones(len(pixels), dtype=bool), camera)
+        pose = None if found is None else found["cam_from_world"]
+        if pose is None or _apart_deg(pose, present) < _DIFFERENT_DEG:
+            return None
+        return cls(number, pose, *(_median_px(camera, one, pixels, points_m) for one in (pose, present)))
+
+    @property
+    def center_m(self) -> FloatArray:
+        """(3,) projection centre in the world."""
+        return np.asarray(-self.pose.rotation.matrix().T @ self.pose.translation)
+
+    def take(self, model: Any) -> None:
+        """Give the image of a model this pose."""
+        image = model.images[self.number]
+        image.frame.set_cam_from_world(image.camera_id, self.pose)
+
+
+def _apart_deg(pose: Any, other: Any) -> float:
+    return angle_between_deg(pose.rotation.matrix(), other.rotation.matrix())
+
+
+def other_pose(pose: FloatArray, points_m: FloatArray) -> FloatArray:
+    """(3, 4) cam_from_world of the other pose from which points (N, 3), about in a plane, look nearly the same.
+
+    Mirrored at the plane and in depth, about the middle of the points: what lies in the plane keeps its places across
+    the line of sight, and nearer and farther are exchanged.
+    """
+    middle_m = points_m.mean(axis=0)
+    normal = np.linalg.svd(points_m - middle_m, full_matrices=False)[2][-1]
+    there = pose[:, :3] @ middle_m + pose[:, 3]
+    sight = there / np.linalg.norm(there)
+    depth, plane = (np.eye(3) - 2.0 * np.outer(axis, axis) for axis in (sight, normal))
+    rotation = depth @ pose[:, :3] @ plane
+    return np.column_stack([rotation, there - rotation @ middle_m])

@@ -1,0 +1,44 @@
+"""Processes of their own for pycolmap, since it stops the whole process on a fault: `python -m MODULE FOLDER`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from types import ModuleType
+
+from aeromatch_cli.errors import InputError, tells_of_memory
+from aeromatch_cli.workers import ONE_THREAD
+
+# COLMAP passes over cameras with a distortion parameter beyond 1, unless told otherwise. Long lenses have such: the
+# parameters of equal distortions grow with powers of the focal length.
+ANY_DISTORTION = 1e9
+
+
+def run_process(module: str, folder: Path, result: str, what: str) -> Path:
+    """The file `result` that a module of this package makes in `folder`.
+
+    Raises MemoryError where it ends for lack of memory, InputError, naming `what`, where it stops otherwise: only the
+    latter says something of the block.
+    """
+    command = [sys.executable, "-m", f"aeromatch_cli.sfm.{module}", str(folder)]
+    environment = {**os.environ, **ONE_THREAD}  # whatever ran before in this process
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    if done.returncode == -signal.SIGKILL or tells_of_memory(done.stderr):
+        raise MemoryError(f"{what} ended for lack of memory")
+    if done.returncode or not (folder / result).is_file():
+        said = " ".join((done.stderr or done.stdout).strip().splitlines()[-1:])
+        raise InputError(f"{what} stopped with exit code {done.returncode}: {said}")
+    return folder / result
+
+
+def quiet_pycolmap() -> ModuleType:
+    """For the child: pycolmap without its log."""
+    zlib.compress(b"")  # pycolmap aborts when it is the first user of zlib
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 3
+    return pycolmap

@@ -1,0 +1,281 @@
+"""What stages have found, in lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from aeromatch_cli.data import Block
+from aeromatch_cli.results.adjustment import Control, ControlInGroup, GroupResult, Xyz
+from aeromatch_cli.results.stages import (
+    AdjustResult,
+    ConsistencyResult,
+    EnhanceResult,
+    ExtractResult,
+    FilterResult,
+    MatchResult,
+    OrientResult,
+    RefineResult,
+    ViewsResult,
+)
+from aeromatch_cli.sfm.control import offset_words
+from aeromatch_cli.sfm.mapping import Group
+from aeromatch_cli.stages.filter import WEAK_MATCHES
+from aeromatch_cli.stages.stage_report import StageReport
+
+# What a control figure is of, in words.
+_CHECKED = {"check points": "check points", "leave one out": "each control point, fitted without it"}
+
+
+def stage_lines(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
+    """Counts and time of a stage, and what it found. names: of the files, by image_id. part: of a shard."""
+    counts = (
+        f"{stage.part + stage.stage:<11} {stage.items:>7} items, {stage.done} done, {stage.skipped} up to date, "
+        f"{len(stage.failures)} failed, {stage.seconds:.1f} s"
+    )
+    return [counts, *(f"          {line}" for line in _found(stage, names, part=part))]
+
+
+def _found(stage: StageReport, names: Mapping[str, str], *, part: bool) -> list[str]:
+    match stage.result:
+        case FilterResult() as found:
+            return _filter_lines(found, names, part=part)
+        case ConsistencyResult() as found:
+            return _consistency_lines(found, names)
+        case AdjustResult() as found:
+            return _adjust_lines(found, stage.items, names)
+        case ViewsResult() as found:
+            words = "; ".join(_views_words(found))
+        case EnhanceResult() as found:
+            words = "; ".join([*_skipped_words(found.images_skipped_same_illumination), *filter(None, [found.remark])])
+        case MatchResult() as found:
+            words = settled_words(found)
+        case RefineResult(keypoints=keypoints, measured=measured, shift_px=float(shift_px)):
+            words = f"{measured} of {keypoints} keypoints measured by least squares, by {shift_px:.2f} px (median)"
+        case _:
+            words = ""
+    return [words] if words else []
+
+
+def _views_words(found: ViewsResult) -> Iterator[str]:
+    """Number and size of the views; of features also images that have none, and those that are not enhanced."""
+    if found.images:
+        views, megapixels = found.views_per_image, found.megapixels_per_image
+        yield f"views per image: {views:.3g}, {megapixels:.3g} megapixels together"
+    if isinstance(found, ExtractResult):
+        if found.images_without_keypoints:
+            yield f"{found.images_without_keypoints} images without keypoints"
+        yield from _skipped_words(found.images_skipped_same_illumination)
+
+
+def _skipped_words(count: int | None) -> list[str]:
+    return [f"{count} images not enhanced (skipped: same illumination)"] if count else []
+
+
+def settled_words(found: MatchResult) -> str:
+    """Which steps of a cascade have given how many pairs enough matches, "" without a cascade."""
+    if found.not_settled is None:
+        return ""
+    by, lacking = found.settled_by, found.not_settled
+    whole = sum(by.values()) + lacking
+    counts = ", ".join(f"{count} by {name}" for name, count in by.items())
+    lack = f"; {lacking} with fewer matches, or less of the overlap covered, than asked for" if lacking else ""
+    return f"of {whole} pairs settled: {counts}{lack}"
+
+
+def _filter_lines(found: FilterResult, names: Mapping[str, str], *, part: bool) -> list[str]:
+    """States of the pairs and how images are connected; of a part of the pairs (a shard) the states alone."""
+    states = ", ".join(f"{count} {state}" for state, count in found.pairs.items()) or "none"
+    lines = [f"pairs: {states}; {found.verified_matches} verified matches"]
+    if part:
+        return lines
+    components = found.components
+    if len(components) > 1:
+        shown = ", ".join(str(size) for size in components[:8]) + (", ..." if len(components) > 8 else "")
+        lines.append(f"{len(components)} unconnected groups of images, of sizes {shown}")
+    else:
+        lines.append("all images are connected")
+    if found.weakly_tied:
+        lines.append(f"weakly tied (< {WEAK_MATCHES} matches): {_listed([names[i] for i in found.weakly_tied])}")
+    return lines
+
+
+def orientation_lines(found: OrientResult, given: Block, block: Block) -> list[str]:
+    """How the block was oriented, and what of that which was given is wrong."""
+    names = {image.image_id: image.name for image in block.images}
+    words = _given_words(found, given) if found.poses_from == "given poses" else _picture_words(found, given, block)
+    for camera_id, focal in found.focal_lengths.items():
+        kept = ", but the given one is kept" if found.stays else ""
+        sizes = f"{focal.found_px:.0f} px instead of {focal.given_px:.0f} px"
+        words.append(f"focal length of camera {camera_id}: {sizes}{kept}")
+    given_wrongly = ("attitudes", "degrees", found.wrong_attitudes), ("positions", "m", found.wrong_positions)
+    for what, unit, wrong in given_wrongly:
+        if wrong:
+            named = _listed([f"{names[i]} ({value:.0f} {unit})" for i, value in wrong.items()])
+            done = "kept, as orient=given asks" if found.stays else "those that the pictures give are used"
+            words.append(f"wrong {what} given; {done}: {named}")
+    if found.outside:
+        words.append(f"not oriented: {_listed([names[i] for i in found.outside])}")
+    return [f"{'orientation' if not row else '':<16} {line}" for row, line in enumerate(words)]
+
+
+def _explained_words(found: OrientResult) -> str:
+    return f"given poses explain the matches of {found.given_poses_explained} of {found.images_matched} images"
+
+
+def _has_attitudes(given: Block) -> bool:
+    return any(pose.world_rotation is not None for pose in given.poses.values())
+
+
+def _given_words(found: OrientResult, given: Block) -> list[str]:
+    if found.images_matched:
+        return [_explained_words(found) if _has_attitudes(given) else "no attitudes were given"]
+    return ["no matches to judge the given poses by" if _has_attitudes(given) else "no matches to find it by"]
+
+
+def _picture_words(found: OrientResult, given: Block, block: Block) -> list[str]:
+    sizes = [str(model.images) for model in found.models] or ["none"]
+    groups = sizes[0] if len(sizes) == 1 else f"groups of {', '.join(sizes[:-1])} and {sizes[-1]}"
+    more = len(found.by_one_pair)
+    also = f", {more} more by their positions and a pair each" if more else ""
+    words = [f"from the pictures: {groups} of {len(block.images)} images{also}"]
+    words += [_explained_words(found)] if _has_attitudes(given) else []
+    words += [
+        f"by a further first pass, with {one.change}: a group of {one.images_then} images, not {one.images}"
+        for one in found.further_first_passes
+        if one.used
+    ]
+    if found.frame == "own" and given.crs != block.crs:
+        words.append(f"in a local frame, not in {given.crs}")
+    elif found.frame == "own" and given.poses:
+        words.append("in a frame of its own, not that of the given positions")
+    return words
+
+
+def frame_remarks(found: OrientResult, groups: Sequence[Group]) -> list[str]:
+    """What nothing ties to the world. groups: images that were oriented together."""
+    beside = sum(len(group.images) for group in groups if group.kind == "level")
+    if not beside:
+        return []
+    if found.frame == "own" and len(groups) > 1:
+        return [
+            f"without usable positions each of {len(groups)} groups of images is in a frame of its own: scale, north "
+            "and place are arbitrary, and so is the distance between the groups"
+        ]
+    if found.frame == "own":
+        return ["without usable positions the result is in a frame of its own: scale, north and place are arbitrary"]
+    return [
+        f"{beside} images are tied to no position and lie beside the others: scale, north and place are arbitrary, "
+        "unless final matches tie them"
+    ]
+
+
+def _adjust_lines(found: AdjustResult, images: int, names: Mapping[str, str]) -> list[str]:
+    """Figures of the bundle adjustment, and images that it could not tie. images: of the block."""
+    if not found.points:
+        return found.remarks
+    error_px = "unknown" if found.reprojection_error_px is None else f"{found.reprojection_error_px:.2f} px"
+    words = [
+        f"{found.images} of {images} images oriented, {found.points} points in {found.track_length:.1f} images each, "
+        f"reprojection error {error_px}"
+    ]
+    if len(found.groups) > 1:
+        sizes = ", ".join(str(group.images) for group in found.groups)
+        words.append(f"{len(found.groups)} groups of images, each oriented by itself: {sizes}")
+    words += control_words(found.control, control_of(found.groups))
+    words += found.remarks
+    outside = list(found.outside.items())
+    words += [f"not oriented: {names.get(image_id, image_id)}: {reason}" for image_id, reason in outside[:10]]
+    words += [f"not oriented: {len(outside) - 10} more, listed in the report"] if len(outside) > 10 else []
+    return words
+
+
+def _consistency_lines(found: ConsistencyResult, names: Mapping[str, str]) -> list[str]:
+    """What was dropped, and images that the adjusted block seems to hold in a wrong place."""
+    doubtful = _listed([names[i] for i in found.doubtful])
+    lines = [f"too many matches contradict the adjusted poses of {doubtful}"] if doubtful else []
+    if found.spread:
+        lines.append(_spread_words(found))
+    if found.remark:
+        lines.append(found.remark)
+    if not found.dropped_matches and not found.rejected_pairs:
+        return lines
+    rejected, expected = found.rejected_pairs, found.expected_right
+    pairs = f", all of {rejected} {'pair' if rejected == 1 else 'pairs'} among them" if rejected else ""
+    why = ["contradict the adjusted block"] if found.points or expected is None else []
+    why += [] if expected is None else ["are not likely to be right"]
+    right = "" if expected is None else f", of which {100 * expected:.1f} % are expected to be right to 3 px"
+    words = f"{found.dropped_matches} matches {' or '.join(why)}{pairs}"
+    return [f"{words}; {found.verified_matches} verified matches are left{right}", *lines]
+
+
+def _spread_words(found: ConsistencyResult) -> str:
+    spread = found.spread.values()
+    held, empty = sum(ninths.held for ninths in spread), sum(ninths.empty for ninths in spread)
+    many = sorted(ninths.points for ninths in spread)[len(spread) // 2]
+    lacking = f", none in {empty} that other images show" if empty else ""
+    left = f"{found.points_left} of {found.points} points are left, " if found.points_left else ""
+    return (
+        f"{left}in {held} ninths of the images (3 x 3 each){lacking}; "
+        f"{many} points per image are seen by three or more (median)"
+    )
+
+
+def control_of(groups: Sequence[GroupResult]) -> list[ControlInGroup]:
+    """What control points did in the adjustment of every group that has some."""
+    return [group.control for group in groups if group.control is not None]
+
+
+def control_words(control: Control | None, adjusted: Sequence[ControlInGroup] = ()) -> list[str]:
+    """Errors at surveyed points. adjusted: what control points did in the adjustment of every group."""
+    if control is None:
+        return []
+    counts = f"control: {control.control} control points, {control.check} check points"
+    if control.points and len(control.not_measured_in_two_images) == control.points:
+        return [f"{counts}: none is measured in two oriented images: are its image names those of the block?"]
+    apart = control.rays_do_not_meet
+    wrong = [f"rays do not meet of {_listed(apart)}: measured at another place in one image?"] if apart else []
+    if once := control.not_measured_in_two_images:
+        wrong.append(f"warning: points that are not measured in two oriented images are left out: {_listed(once)}")
+    taking_part = [words for one in adjusted for words in _adjusted_words(one)]
+    if any(one.used for one in adjusted) or (taking_part and not control.control):
+        return [counts, *wrong, *taking_part]
+    if control.control_rmse_m is None:
+        few = f"{counts}: fewer than 3 control points are measured in two oriented images; a transformation needs 3"
+        return [few, *wrong, *taking_part]
+    words = [counts, *wrong, *taking_part, offset_words(control)]
+    words.append(
+        f"after a similarity transformation onto the control points: RMSE at these {_axes(control.control_rmse_m)} m"
+    )
+    if control.check_rmse_m is not None and control.check_kind is not None:
+        words[-1] += f", at {_CHECKED[control.check_kind]} {_axes(control.check_rmse_m)} m"
+    if control.doubtful:
+        words.append(f"control points that the others contradict: {_listed(control.doubtful)}")
+    return words
+
+
+def _axes(errors_m: Xyz) -> str:
+    return ", ".join(f"{axis} {error:.3f}" for axis, error in zip("xyz", errors_m, strict=True))
+
+
+def _adjusted_words(control: ControlInGroup) -> Iterator[str]:
+    """What control points did in the adjustment of a group."""
+    if control.fault:
+        yield f"warning: the control points fit the block if {control.fault}: correct the list"
+    if control.exchanged:
+        yield f"names of control points that are exchanged: {_listed(control.exchanged)}; they were left out"
+    if control.wrong:
+        yield f"control points that the others contradict: {_listed(control.wrong)}; they were left out"
+    with_m, without_m = control.held_out_rms_m, control.without_rms_m
+    held_out = "check points" if control.held_out == "check points" else "control points left out in turn"
+    errors = "" if with_m is None else f"; RMSE at {held_out}: {_axes(with_m)} m"
+    errors += "" if with_m is None or without_m is None else f", without any control {_axes(without_m)} m"
+    if control.kept and not control.used:
+        yield f"the block as it is: RMSE at check points {_axes(with_m)} m" if with_m else "no check points"
+    elif control.kept:
+        yield f"{len(control.used)} control points take part in the adjustment{errors}"
+    else:
+        yield f"the control points were left out of the adjustment, since they make it no better{errors}"
+
+
+def _listed(names: list[str], shown: int = 10) -> str:
+    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")

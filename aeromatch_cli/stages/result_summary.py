@@ -1,0 +1,51 @@
+"""What a run comes to, in words: how good the block is, where it is weak, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from aeromatch_cli.results.stages import BlockResults
+from aeromatch_cli.sfm.quality import Quality
+from aeromatch_cli.stages.filter import WEAK_MATCHES
+
+_NAMED = 5
+# Images with fewer points that three images see hold a block adjustment loosely.
+_FEW_POINTS = 20
+
+
+def closing_lines(quality: Quality, results: BlockResults, names: Mapping[str, str]) -> list[str]:
+    """The verdict with what speaks against the block, and where it is weak. names: of the files, by image_id."""
+    count = len(names)
+    whole = f"all {count} images are connected" if count > 2 else "both images are connected"
+    if results.adjust is not None and results.adjust.images:
+        whole += " and oriented"
+    lines = verdict_lines(quality, whole)
+    others = [f"not checked: {'; '.join(quality.unchecked)}"] if quality.unchecked else []
+    return [*lines, *(f"{'':<9} {line}" for line in (*others, *_weak(results, names)))]
+
+
+def verdict_lines(quality: Quality, whole: str = "") -> list[str]:
+    """The verdict with what speaks against the block; whole: what is said where nothing does."""
+    first, *others = [one.sentence for one in quality.faults] or [whole]
+    return [f"{'result':<9} {quality.verdict}: {first}", *(f"{'':<9} {line}" for line in others)]
+
+
+def _weak(results: BlockResults, names: Mapping[str, str]) -> list[str]:
+    """Images that hang loosely on a block."""
+    lines = []
+    tied = [] if results.connection is None else results.connection.weakly_tied
+    if tied:
+        lines.append(f"weak: {_listed(tied, names)}, with fewer than {WEAK_MATCHES} verified matches")
+    spread = {} if results.consistency is None else results.consistency.spread
+    loose = [i for i, ninths in spread.items() if ninths.points < _FEW_POINTS and i not in tied]
+    if loose and len(spread) > 2:
+        lines.append(f"weak: {_listed(loose, names)}, with fewer than {_FEW_POINTS} points that three images see")
+    empty = [i for i, ninths in spread.items() if ninths.empty]
+    if empty:
+        lines.append(f"parts without a point though other images show them: {_listed(empty, names)}")
+    return lines
+
+
+def _listed(ids: Sequence[str], names: Mapping[str, str]) -> str:
+    shown = ", ".join(names.get(i, i) for i in ids[:_NAMED])
+    return shown + (f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "")

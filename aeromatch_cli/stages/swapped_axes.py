@@ -1,0 +1,45 @@
+"""Whether given positions fit the pictures with two of their columns exchanged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from aeromatch_cli.blocks.crs import LOCAL, geographic_from_grid, grid_from_geographic, utm_crs
+from aeromatch_cli.data import Block, FloatArray
+from aeromatch_cli.errors import ConfigError
+from aeromatch_cli.sfm.georeferencing import place
+from aeromatch_cli.sfm.mapping import Model
+
+
+def exchanged_columns(block: Block, model: Model) -> str:
+    """The columns whose exchange makes the given positions fit a model that contradicts them, "" for none.
+
+    Longitudes in the place of latitudes lie in another zone: they are not merely mirrored there.
+    """
+    ids = sorted(model.centers_m.keys() & block.poses.keys())
+    if len(ids) < 3:  # two of them fit anything
+        return ""
+    centers = np.array([model.centers_m[i] for i in ids])
+    given_m = np.array([block.poses[i].center_m for i in ids])
+    sigmas_m = np.array([block.poses[i].sigma_position_m for i in ids])
+    for words, positions_m in _readings(block, given_m):
+        placement = place(centers, model.points_m, positions_m, sigmas_m)
+        if placement.kind == "positions" and not placement.contradiction:
+            return words
+    return ""
+
+
+def _readings(block: Block, given_m: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Names of columns, and positions (N, 3) with these exchanged, about their middle."""
+    if block.crs != LOCAL:
+        latitudes, longitudes = geographic_from_grid(block.crs, given_m[:, :2] + np.array(block.origin_m[:2])).T
+        try:
+            zone = utm_crs(longitudes, latitudes)
+        except ConfigError:  # beyond the poles: those are no latitudes
+            zone = ""
+        places_m = grid_from_geographic(zone, longitudes, latitudes) if zone else np.full((1, 2), np.nan)
+        if np.isfinite(places_m).all():
+            yield "latitude and longitude", np.column_stack([places_m - places_m.mean(axis=0), given_m[:, 2]])
+    yield "x and y", given_m[:, [1, 0, 2]]
