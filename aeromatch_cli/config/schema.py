@@ -19,15 +19,17 @@ from pydantic_core import CoreSchema
 
 from aeromatch_cli.blocks.pose_files import POSE_FORMATS
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.consistencies import CONSISTENCIES
+from aeromatch_cli.strategies.consistencies import CONSISTENCIES, BlockConsistency
 from aeromatch_cli.strategies.enhancers import ENHANCERS
 from aeromatch_cli.strategies.exporters import EXPORTERS
 from aeromatch_cli.strategies.extractors import EXTRACTORS
 from aeromatch_cli.strategies.filters import FILTERS
 from aeromatch_cli.strategies.matchers import MATCHERS
-from aeromatch_cli.strategies.orienters import ORIENTERS
+from aeromatch_cli.strategies.orienters import ORIENTERS, FirstPass
 from aeromatch_cli.strategies.pairings import PAIRINGS
+from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.strategies.refiners import REFINERS
+from aeromatch_cli.strategies.refiners.least_squares import LeastSquares
 from aeromatch_cli.strategies.simulators import SIMULATORS
 from aeromatch_cli.strategies.steps import STEPS
 
@@ -360,6 +362,34 @@ class Settings(_Section):
                 "--set cascade=none, or --set extract=sift"
             )
         return self
+
+    @property
+    def first_pass(self) -> FirstPass | None:
+        """How the block is oriented from a first pass, None where poses stay as they are given and none is made."""
+        return self.orient if isinstance(self.orient, FirstPass) else None
+
+    @property
+    def keeps_poses(self) -> bool:
+        """Whether a first pass is made, and given poses stay all the same."""
+        return self.first_pass is not None and not self.first_pass.replaces
+
+    @property
+    def similar(self) -> Similar | None:
+        """How pairs are chosen by what images look like, None where they are not."""
+        return self.pairs if isinstance(self.pairs, Similar) else None
+
+    @property
+    def least_squares(self) -> LeastSquares | None:
+        """How tie points are measured, None where they are not: matchers that read pixels have measured them."""
+        measured = isinstance(self.refine, LeastSquares) and not self.match.reads_pixels
+        return self.refine if measured else None
+
+    @property
+    def rejection(self) -> BlockConsistency | None:
+        """By what the adjusted block rejects matches, None where it rejects none: those of matchers that read pixels
+        have no keypoints that it could see."""
+        judged = isinstance(self.consistency, BlockConsistency) and not self.match.reads_pixels
+        return self.consistency if judged else None
 
 
 def add_strategies(families: Mapping[str, Mapping[str, type[Strategy]]]) -> None:

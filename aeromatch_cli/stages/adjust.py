@@ -37,7 +37,6 @@ from aeromatch_cli.stages.filter import pair_fingerprint, verified_pairs
 from aeromatch_cli.stages.simulate import degenerate_view
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.versions import library_version
-from aeromatch_cli.strategies.orienters import FirstPass, GivenPoses
 
 VERSION = 26
 # A focal length that the adjustment changed by more than this share is said.
@@ -55,10 +54,10 @@ _FEW_KEYPOINTS = 0.1
 def run(context: Context) -> StageReport:
     """Write adjusted.npz, adjusted.json, orientation.csv and residuals.csv where they are not up to date."""
     report = StageReport("adjust", items=len(context.block.images))
-    recipe, groups = context.settings.orient, _groups(context)
+    first_pass, groups = context.settings.first_pass, _groups(context)
     if not groups:
         report.items = 0
-        report.result = AdjustResult(images=0, remarks=[_NOTHING] if isinstance(recipe, FirstPass) else [])
+        report.result = AdjustResult(images=0, remarks=[] if first_pass is None else [_NOTHING])
         _remove(context)
         return report.write(context.workspace)
     context, _ = with_current_pairs(context)
@@ -70,8 +69,8 @@ def run(context: Context) -> StageReport:
     _remove(context)
     try:
         with context.executor.step("adjust"):
-            fixed = isinstance(recipe, FirstPass) and not recipe.replaces
-            adjusted, found = adjust_block(contents_of(context, raw=False), context.observed, groups, fixed=fixed)
+            contents, fixed = contents_of(context, raw=False), context.settings.keeps_poses
+            adjusted, found = adjust_block(contents, context.observed, groups, fixed=fixed)
     except InputError as error:  # matches and export stand without it
         report.failures.append(("all images", str(error)))
         report.result = AdjustResult(images=0, remarks=[f"not done: {error}"])  # not that of an earlier adjustment
@@ -103,7 +102,7 @@ def is_current(context: Context) -> bool:
 
 
 def _groups(context: Context) -> Sequence[Group]:
-    return orient.groups(context) if isinstance(context.settings.orient, FirstPass) else []
+    return [] if context.settings.first_pass is None else orient.groups(context)
 
 
 def _is_current(context: Context, groups: Sequence[Group]) -> bool:
@@ -186,14 +185,14 @@ def _result(
 
 def _held_by(context: Context) -> dict[str, str]:
     """Parameters of cameras that a setting holds -> that setting."""
-    if isinstance(context.settings.orient, GivenPoses):
+    if context.settings.keeps_poses:
         return dict.fromkeys(MODELS[BROWN], "orient=given")
     return held_by(context.observed.calibration, context.observed.switches)
 
 
 def readout_not_tried(context: Context, oriented: Collection[str]) -> str | None:
     """Why the read-out time of a rolling shutter was no unknown, None where it was tried. oriented: image_ids."""
-    if isinstance(context.settings.orient, GivenPoses):
+    if context.settings.keeps_poses:
         return "orient=given"
     if not context.settings.adjust.rolling_shutter:
         return "adjust.rolling_shutter=false"
@@ -218,7 +217,7 @@ def _remarks(
     """What a person should know of the adjusted block, one sentence each."""
     if not adjusted.poses:
         words = "no image could be oriented from the verified matches: export/colmap/sparse has no points"
-        kept = isinstance(context.settings.orient, GivenPoses)
+        kept = context.settings.keeps_poses
         return [f"{words}. They do not fit the given poses; use orient=global instead of given" if kept else words]
     remarks = []
     before, used = context.block.cameras, {i.camera_id for i in context.block.images if i.image_id in adjusted.poses}

@@ -172,7 +172,7 @@ def _looking_down(context: Context) -> Context:
     """The block as `orient` may find it, where no image has an attitude: their views and neighbours cost as much as
     those of images that look straight down from one height. Only for trials."""
     block = context.block
-    found = isinstance(context.settings.orient, FirstPass) and not context.settings.match.reads_pixels
+    found = context.settings.first_pass is not None and not context.settings.match.reads_pixels
     if not found or any(pose.world_rotation is not None for pose in block.poses.values()):
         return context
     nowhere = Pose(np.zeros(3), None, math.inf, math.inf)
@@ -189,7 +189,7 @@ def _looking_down(context: Context) -> Context:
 
 def _later(context: Context) -> float:
     """Seconds of what follows matching for one of what leads to it."""
-    adjusts = isinstance(context.settings.orient, FirstPass) and not context.settings.match.reads_pixels
+    adjusts = context.settings.first_pass is not None and not context.settings.match.reads_pixels
     return _LATER if adjusts else 0.0
 
 
@@ -197,8 +197,8 @@ def _orientation(context: Context, sampled: Sequence[Pair]) -> tuple[float | Non
     """Seconds that the first pass and the mapping take, by trials of sampled pairs, None where their images cannot be
     read; and keypoints of each image in the first pass that stays on file. Workers are ready by then. Given poses are
     looked at, and found anew where they do not explain the sampled pairs."""
-    recipe, block = context.settings.orient, context.block
-    if not isinstance(recipe, FirstPass) or not sampled:
+    recipe, block = context.settings.first_pass, context.block
+    if recipe is None or not sampled:
         return None, 0
     recipe, seconds = first_pass.fitted(recipe, block), 0.0
     if sum(pose.world_rotation is not None for pose in block.poses.values()) == len(block.images):
@@ -348,7 +348,7 @@ def _disk_bytes(context: Context, keypoints: float, descriptors: float, matches:
     total += matches * _BYTES_PER_EXPORTED * len(settings.export)
     if settings.cascade:
         total += keypoints * _BYTES_PER_UNITED
-    if isinstance(settings.orient, FirstPass):
+    if settings.first_pass is not None:
         total += keypoints * _BYTES_PER_REFINED + matches * _BYTES_PER_ADJUSTED
     if settings.run.report:
         pixels = [image.width_px * image.height_px for image in context.block.images]

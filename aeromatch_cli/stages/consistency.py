@@ -29,7 +29,6 @@ from aeromatch_cli.stages.context import Context
 from aeromatch_cli.stages.filter import Judged, connection, select, verified_pairs
 from aeromatch_cli.stages.rows import check_features
 from aeromatch_cli.stages.stage_report import StageReport
-from aeromatch_cli.strategies.consistencies import BlockConsistency
 from aeromatch_cli.workspace import Workspace
 
 VERSION = 7
@@ -38,19 +37,18 @@ VERSION = 7
 def run(context: Context) -> StageReport:
     """Write dropped.npz and final.npz where they are not up to date."""
     report = StageReport("consistency")
-    recipe = context.settings.consistency
+    recipe = context.settings.rejection
     adjusted = None
-    if isinstance(recipe, BlockConsistency) and not context.settings.match.reads_pixels and orient.groups(context):
+    if recipe is not None and orient.groups(context):
         context, _ = with_current_pairs(context)
         adjusted = adjust.adjusted_block(context)
     path = context.workspace.dropped
     if adjusted is None and _judges_pairs(context):
         context, _ = with_current_pairs(context)
         adjusted = AdjustedBlock.empty()
-    if adjusted is None or not isinstance(recipe, BlockConsistency):
-        without = isinstance(recipe, BlockConsistency) and context.settings.match.reads_pixels
+    if adjusted is None or recipe is None:
         words = f"not done: match {context.settings.match.name} measures points without keypoints"
-        report.result = ConsistencyResult(remark=words if without else "")
+        report.result = ConsistencyResult(remark=words if context.settings.match.reads_pixels else "")
         for stale in (path, context.workspace.final):
             with translated_os_errors(stale):
                 stale.unlink(missing_ok=True)
@@ -110,8 +108,8 @@ def run(context: Context) -> StageReport:
 
 def _judges_pairs(context: Context) -> bool:
     """Whether pairs are judged that no adjusted block holds."""
-    recipe, match = context.settings.consistency, context.settings.match
-    return isinstance(recipe, BlockConsistency) and recipe.min_probability > 0.0 and not match.reads_pixels
+    recipe = context.settings.rejection
+    return recipe is not None and recipe.min_probability > 0.0
 
 
 def _matched(

@@ -1,4 +1,4 @@
-"""filter: which matches of every pair hold, whether it is verified, and whose attitude contradicts the pictures."""
+"""filter: which matches of every pair hold, and whether the pair is verified."""
 
 from __future__ import annotations
 

@@ -24,7 +24,6 @@ from aeromatch_cli.strategies.filters.poselib import Poselib
 from aeromatch_cli.strategies.matchers.descriptors.nearest import Nearest
 from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.strategies.pairings.neighbours import fallback_pairs
-from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.strategies.simulators.none import SourceOnly
 
 # A look at given poses needs less than finding poses does: reduced size (in pixels, and as a share of the images, but
@@ -143,11 +142,10 @@ def _pairs(
 ) -> tuple[set[tuple[str, str]], tuple[tuple[str, str], ...]]:
     """Nearest neighbours by position. Of images without position all pairs in a small block, in a large one those that
     look alike. Second: the pairs that look alike, where pairs=similar asks for them."""
-    block, wanted = context.block, context.settings.pairs
+    block, asked = context.block, context.settings.similar
     ids = sorted(image.image_id for image in block.images)
     count = len(ids) * (len(ids) - 1) // 2
-    asked = isinstance(wanted, Similar)
-    candidates = wanted.candidates if isinstance(wanted, Similar) else recipe.neighbours
+    candidates = recipe.neighbours if asked is None else asked.candidates
     placed = [i for i in ids if i in block.poses] if by_position and not asked else []
     near = set(fallback_pairs(block, placed, recipe.neighbours))
     if len(placed) == len(ids):

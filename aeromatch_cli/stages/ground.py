@@ -18,7 +18,6 @@ from aeromatch_cli.sfm.dem import Terrain
 from aeromatch_cli.sfm.epipolar_agreement import heights_above_m
 from aeromatch_cli.sfm.heights import height_remedy, zeros_words
 from aeromatch_cli.stages.context import Context
-from aeromatch_cli.strategies.orienters import GivenPoses
 
 # A stated ground that differs from the terrain of the pictures by this share of the flying height is said; so is one
 # that differs by more than so many standard deviations of a position, whichever is more.
@@ -105,7 +104,7 @@ def judged_ground(
         )
         return ground.shifted(-off_m), f"{source}, {shift}", [words]
     remark += ": do heights and ground count from the same zero (ellipsoid, sea level, take-off point)?"
-    keeps = isinstance(context.settings.orient, GivenPoses) or abs(off_m) <= _WRONG_SHARE * flying_m
+    keeps = context.settings.keeps_poses or abs(off_m) <= _WRONG_SHARE * flying_m
     return (ground, source, [remark]) if keeps else (shown, words, [f"{remark} The terrain of the pictures is used"])
 
 

@@ -41,7 +41,6 @@ from aeromatch_cli.stages.stage_report import StageReport, gather_failures
 from aeromatch_cli.stages.swapped_axes import exchanged_columns
 from aeromatch_cli.stages.versions import library_version
 from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.strategies.pairings.similar import Similar
 
 # The second is that of what is done with blocks that are large (`first_pass.is_large`) alone.
 VERSION, _LARGE_BLOCK_VERSION = 24, 1
@@ -58,8 +57,8 @@ def run(
     is made or written.
     """
     report = StageReport("orient", items=len(context.block.images))
-    recipe = context.settings.orient
-    if not isinstance(recipe, FirstPass):
+    recipe = context.settings.first_pass
+    if recipe is None:
         report.items = 0
         return context, report
     images, settings = _prints(context)
@@ -138,7 +137,7 @@ def _solution(
     block = context.block
     given = sum(pose.world_rotation is not None for pose in block.poses.values())
     # Pairs that look alike are chosen once, for all passes.
-    looks = given == len(block.images) and not isinstance(context.settings.pairs, Similar)
+    looks = given == len(block.images) and context.settings.similar is None
     first, evidence = evidence_of(context, first_pass.look(recipe, block) if looks else recipe, look=looks)
     if recipe.replaces:
         context, first, evidence = _with_better_cameras(context, first, evidence)
@@ -221,8 +220,8 @@ def _prints(context: Context) -> tuple[dict[str, str], str]:
             context.likely_focals.get(image.camera_id),
         )  # fmt: skip
     how: list[Any] = [settings.orient, settings.block.max_size_px, _LARGE_BLOCK_VERSION]
-    if isinstance(settings.pairs, Similar):
-        how.append(settings.pairs)
+    if settings.similar is not None:
+        how.append(settings.similar)
     return images, fingerprint(VERSION, library_version("pycolmap"), how, block.crs, block.origin_m)
 
 

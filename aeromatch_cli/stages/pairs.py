@@ -25,8 +25,6 @@ from aeromatch_cli.stages.messages import orientation_lines
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, forget_absent
 from aeromatch_cli.strategies import Strategy
-from aeromatch_cli.strategies.orienters import FirstPass
-from aeromatch_cli.strategies.pairings.similar import Similar
 from aeromatch_cli.workspace import Workspace
 
 log = logging.getLogger("aeromatch")
@@ -192,7 +190,7 @@ def _check_settings(settings: Settings) -> None:
     now, and not after hours of extraction.
     """
     budget_mb(settings.run.memory)
-    if isinstance(settings.pairs, Similar) and not isinstance(settings.orient, FirstPass):
+    if settings.similar is not None and settings.first_pass is None:
         raise ConfigError(
             "pairs=similar compares the descriptors of the first pass, and orient=none makes none: choose another "
             "orient, or pairs=exhaustive"

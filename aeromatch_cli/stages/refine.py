@@ -51,8 +51,8 @@ _IMAGES_AT_ONCE = 128
 def run(context: Context) -> StageReport:
     """Write refined/<id>.npz of all images where they are not up to date."""
     report = StageReport("refine")
-    recipe, folder = context.settings.refine, context.workspace.refined_files.parent
-    if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
+    recipe, folder = context.settings.least_squares, context.workspace.refined_files.parent
+    if recipe is None:
         _remove(folder)
         report.result = RefineResult()
         return report.write(context.workspace)
@@ -100,8 +100,8 @@ def made_fingerprint(context: Context) -> str:
 
 def current_fingerprint(context: Context) -> str:
     """Of the measured places of the present results."""
-    recipe, block = context.settings.refine, context.block
-    if not isinstance(recipe, LeastSquares) or context.settings.match.reads_pixels:
+    recipe, block = context.settings.least_squares, context.block
+    if recipe is None:
         return ""
     heights = [context.ground_z_m(image.image_id) for image in block.images]
     state = [sorted(block.cameras.items()), sorted(block.poses.items()), heights]

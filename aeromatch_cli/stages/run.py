@@ -47,7 +47,6 @@ from aeromatch_cli.stages.result_summary import closing_lines, verdict_lines
 from aeromatch_cli.stages.settings_diff import changed_words
 from aeromatch_cli.stages.shard import Shard
 from aeromatch_cli.stages.stage_report import StageReport, gather_failures, once, owner
-from aeromatch_cli.strategies.orienters import FirstPass
 from aeromatch_cli.workspace import Workspace, locked
 
 log = logging.getLogger("aeromatch")
@@ -426,7 +425,7 @@ def _all_failures(command: str, context: Context, reports: list[StageReport]) ->
 
 
 def _check(context: Context, oriented: StageReport, first: StageReport, said: _Said) -> Result:
-    settled = oriented.result is not None or not isinstance(context.settings.orient, FirstPass)
+    settled = oriented.result is not None or context.settings.first_pass is None
     read, quality = _block_of([first]), picture_quality.measured(context)
     looks = picture_quality.remarks(context, quality)
     for warning in looks:
