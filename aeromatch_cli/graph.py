@@ -120,9 +120,11 @@ def course(*, shard: bool) -> tuple[str, ...]:
 
 
 def sharded(command: str) -> bool:
-    """Whether `--shard` cuts a command: the items of all its stages, but for those that every shard looks at as a
-    whole, are independent of each other."""
-    return command == "run" or all(BY_NAME[name].unit != "block" for name in COMMANDS[command])
+    """Whether `--shard` cuts a command: the items of its stages are independent of each other. Of a run those are that
+    come before the block is adjusted."""
+    if command == "run":
+        return True
+    return command in COMMANDS and all(BY_NAME[name].unit != "block" for name in COMMANDS[command])
 
 
 def per_item() -> tuple[str, ...]:

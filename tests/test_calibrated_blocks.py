@@ -127,12 +127,12 @@ def check_errors_px(block: SimulatedBlock, found: AdjustedBlock, without: list[i
 def test_a_factory_calibration_and_exact_positions_are_met_together() -> None:
     block = factory_calibrated(simulate(SCENE, "nadir", 12, "rtk2cm", SEED, tie_points=400), 1)
     found, facts = adjusted(block)
-    positions = facts["positions"]
-    assert positions["used"] == 12
-    assert max(positions["rms_sigmas"]) < 3.0
+    positions = facts.positions
+    assert positions.used == 12
+    assert max(positions.rms_sigmas) < 3.0
     assert judged(block, Found.of(found))["focal_percent"] < 0.3
     [(camera_id, camera)] = found.cameras.items()
-    values = [facts["calibration"][camera_id]["parameters"][name][0] for name in ("f", "cx", "cy", "k1")]
+    values = [facts.calibration[camera_id].parameters[name].value for name in ("f", "cx", "cy", "k1")]
     corner_px = [0.0, 0.5, 0.5, 0.0]  # as camera files count
     np.testing.assert_allclose(lens_of(camera)[:4] + corner_px, values, rtol=1e-9)
     assert abs(focal_px(camera) - focal_px(block.observed.cameras[camera_id])) > 1.0
@@ -142,8 +142,8 @@ def test_every_third_image_of_a_block_is_met_as_well() -> None:
     block = every_third(factory_calibrated(simulate(SCENE, "nadir", 36, "rtk2cm", SEED, tie_points=400), 1))
     found, facts = adjusted(block)
     row = judged(block, Found.of(found))
-    assert row["oriented"] == facts["positions"]["used"] == 12
-    assert max(facts["positions"]["rms_sigmas"]) < 3.0
+    assert row["oriented"] == facts.positions.used == 12
+    assert max(facts.positions.rms_sigmas) < 3.0
     assert row["focal_percent"] < 0.3
     assert row["horizontal_px"] < 1.0
     assert row["height_px"] < 1.5
@@ -154,8 +154,8 @@ def test_the_read_out_of_a_rolling_shutter_is_found_where_there_is_one(readout_m
     """And what the shutter has moved is taken from the keypoints: residuals are those of the measurement (0.3 px)."""
     block = rolled(simulate(SCENE, "cross", 12, "rtk2cm", SEED, tie_points=400), readout_ms / 1000.0, speed_m_s)
     result, facts = adjusted(block)
-    [calibration] = facts["calibration"].values()
-    found = calibration["parameters"].get("readout_s")
+    [calibration] = facts.calibration.values()
+    found = calibration.parameters.get("readout_s")
     if readout_ms == 0.0:
         assert found is None
     else:
@@ -171,19 +171,19 @@ def test_control_points_place_a_block_and_a_wrong_one_is_named() -> None:
     without, _ = adjusted(block, start)
     points, rows = surveyed(block, 3, {})
     with_three, facts = adjusted(block, start, control=points)
-    assert facts["control"]["used"] == ["gcp0", "gcp1", "gcp2"]
+    assert facts.control.used == ["gcp0", "gcp1", "gcp2"]
     before, after = check_errors_px(block, without, rows), check_errors_px(block, with_three, rows)
     assert after[0] <= before[0]
     assert after[1] <= before[1]
     raised = tuple(replace(point, position_m=point.position_m + np.array([0.0, 0.0, 200.0])) for point in points)
     lifted, facts = adjusted(block, start, control=raised)
-    assert facts["control"]["used"] == ["gcp0", "gcp1", "gcp2"]
+    assert facts.control.used == ["gcp0", "gcp1", "gcp2"]
     heights_m = [np.mean([pose.center_m[2] for pose in one.poses.values()]) for one in (with_three, lifted)]
     assert heights_m[1] - heights_m[0] == pytest.approx(200.0, abs=0.05)
     points, rows = surveyed(block, 5, {1: np.array([0.5, -0.4, 0.6])})
     with_five, facts = adjusted(block, start, control=points)
-    assert facts["control"]["wrong"] == ["gcp1"]
-    assert facts["control"]["used"] == ["gcp0", "gcp2", "gcp3", "gcp4"]
+    assert facts.control.wrong == ["gcp1"]
+    assert facts.control.used == ["gcp0", "gcp2", "gcp3", "gcp4"]
     across_px, up_px = check_errors_px(block, with_five, rows)
     assert across_px <= 1.0
     assert up_px <= 1.5
@@ -211,5 +211,5 @@ def test_images_of_a_long_lens_stay_whose_distortion_has_a_parameter_beyond_one(
     block = simulate(SCENE, "cross", 16, "rtk2cm", SEED, tie_points=400, lens=lens, start_camera=lens)
     found, facts = adjusted(block)
     assert len(found.poses) == 16
-    assert facts["calibration"]["1"]["parameters"]["k3"][0] == pytest.approx(1.6, abs=0.1)
+    assert facts.calibration["1"].parameters["k3"].value == pytest.approx(1.6, abs=0.1)
     assert judged(block, Found.of(found))["height_px"] <= 1.5

@@ -57,7 +57,7 @@ def test_a_block_that_falls_into_parts_is_searched_with_more_keypoints(
         facts = read_json(site.work / "reports" / "orient.json")["result"]
         return [model["images"] for model in facts["models"]], facts["further_first_passes"], outcome.stdout
 
-    more = {"with": "more keypoints", "images": 3}
+    more = {"change": "more keypoints", "images": 3}
     monkeypatch.setattr("aeromatch_cli.stages.first_pass._MORE_KEYPOINTS", 1)
     models, tried, said = oriented()
     assert (models, tried) == ([3], [{**more, "images_then": 3, "used": False}])

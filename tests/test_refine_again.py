@@ -14,6 +14,7 @@ from aeromatch_cli.errors import ItemError
 from aeromatch_cli.images.source import Source, read_source
 from aeromatch_cli.stages import measuring, refine
 from aeromatch_cli.stages.context import Context
+from aeromatch_cli.stages.run import FUNCTIONS
 from aeromatch_cli.stages.stage_report import StageReport
 from aeromatch_cli.workspace import Workspace
 
@@ -67,7 +68,7 @@ def test_a_picture_that_is_another_for_a_while_is_not_measured(
 
     shutil.rmtree(work.refined_files.parent)
     with monkeypatch.context() as patch:
-        patch.setattr(refine, "run", swapped)
+        patch.setitem(FUNCTIONS, "refine", swapped)
         outcome = done_site("adjust")
     assert outcome.code == 1
     assert f"{image.name} has changed since the command began" in outcome.stderr
