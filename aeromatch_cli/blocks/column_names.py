@@ -18,6 +18,30 @@ _WITH_HEIGHT = frozenset(
     ("gps", "gnss", "camera", "above", "sea", "level", "mean", "absolute", "abs", "geodetic", "normal")
 )
 _DATUMS_ALONE = frozenset(("msl", "amsl", "asl", "hae"))
+# Words of columns that hold other heights, or accuracies of heights.
+_NO_HEIGHT = frozenset(
+    (
+        "agl",
+        "ato",
+        "ground",
+        "takeoff",
+        "home",
+        "relative",
+        "rel",
+        "accuracy",
+        "std",
+        "sigma",
+        "sd",
+        "rms",
+        "error",
+        "unit",
+    )
+)
+_REFERENCE_COLUMN = re.compile(
+    r"(gps|horizontal|geodetic)?_?(map)?_?datum|(gps)?_?(alt|altitude|height|elevation|vertical|z)_?(ref|reference|datum|mode|type)"
+)
+# Altitudes that EXIF calls those above sea level.
+_USUAL_REFERENCES = ("0", "above sea level", "above", "absolute")
 _UNIT_COLUMN = re.compile(r"(?:(.+)_)?(?:unit|units|uom)")
 _BLANK = frozenset(("", "nan", "na", "n/a", "none", "null", "-"))
 
@@ -54,7 +78,10 @@ def is_height(name: str) -> bool:
 
 def seems_height(name: str) -> bool:
     """Whether a name has a word of heights among others."""
-    return bool((_HEIGHT - {"z"} | _DATUMS_ALONE) & set(re.split(r"[^\w]|_|\d", name)))
+    words = set(re.split(r"[^\w]|_|\d", name))
+    if words & _NO_HEIGHT or _REFERENCE_COLUMN.fullmatch(name):
+        return False
+    return bool((_HEIGHT - {"z"} | _DATUMS_ALONE) & words)
 
 
 def side(where: str, cell: str, sides: str) -> str:
@@ -78,18 +105,21 @@ def on_side(where: str, degrees: float, found: str) -> float:
     return degrees
 
 
-def comments_of_units(
+def comments_of_columns(
     where: str, columns: Sequence[str], records: Iterable[Mapping[int, str]]
 ) -> tuple[list[str], tuple[int, ...], list[str]]:
-    """What columns of units say (`altitude_unit`: ft), as comments, the places of these columns, and remarks.
+    """What columns of units (`altitude_unit`: ft), datums and zeros (`altitude_ref`: takeoff) say, as comments, the
+    places of these columns, and remarks.
 
-    records: cells of every line by their place. Raises ConfigError where a column names several units.
+    records: cells of every line by their place. Raises ConfigError where a column says several things.
     """
     places = {}
     for place, name in enumerate(columns):
         match = _UNIT_COLUMN.fullmatch(name)
         if match and quantity_of(match[1] or "") is not None:
             places[place] = (match[1] or "").replace("_", " ")
+        elif _REFERENCE_COLUMN.fullmatch(name):
+            places[place] = "datum"
     comments, taken, remarks = [], [], []
     cells: dict[int, set[str]] = {place: set() for place in places}
     for record in records if places else ():
@@ -100,8 +130,15 @@ def comments_of_units(
     for place, of in places.items():
         units = sorted(cells[place])
         if len(units) > 1:
-            raise ConfigError(f"{where}, column {columns[place]}: {units[0]} and {units[1]}: one unit is needed")
-        if units and kind_of(units[0]) is None:
+            raise ConfigError(f"{where}, column {columns[place]}: {units[0]} and {units[1]}: only one can be applied")
+        if of == "datum":
+            taken.append(place)
+            if units and units[0] in ("1", "below sea level"):
+                remarks.append(f"column {columns[place]!r} says below sea level, which is not applied: write a minus")
+            elif units and units[0] not in _USUAL_REFERENCES:
+                zero = re.search(r"alt|height|elev|vert|^z", columns[place])
+                comments.append(f"# altitude reference: {units[0]}" if zero else f"# Datum: {units[0]}")
+        elif units and kind_of(units[0]) is None:
             remarks.append(f"column {columns[place]!r} names {units[0]!r}, which is no unit that is known: not applied")
         elif units:
             taken.append(place)

@@ -18,10 +18,13 @@ _LABEL = re.compile(
 _LOOSE = ("projection", "coordinate", "spatial", "coordinate system", "reference system")
 # Labels of much else than a CRS.
 _OFTEN = ("coordinates", "positions", "coordinate", "spatial")
-_CODE = re.compile(r"\b(EPSG|ESRI|IGNF|SRID)\b[\s:=/]{1,4}(\d{4,6})((?:\+\d{4,6})?)", re.IGNORECASE)
+_CODE = re.compile(r"\b(EPSG|ESRI|IGNF|SRID)\b(?:\s*code)?[\s:=/]{1,4}(\d{4,6})((?:\+\d{4,6})?)", re.IGNORECASE)
 _PROJ = re.compile(r"\+(?:proj|init)=.*")
 _WKT = re.compile(r"(?:PROJ|GEOG|COMPD|GEOD|BOUND|COMPOUND|LOCAL_|ENG)(?:CS|CRS)\[.*")
-_ZONE = re.compile(r"\bUTM[\s_-]*(?:zone[\s_-]*)?(\d{1,2})\s*([A-Z]?)\b", re.IGNORECASE)
+_ZONE = re.compile(
+    r"\bUTM[\s_-]*(?:zone[\s_:=-]*)?(\d{1,2})(?:\s*([A-Z])\b|[\s,]*(north|south)(?:ern(?:\s+hemisphere)?)?)?(?![A-Z\d])",
+    re.IGNORECASE,
+)
 _DATUM = re.compile(
     r"\b(WGS\s*[_-]?\s*84|WGS\s*72|NAD\s*27|NAD\s*83(?:\s*\([\w ]+\))?|ETRS\s*89|ED\s*50|GDA\s*(?:94|2020)"
     r"|JGD\s*(?:2000|2011)|SIRGAS\s*2000|RGF\s*93|OSGB\s*36|Tokyo|DHDN|CH1903\+?|SAD69|Pulkovo\s*1942)(?!\w)",
@@ -29,6 +32,13 @@ _DATUM = re.compile(
 )
 _SPELLED = {"WGS84": "WGS 84", "WGS72": "WGS 72", "SIRGAS2000": "SIRGAS 2000", "PULKOVO1942": "Pulkovo 1942",
             "TOKYO": "Tokyo"}  # fmt: skip
+# What speaks of a CRS, or of sides of the globe, and names none that is whole.
+_HINT = re.compile(
+    r"\b(utm|state\s*plane|spcs|gauss|lambert|mercator|hemisphere|(?<!time )zone\s*[:=]?\s*\d+\s*[A-Z]?"
+    r"|(south|west)(ern)?\s+(lat|lon)\w*)\b",
+    re.IGNORECASE,
+)
+_WGS84 = ("WGS 84", "WGS84")
 # Words by which a comment tells of another list than this one.
 _OF_OTHERS = re.compile(r"\b(from|converted|transformed|original|originally|not|was|were)\b", re.IGNORECASE)
 
@@ -72,9 +82,15 @@ def crs_comment(line: str) -> CrsComment | None:
         crs = _of_zone(body, zone)
         if crs:
             return CrsComment(crs, body[zone.end() :])
-        return CrsComment(rest=body[zone.end() :], unclear=_incomplete(comment))
-    datum = _DATUM.fullmatch(body)
-    return CrsComment(_spelled(datum[0]), datum=True) if datum and _parses(_spelled(datum[0])) else None
+        return CrsComment(rest=body[zone.end() :], unclear=_not_whole(comment))
+    if "/" in body and _parses(body):
+        return CrsComment(body)
+    datum = _DATUM.search(body)
+    if datum and datum[0] == body and _parses(_spelled(body)):
+        return _of_datum(comment, body, "")
+    if _HINT.search(body) or (datum and _spelled(datum[0]) not in _WGS84):
+        return CrsComment(rest=body, unclear=_not_whole(comment))
+    return None
 
 
 def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | None:
@@ -94,14 +110,14 @@ def _labelled(comment: str, label: str, mark: str, text: str) -> CrsComment | No
         if _parses(words):
             rest = bare[len(words) :]
             alone = label in ("datum", *_OFTEN) and _DATUM.fullmatch(words) is not None
-            return CrsComment(words, rest, datum=alone)
+            return _of_datum(comment, words, rest) if alone else CrsComment(words, rest)
     if code:
         return CrsComment(_code(code), _without(text, code))
     if zone:
         crs = _of_zone(text, zone)
         return CrsComment(crs, text[zone.end() :]) if crs else CrsComment(text)
     if datum and (label == "datum" or datum.end() == len(text)):
-        return CrsComment(_spelled(datum[0]), text[datum.end() :], datum=True)
+        return _of_datum(comment, datum[0], text[datum.end() :])
     if label == "datum":
         return CrsComment(rest=text, unclear=f"{comment!r} names no datum that is known: name a CRS, # CRS: EPSG:...")
     return CrsComment(text) if mark and label not in _OFTEN else None
@@ -120,12 +136,17 @@ def _without(text: str, code: re.Match[str]) -> str:
 def _of_zone(text: str, zone: re.Match[str]) -> str:
     """The CRS of a zone of UTM with the datum beside it; "" without one, or without hemisphere."""
     datum = _DATUM.search(text)
-    letter = zone[2].upper()
+    letter = (zone[2] or zone[3] or "")[:1].upper()
     if datum is None or not letter:
         return ""
     side = "N" if letter >= "N" and letter != "S" else "S"
     crs = f"{_spelled(datum[0])} / UTM zone {int(zone[1])}{side}"
     return crs if _parses(crs) else ""
+
+
+def _of_datum(comment: str, name: str, rest: str) -> CrsComment:
+    crs = _spelled(name)
+    return CrsComment(crs, rest, datum=True, unclear="" if crs in _WGS84 else _not_whole(comment))
 
 
 def _spelled(datum: str) -> str:
@@ -143,8 +164,8 @@ def _parses(text: str) -> bool:
     return bool(found.is_projected or found.is_geographic)
 
 
-def _incomplete(comment: str) -> str:
+def _not_whole(comment: str) -> str:
     return (
-        f"{comment!r} names a zone of UTM without its datum or hemisphere, and the coordinates stay as they are: name "
-        "the CRS, such as # CRS: EPSG:32633, or with --crs"
+        f"{comment!r} names no whole CRS and is not applied: the coordinates must count in that of --crs, or of a "
+        "comment such as # CRS: EPSG:32633, with signs for the sides of the globe"
     )

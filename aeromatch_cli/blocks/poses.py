@@ -43,7 +43,7 @@ from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m, overall_
 from aeromatch_cli.blocks.column_names import (
     LATITUDE_SIDES,
     LONGITUDE_SIDES,
-    comments_of_units,
+    comments_of_columns,
     is_height,
     on_side,
     seems_height,
@@ -268,6 +268,8 @@ def read_poses(path: Path, usual_m: tuple[float, float] = (1.0, 1.0), text: str 
             f"{path}, line {max(systems.values())}: the list names {len(systems)} coordinate systems: one is needed"
         )
     crs = next(iter(systems), None) or said.crs_of(grid=layout.position_kind == "grid")
+    if crs is None:
+        ignored += [f"{path.name}: {words}" for words in said.not_whole]
     remarks = (*ignored, *exchanged, *warnings)
     return PoseList(tuple(rows), layout.position_kind, remarks, crs=crs, heights=layout.zero or said.zero)
 
@@ -362,7 +364,7 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[int, _Layout, lis
         if "image" in columns and len(columns) > 1:
             where = f"{path}, line {number}"
             cells = (dict(enumerate(_cells(text, separator))) for _, text in records)
-            more, unit_columns, unknown = comments_of_units(where, columns, cells)
+            more, unit_columns, unknown = comments_of_columns(where, columns, cells)
             said = statements_of([*more, *(text for n, text in lines if n != number)])
             columns = tuple("" if k in unit_columns else name for k, name in enumerate(columns))
             layout = _layout(path, number, separator, columns, units, said)
@@ -658,7 +660,7 @@ def _on_side(
     column, sides = _SIDES[name]
     if degrees is None:
         return None
-    found = side(f"{path}, line {line}, column {column}", record.get(column, ""), sides) or layout.sides.get(name, "")
+    found = side(f"{path}, line {line}, side of {name}", record.get(column, ""), sides) or layout.sides.get(name, "")
     return on_side(f"{path}, line {line}, column {name}", degrees, found)
 
 

@@ -75,6 +75,7 @@ _IMAGE_NAMES = _set(
 _WORD = re.compile(r"[^\W\d_][^\W_]*|\d+(?:[.,]\d+)*|°")
 _DATUM_NUMBER = re.compile(r"\b(egm|navd|ngvd|wgs|nad|etrs|dhhn|evrf|grs|jgd|gda)[\s_-]*(\d{2,4})\b")
 _CLAUSE = re.compile(r"[;,]|\.(?=\s)|\s-\s")
+_ZERO_ALONE = re.compile(r"(reference|ref|datum|zero)( point| level)? (the )?(ground|take ?off|home|launch)( .*)?")
 _BEFORE_ACCURACY = re.compile(r"[,/&+]\s*(?=(accurac|sigma|std|standard|precis|uncert))")
 # So many gon or degrees are a circle, and no measurement.
 _CIRCLES = ("400", "360")
@@ -87,7 +88,7 @@ class Statements:
     crs: text for `crs.parsed_crs`; datum_crs: that of degrees, by a datum alone. units: by quantity and kind. relative:
     the comment by which heights count from the ground; datum: that which names another zero of theirs; zero: that as of
     `crs.heights_of`. north: "true", "grid" or "magnetic" as headings count from it, by the comment north_in. remarks:
-    what cannot be applied, by name.
+    what cannot be applied, by name; not_whole: the same of words for a CRS, where nothing else names one.
     """
 
     crs: str | None = None
@@ -99,6 +100,7 @@ class Statements:
     north: str = ""
     north_in: str = ""
     remarks: list[str] = field(default_factory=list)
+    not_whole: list[str] = field(default_factory=list)
 
     def crs_of(self, *, grid: bool) -> str | None:
         """The CRS. grid: of grid coordinates, of which a datum alone says nothing."""
@@ -125,7 +127,7 @@ def statements_of(lines: Iterable[str], mark: str = "#") -> Statements:
                 found.datum_crs = found.datum_crs or system.crs or None
             else:
                 found.crs = found.crs or system.crs or None
-            found.remarks += [system.unclear] if system.unclear else []
+            found.not_whole += [system.unclear] if system.unclear else []
         _read(found, text, text if system is None else f"{mark} {system.rest}")
     return found
 
@@ -155,6 +157,8 @@ def _read(found: Statements, comment: str, text: str) -> None:
             found.remarks.append(_unplaced(comment))
         return
     _read_units(found, comment, words)
+    if _ZERO_ALONE.fullmatch(" ".join(words)):
+        found.remarks.append(f"{comment!r} may say what heights count from: if they do, leave them out")
     heights = any(_QUANTITIES.get(word) == "heights" or is_named_datum(word) for word in words)
     for clause in _CLAUSE.split(text):
         _read_zero(found, comment, _WORD.findall(clause), heights=heights)

@@ -19,7 +19,7 @@ US_FOOT_M = 1200.0 / 3937.0
 _FEET = ("ft", "feet", "foot")
 _SURVEY = ("us", "ussurvey", "survey", "usa", "american")
 _METRES: Mapping[str, float] = {
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres", "mtr"), 1.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres", "mtr", "metern"), 1.0),
     **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
     **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 0.01),
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 0.001),
@@ -79,7 +79,7 @@ def factor(where: str, column: str, unit: str, kind: Kind) -> float:
 
     Raises ConfigError where it is none of this kind.
     """
-    parts = [part for part in re.split(r"[,;/|]", unit) if part.strip()]
+    parts = [_without_silent(part) for part in re.split(r"[,;/|]", unit) if part.strip()]
     found = [_UNITS[kind][bare(part)] for part in parts if bare(part) in _UNITS[kind]]
     others = [part.strip() for part in parts if bare(part) not in _UNITS[kind] and not _is_silent(part)]
     if len(set(found)) > 1 or others:
@@ -89,6 +89,13 @@ def factor(where: str, column: str, unit: str, kind: Kind) -> float:
             f"unit {usual}"
         )
     return found[0] if found else 1.0
+
+
+def _without_silent(text: str) -> str:
+    """`ft` of `NAVD88 ft`; the text where nothing is left, or it is known as it is."""
+    if kind_of(text) or _is_silent(text):
+        return text
+    return " ".join(word for word in text.split() if not _is_silent(word)) or text
 
 
 def _is_silent(text: str) -> bool:

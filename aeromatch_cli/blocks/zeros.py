@@ -25,8 +25,8 @@ _RELATIVE = re.compile(
 # Words of a comment, joined by blanks, that say the same of heights.
 _RELATIVE_WORDS = re.compile(
     r"\b(agl|ato|relativetoground|relative(?! (accura|precis|error|orient|posi))"
-    r"|(above|over|from|to|reference|ref|datum|zero|mode|type|is|are|relative|heights?|altitudes?|elevations?|z|alt)"
-    r" (the |local )*(ground|terrain|surface|take ?off|home|launch)"
+    r"|(above|over|über|ueber|from|to|reference|ref|datum|zero|mode|type|is|are|relative|heights?|altitudes?|elevations?|z|alt)"
+    r" (the |local |dem )*(ground|terrain|surface|take ?off|home|launch|grund|boden|gelände|startpunkt)"
     r"(?! (control|sampling|sample|truth|points\b|station)))"
 )
 

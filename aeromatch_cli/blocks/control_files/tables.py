@@ -22,7 +22,7 @@ from aeromatch_cli.blocks.accuracies import Sigmas, completed_sigmas_m
 from aeromatch_cli.blocks.column_names import (
     LATITUDE_SIDES,
     LONGITUDE_SIDES,
-    comments_of_units,
+    comments_of_columns,
     on_side,
     side,
     words_of_height,
@@ -114,12 +114,14 @@ def read_coordinates(source: Source, usual_crs: str | None = None) -> Survey:
     crs, crs_where = _stated_crs(source, said, geographic="latitude" in names)
     crs = crs or _crs_of_column(source, names, records)
     names, remarks = _one_form(source, names, crs)
-    remarks += tuple(f"{source.path.name}: {words}" for words in (*more, *said.remarks))
+    remarks += tuple(
+        f"{source.path.name}: {words}" for words in (*more, *said.remarks, *(() if crs else said.not_whole))
+    )
     rows = [
         (line, dict(zip(names, cells, strict=False)) if header else _unnamed(source, line, cells))
         for line, cells, _ in records
     ]
-    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys("xyz", "")
+    stated = dict(zip(names, units, strict=True)) if names else dict.fromkeys((*"xyz", "sigma_xy", "sigma_z"), "")
     points = _points(source, rows, _factors(source, header, stated, said, crs or usual_crs, crs_where))
     geographic = "latitude" in names or _in_degrees(points)
     if crs is None and usual_crs is not None and geographic:
@@ -144,7 +146,7 @@ def _statements(
     cells, _ = _cells(source.lines[header - 1].strip().lstrip("#").strip())
     columns = [re.sub(r"[\s-]+", "_", cell.strip().lower()) for cell in cells]
     rows = (dict(enumerate(cells)) for _, cells, _ in records)
-    comments, _, remarks = comments_of_units(source.at(header), columns, rows)
+    comments, _, remarks = comments_of_columns(source.at(header), columns, rows)
     return statements_of([*comments, *lines]), remarks
 
 
@@ -298,7 +300,7 @@ def _point(source: Source, line: int, record: Mapping[str, str], factors: Mappin
             degrees = degrees_of(cell, "EW" if column == "longitude" else "NS")
             found = None if degrees is None else degrees * unit
             place, sides = ("lon_side", "EW") if column == "longitude" else ("lat_side", "NS")
-            where = source.at(line, column)
+            where = source.at(line, f"{column}, side")
             found = None if found is None else on_side(where, found, side(where, record.get(place, ""), sides))
         else:
             refuse_rounded(source.at(line, column), cell)

@@ -147,7 +147,8 @@ class Units:
     said: Statements = field(default_factory=Statements)
 
     def remarks(self, source: Source) -> tuple[str, ...]:
-        return tuple(f"{source.path.name}: {words}" for words in self.said.remarks)
+        not_whole = [] if self.said.crs else self.said.not_whole
+        return tuple(f"{source.path.name}: {words}" for words in (*self.said.remarks, *not_whole))
 
 
 def units_of_comments(source: Source) -> Units:
