@@ -290,3 +290,5 @@ def test_a_comment_is_read_in_one_pass_whatever_its_length() -> None:
     long = "# " + "heights above the " * 20_000 + "z ( " * 20_000
     assert not statements_of([long]).units
     assert crs_comment(long) is None
+    rows = [f"# flight 7/b/IMG_{n:04}.jpg,52.{n},13.{n},100 # off" for n in range(3000)]  # lines switched off
+    assert statements_of(rows).crs is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from aeromatch_cli.blocks.crs import parsed_crs
 from aeromatch_cli.blocks.zeros import is_datum, names_datum
@@ -38,6 +39,8 @@ _HINT = re.compile(
     r"|(south|west)(ern)?\s+(lat|lon)\w*)\b",
     re.IGNORECASE,
 )
+# How names of projected CRSs are written.
+_NAME = re.compile(r"[\w().+ -]{3,40} / [\w().+ -]{3,40}")
 _WGS84 = ("WGS 84", "WGS84")
 # Words by which a comment tells of another list than this one.
 _OF_OTHERS = re.compile(r"\b(from|converted|transformed|original|originally|not|was|were)\b", re.IGNORECASE)
@@ -83,7 +86,7 @@ def crs_comment(line: str) -> CrsComment | None:
         if crs:
             return CrsComment(crs, body[zone.end() :])
         return CrsComment(rest=body[zone.end() :], unclear=_not_whole(comment))
-    if "/" in body and _parses(body):
+    if _NAME.fullmatch(body) and _parses(body):
         return CrsComment(body)
     datum = _DATUM.search(body)
     if datum and datum[0] == body and _parses(_spelled(body)):
@@ -154,7 +157,11 @@ def _spelled(datum: str) -> str:
     return _SPELLED.get(text, text)
 
 
+@lru_cache(maxsize=64)
 def _parses(text: str) -> bool:
+    """Whether a text names a CRS that has coordinates. Ordinary words are not looked up, which takes seconds."""
+    if not (re.search(r"[\d/\[]", text) or _DATUM.match(text)):
+        return False
     from pyproj.exceptions import CRSError
 
     try:

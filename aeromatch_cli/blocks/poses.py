@@ -16,11 +16,13 @@ Columns, in any order and case (aliases in brackets):
   frame                         of orientation.csv: images in a frame of their own have no pose here (optional)
 
 Lengths are metres and angles degrees unless the name of the column says otherwise (`alt_ft`, `x [us-ft]`, `omega_gon`,
-`yaw (rad)`, `accuracy_mm`), or a comment above the header (`# angles in gon`, `# heights: feet`); a cell may have its
-own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and seconds.
+`yaw (rad)`, `accuracy_mm`), a column of its own (`altitude_unit`), or a comment (`# angles in gon`, `# heights: feet`,
+see `statements`); a cell may have its own unit (`142.6 m`), and latitudes and longitudes may be degrees, minutes and
+seconds, with their side of the globe in a column (`latref`).
 
 Beside x y or lat lon, a height under another name (altitude, ellipsoidal height, height, elevation) is taken and said;
-heights above ground (relative_altitude, agl) are refused.
+heights above ground (relative_altitude, agl) are refused. Columns e and n stand for x and y where no other position is
+there.
 
 The separator is a comma, semicolon, tab or blanks, found from the header; lines that start with # are comments (a
 header behind # is accepted); a decimal comma is accepted where the separator is another, or in quotes. A line whose

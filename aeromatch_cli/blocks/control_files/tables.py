@@ -1,7 +1,8 @@
 """Tables of coordinates, and tables of image measurements.
 
 Coordinates, as Pix4D writes them: `label,c1,c2,z[,accuracy_horizontal,accuracy_vertical][,type]`; in degrees the
-latitude stands first; a CRS is not stated, unless a first line is its code, or a .prj of the same name lies beside.
+latitude stands first; a CRS is not stated, unless a first line is its code, a comment names it, or a .prj of the same
+name lies beside.
 With a header the columns go by their names; Metashape's reference is such a table: `# CoordinateSystem: WKT`, then
 `#Label,[Enable,]X/Easting,Y/Northing,Z/Altitude,Accuracy_X_(m),...`, longitude before latitude; what is not enabled is
 a check point. `type`: check points are named as such, all else is a control point. Names of columns and comments may
