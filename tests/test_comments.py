@@ -60,6 +60,9 @@ UNITS = [
     ("Angles are in radians (rad)", (1, 1, 1, math.degrees(1))),
     ("Units: international feet; angles: grads (400)", (FT, FT, 1, 0.9)),
     ("Units: m, gon", (1, 1, 1, 0.9)),
+    ("feet: x y z", (FT, FT, 1, 1)),
+    ("US feet heights, mm accuracies", (1, US_FT, 1e-3, 1)),
+    ("focal length in mm, heights in feet", (1, FT, 1, 1)),
     ("heights in ft (1 ft = 0.3048 m)", (1, FT, 1, 1)),
 ]
 

@@ -113,7 +113,7 @@ _ALIASES = {
     **dict.fromkeys(LATITUDE_SIDES, "lat_side") | dict.fromkeys(LONGITUDE_SIDES, "lon_side"),
 }
 # Names that count where there is no other image, and no other position.
-_OTHER_IMAGES = ("photoid", "photo_id", "imageid", "image_id", "picture_name", "bild", "foto")
+_OTHER_IMAGES = ("photoid", "photo_id", "picture_name", "bild", "foto")
 _OTHER_PLACES = {"e": "x", "east": "x", "n": "y", "north": "y"}
 # Columns that are taken for z or alt where there is none, the likeliest first.
 _OTHER_HEIGHTS = ("z", "alt", "absolute_altitude", "absalt", "abs_alt", "ellipsoidal_height", "ellipsoid_height",

@@ -10,9 +10,9 @@ what counts so, is applied to nothing and becomes a remark.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, cast
 
 from aeromatch_cli.blocks.crs_comments import crs_comment
 from aeromatch_cli.blocks.units import Kind, is_same, is_usual, kind_of
@@ -168,61 +168,67 @@ def _read(found: Statements, comment: str, text: str) -> None:
 
 def _read_units(found: Statements, comment: str, words: Sequence[str]) -> None:
     stated: dict[tuple[Quantity, Kind], str] = {}
-    subjects: list[Quantity] = []
-    waiting, place = "", 0  # waiting: a unit whose quantity follows
-    closed = other = both = False
-    while place < len(words):
-        unit, count = _unit_at(words, place)
-        word = words[place]
-        what = _QUANTITIES.get(word)
-        if unit and count:
-            before = words[place - 1] if place else ""
-            circle = before in _CIRCLES and kind_of(unit) == "angle"
-            if before[:1].isdigit() and not circle:
-                subjects, waiting = [], ""
-            elif other:
-                if _FLIGHT & set(words):
-                    found.remarks.append(_unplaced(comment))
-                subjects, other = [], False
-            elif subjects:
-                for subject in _meant(subjects, both=both):
-                    known = stated.setdefault((subject, kind_of(unit) or "length"), unit)
-                    if not is_same(known, unit):
-                        found.remarks.append(
-                            f"{comment!r} names {known} and {unit} for one thing: neither is applied; write the unit "
-                            "behind the names of the columns"
-                        )
-                        return
-                closed = True
-            else:
-                waiting = unit
-            place += count
+    for unit, subjects in _pairs(words):
+        if not subjects:
+            if not is_usual(unit):
+                found.remarks.append(_unplaced(comment))
             continue
-        if what is not None or is_named_datum(word):
-            if closed:
-                subjects, closed, both = [], False, False
-            apart = place > 0 and words[place - 1] in ("and", "und", "et") and "accuracies" not in subjects
-            both |= apart and what == "accuracies"
-            subjects.append(what or "heights")
-            if waiting:
-                stated.setdefault((subjects[0], kind_of(waiting) or "length"), waiting)
-                waiting, closed = "", True
-        elif word in _OTHERS:
-            other, subjects = True, []
-        elif (
-            word not in _LINKS
-            and not is_datum(word)
-            and not word[:1].isdigit()
-            and word not in _WITH_QUANTITY | _FOREIGN
-        ):
-            if waiting:
-                break
-            subjects = []
-        place += 1
-    if waiting and not is_usual(waiting):
-        found.remarks.append(_unplaced(comment))
+        for subject in subjects:
+            known = stated.setdefault((subject, kind_of(unit) or "length"), unit)
+            if not is_same(known, unit):
+                found.remarks.append(
+                    f"{comment!r} names {known} and {unit} for one thing: neither is applied; write the unit behind "
+                    "the names of the columns"
+                )
+                return
     for key, unit in stated.items():
         found.units.setdefault(key, unit)
+
+
+def _pairs(words: Sequence[str]) -> Iterator[tuple[str, Sequence[Quantity]]]:
+    """Units of a comment, each with what counts so; with nothing where that is not clear."""
+    for phrase in _phrases(words):
+        places = [place for place, (kind, _) in enumerate(phrase) if kind == "unit"]
+        leading = places[:1] == [0]  # `US feet heights`, `feet: x y z`
+        subjects: Sequence[Quantity] = ()
+        for start, place, end in zip([-1, *places], places, [*places[1:], len(phrase)], strict=False):
+            between = phrase[place + 1 : end] if leading else phrase[start + 1 : place]
+            # Of two units in a row the second counts for the same quantities.
+            subjects = _meant(between) or subjects
+            yield phrase[place][1], subjects
+
+
+_Item = tuple[Literal["unit", "what", "and"], str]
+
+
+def _phrases(words: Sequence[str]) -> Iterator[list[_Item]]:
+    """Units and quantities that no other word parts. Measurements, and other things with their unit, part them."""
+    phrase: list[_Item] = []
+    place, other = 0, False
+    while place < len(words):
+        word, (unit, count) = words[place], _unit_at(words, place)
+        parts = False
+        if unit:
+            before = words[place - 1] if place else ""
+            circle = before in _CIRCLES and kind_of(unit) == "angle"
+            parts = other or (before[:1].isdigit() and not circle)
+            if other and _FLIGHT & set(words) and not before[:1].isdigit():
+                yield [("unit", unit)]
+            phrase += [] if parts else [("unit", unit)]
+            other = False
+        elif word in _QUANTITIES or is_named_datum(word):
+            phrase.append(("what", _QUANTITIES.get(word, "heights")))
+        elif word in ("and", "und", "et"):
+            phrase.append(("and", word))
+        elif word in _OTHERS:
+            parts = other = True
+        else:
+            parts = not (word in _LINKS or word in _WITH_QUANTITY | _FOREIGN or is_datum(word) or word[:1].isdigit())
+        if parts or other:
+            yield phrase
+            phrase = []
+        place += max(count, 1)
+    yield phrase
 
 
 def _unit_at(words: Sequence[str], place: int) -> tuple[str, int]:
@@ -235,13 +241,19 @@ def _unit_at(words: Sequence[str], place: int) -> tuple[str, int]:
     return ("", 0)
 
 
-def _meant(subjects: Sequence[Quantity], *, both: bool) -> Sequence[Quantity]:
-    """Of what a unit is: an accuracy of heights is an accuracy, and a unit of angles one of angles. both: accuracies
-    stand beside the others."""
-    if "accuracies" in subjects and not both:
+def _meant(items: Sequence[_Item]) -> Sequence[Quantity]:
+    """Of what a unit is: an accuracy of heights is an accuracy, where it does not stand beside them (`heights and
+    accuracies`), and a unit of angles is one of angles."""
+    found: list[Quantity] = []
+    beside = False
+    for place, (kind, what) in enumerate(items):
+        if kind == "what":
+            linked = place > 0 and items[place - 1][0] == "and"
+            beside |= linked and what == "accuracies" and bool(found) and "accuracies" not in found
+            found.append(cast(Quantity, what))
+    if "accuracies" in found and not beside:
         return ("accuracies",)
-    named = [subject for subject in subjects if subject != "all"]
-    return list(dict.fromkeys(named or subjects))
+    return list(dict.fromkeys([what for what in found if what != "all"] or found))
 
 
 def _read_zero(found: Statements, comment: str, words: Sequence[str], *, heights: bool) -> None:
